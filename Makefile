@@ -1,0 +1,39 @@
+# A fresh machine needs Python >= 3.11 and make, nothing else: `make demo` runs the main job, `make test` all fast checks.
+PYTHON ?= python3
+ifeq ($(OS),Windows_NT)
+BIN := .venv/Scripts
+else
+BIN := .venv/bin
+endif
+PY := $(BIN)/python
+
+.PHONY: demo test test-slow lint format clean
+
+demo: .venv/installed
+	$(PY) problems/rig_demo.py --out out/rig_demo
+
+test: .venv/installed lint
+	$(PY) -m pytest --cov --cov-report=term
+
+test-slow: .venv/installed
+	$(PY) -m pytest -m slow
+
+lint: .venv/installed
+	$(PY) -m ruff format --check .
+	$(PY) -m ruff check .
+	$(PY) -m mypy
+	$(BIN)/lint-imports
+
+format: .venv/installed
+	$(PY) -m ruff format .
+	$(PY) -m ruff check --fix .
+
+.venv/installed: pyproject.toml
+	$(PYTHON) -c "import sys; sys.exit('pneuopt needs Python 3.11 or newer, this is ' + sys.version.split()[0] if sys.version_info < (3, 11) else 0)"
+	$(PYTHON) -m venv .venv
+	$(PY) -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
+	$(PY) -m pip install --quiet --disable-pip-version-check --editable . --group dev
+	$(PY) -c "open('.venv/installed', 'w').close()"
+
+clean:
+	$(PYTHON) -c "import shutil; [shutil.rmtree(d, ignore_errors=True) for d in ('.venv', 'out', 'build')]"

@@ -1,0 +1,63 @@
+"""One tree of errors: what the user can mend (`InputError`), and what a solver could not do (`ConvergenceError`)."""
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+
+class PneuoptError(Exception):
+    """Base of every error that pneuopt raises on purpose."""
+
+
+class InputError(PneuoptError, ValueError):
+    """Something that the user gave cannot be used; the message names the place, the value and the remedy."""
+
+
+class UnitError(InputError):
+    """A unit is missing, unknown, ambiguous or of another dimension."""
+
+
+class UnknownNameError(InputError):
+    """A name that comes from data is not known; the message offers the nearest one."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str], where: str = "") -> None:
+        known = sorted(known)
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known) or 'none'}"
+        super().__init__(f"{where + ': ' if where else ''}unknown {kind} {name!r}; {hint}")
+
+
+class LogError(InputError):
+    """A log cannot be read; the message names the file, row and column."""
+
+
+class ModelError(InputError):
+    """A model, its parameters and its data do not fit together."""
+
+
+class ConvergenceError(PneuoptError):
+    """A solver stopped without an answer that may be trusted.
+
+    Attributes
+    ----------
+    solution : object
+        The last iterate, of the type that the verb returns, marked as not converged; None where there is none.
+    """
+
+    def __init__(self, message: str, solution: Any = None) -> None:
+        super().__init__(message)
+        self.solution = solution
+
+
+def require(condition: bool, message: str, error: type[PneuoptError] = InputError) -> None:
+    """Raise `error` with `message` unless `condition` holds."""
+    if not condition:
+        raise error(message)
+
+
+def check_known(kind: str, names: Iterable[str], known: Iterable[str], where: str = "") -> None:
+    """Raise `UnknownNameError` for the first of `names` that is not in `known`."""
+    known = set(known)
+    for name in names:
+        if name not in known:
+            raise UnknownNameError(kind, name, known, where)

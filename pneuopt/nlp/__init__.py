@@ -1,0 +1,1 @@
+"""Multiple shooting: what a problem is (`transcription`), and the methods that solve it."""

@@ -1,0 +1,208 @@
+"""What a multiple-shooting problem is, apart from how it is solved: phases, nodes, residuals, costs, limits.
+
+Nothing here is a graph of the whole problem: the pieces are small SX functions of one node, and every solver of `nlp`
+reads them as it needs. All numbers that a problem depends on stand in one `ParameterSet`; ``"name[phase]"`` overrides
+``"name"`` in that phase, which is how conditions of a log and parameters of its own (`per_log`) are written.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import ModelError, check_known, require
+from pneuopt.parameters import ParameterSet
+from pneuopt.system import DiscreteSystem, names
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+class Where(Enum):
+    """Where a cost or limit holds."""
+
+    START = "start"
+    NODES = "nodes"
+    END = "end"
+    PARAMETERS = "parameters"
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """A run of n samples on one time grid.
+
+    Parameters
+    ----------
+    name : str
+    t, h : ndarray, shape (n,)
+        Instant of each sample and the step that follows it [s]; as fractions of the duration where that is free.
+    inputs : ndarray, shape (n, n_inputs)
+        Held over each step.
+    nodes : ndarray of int, shape (m,)
+        Samples at which a segment begins; the first is 0.
+    start : ndarray, shape (n_states,), optional
+        The start state where it is known; otherwise it is solved for.
+    follows : bool
+        The phase begins where the previous one ends.
+    duration : str, optional
+        Name of the parameter that is the phase's duration; `t` and `h` are then fractions of it.
+    guess : ndarray, shape (n, n_states), optional
+        States to start the solver from.
+    """
+
+    name: str
+    t: Array
+    h: Array
+    inputs: Array
+    nodes: Indices
+    start: Array | None = None
+    follows: bool = False
+    duration: str | None = None
+    guess: Array | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.t)
+        require(
+            len(self.h) == n and len(self.inputs) == n, f"{self.name}: t, h and inputs differ in length", ModelError
+        )
+        ordered = len(self.nodes) > 0 and self.nodes[0] == 0 and bool(np.all(np.diff(self.nodes) > 0))
+        require(
+            ordered and self.nodes[-1] < n, f"{self.name}: nodes must begin at 0 and increase below {n}", ModelError
+        )
+        require(
+            not (self.follows and self.start is not None), f"{self.name}: it follows a phase, so no start", ModelError
+        )
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return len(self.t)
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Measured outputs of one phase: ``(y - measured) / noise``, NaN marks a missing sample.
+
+    Parameters
+    ----------
+    phase : int
+    outputs : tuple of str
+    measured : ndarray, shape (n, len(outputs))
+    noise : ndarray, shape (len(outputs),)
+        Standard deviations [unit of the output].
+    """
+
+    phase: int
+    outputs: tuple[str, ...]
+    measured: Array
+    noise: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Cost:
+    """`weight` times a scalar, summed over where it holds.
+
+    Parameters
+    ----------
+    name : str
+    function : casadi.Function
+        ``(t, x, u, p) -> scalar``; for `Where.PARAMETERS` ``(q) -> scalar`` of all the problem's parameters.
+    where : Where
+    phases : tuple of int
+        Empty: every phase.
+    weight : float
+    """
+
+    name: str
+    function: ca.Function
+    where: Where
+    phases: tuple[int, ...] = ()
+    weight: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Limit:
+    """``lower <= function <= upper`` wherever it holds.
+
+    Parameters
+    ----------
+    name : str
+        Appears in messages: which limit is violated, which is active.
+    function : casadi.Function
+        ``(t, x, u, p) -> vector``; for `Where.PARAMETERS` ``(q) -> vector`` of all the problem's parameters.
+    lower, upper : float
+    where : Where
+    phases : tuple of int
+        Empty: every phase.
+    """
+
+    name: str
+    function: ca.Function
+    lower: float
+    upper: float
+    where: Where
+    phases: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Transcription:
+    """A multiple-shooting problem as data; `nlp` holds the methods that solve it.
+
+    Parameters
+    ----------
+    system : DiscreteSystem
+    parameters : ParameterSet
+        The system's parameters, overrides ``"name[phase]"``, durations; the free ones are unknowns, as are the states.
+    phases : tuple of Phase
+    residuals : tuple of Residuals
+    costs : tuple of Cost
+    limits : tuple of Limit
+    """
+
+    system: DiscreteSystem
+    parameters: ParameterSet
+    phases: tuple[Phase, ...]
+    residuals: tuple[Residuals, ...] = ()
+    costs: tuple[Cost, ...] = ()
+    limits: tuple[Limit, ...] = ()
+
+    def __post_init__(self) -> None:
+        require(len(self.phases) > 0, "a problem needs at least one phase", ModelError)
+        require(not self.phases[0].follows, "the first phase cannot follow another", ModelError)
+        check_known("parameter", self.system.parameters, self.parameters)
+        for phase in self.phases:
+            if phase.duration is not None:
+                check_known("parameter", [phase.duration], self.parameters, phase.name)
+        for residual in self.residuals:
+            check_known("output", residual.outputs, names(self.system.outputs), self.phases[residual.phase].name)
+
+    def gather(self, phase: Phase) -> Indices:
+        """Positions, among the problem's parameters, of the system's parameter vector in this phase."""
+        position = {n: i for i, n in enumerate(self.parameters)}
+        return np.array(
+            [position.get(f"{n}[{phase.name}]", position[n]) for n in self.system.parameters], dtype=np.intp
+        )
+
+    @property
+    def free(self) -> Indices:
+        """Positions of the free parameters among the problem's parameters."""
+        return np.array([i for i, p in enumerate(self.parameters.values()) if p.free], dtype=np.intp)
+
+
+def every(n: int, samples: int) -> Indices:
+    """Nodes at every `samples`-th of n samples; the last segment takes the rest.
+
+    Examples
+    --------
+    >>> every(10, 4).tolist()
+    [0, 4, 8]
+    """
+    return np.arange(0, n, max(1, samples), dtype=np.intp)
+
+
+def phases_of(term: Cost | Limit, transcription: Transcription) -> Sequence[int]:
+    """The phases in which a term holds."""
+    return term.phases or range(len(transcription.phases))

@@ -1,0 +1,194 @@
+"""Signals (`Quantity`) and numbers (`Parameter`, `ParameterSet`): immutable, named, in SI units, edited by copy."""
+
+import fnmatch
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from pneuopt.errors import InputError, UnknownNameError, check_known, require
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A signal: a state, an input or an output.
+
+    Parameters
+    ----------
+    name : str
+        The field's term, in snake case; parts are prefixed ("pid.integral").
+    unit : str
+        SI unit of the signal. "Pa(a)" and "Pa(g)" mark pressure levels, absolute and gauge.
+    nominal : float
+        The signal's usual size, by which solvers scale it [unit].
+    lower, upper : float
+        Physical range [unit].
+    """
+
+    name: str
+    unit: str
+    nominal: float = 1.0
+    lower: float = -math.inf
+    upper: float = math.inf
+
+    def __post_init__(self) -> None:
+        require(self.nominal > 0, f"{self.name}: nominal must be positive, got {self.nominal}")
+        require(self.lower < self.upper, f"{self.name}: lower {self.lower} is not below upper {self.upper}")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number with its unit, bounds and source.
+
+    Parameters
+    ----------
+    value, lower, upper : float
+        Linear SI values; `lower <= value <= upper` is checked, never repaired.
+    unit : str
+        SI unit.
+    log : bool
+        Solvers work on its logarithm; the value and both finite bounds must be positive.
+    free : bool
+        It is to be identified or tuned.
+    per_log : bool
+        Each experiment has a value of its own (a sensor offset, say).
+    source : str
+        Where the number comes from.
+    """
+
+    value: float
+    unit: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    log: bool = False
+    free: bool = False
+    per_log: bool = False
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        require(not math.isnan(self.value), f"a parameter's value is NaN [{self.unit}]; give a number")
+        require(
+            self.lower <= self.upper, f"lower bound {self.lower:g} lies above upper bound {self.upper:g} {self.unit}"
+        )
+        require(
+            self.lower <= self.value <= self.upper,
+            f"value {self.value:g} {self.unit} lies outside its bounds [{self.lower:g}, {self.upper:g}]; "
+            "move the value or the bounds",
+        )
+        require(not self.log or self.value > 0, f"a log parameter must be positive, got {self.value:g} {self.unit}")
+
+
+class ParameterSet(Mapping[str, Parameter]):
+    """An immutable, ordered mapping from name to `Parameter`.
+
+    Examples
+    --------
+    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "friction.coulomb": Parameter(40.0, "N")})
+    >>> rig.freed("friction.*").free_names
+    ('friction.coulomb',)
+    >>> rig.with_values({"load.mass": 6.0}).value("load.mass")
+    6.0
+    """
+
+    def __init__(self, parameters: Mapping[str, Parameter] | Iterable[tuple[str, Parameter]] = ()) -> None:
+        self._parameters = dict(parameters)
+
+    def __getitem__(self, name: str) -> Parameter:
+        try:
+            return self._parameters[name]
+        except KeyError:
+            raise UnknownNameError("parameter", name, self._parameters) from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._parameters
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parameters)
+
+    def __len__(self) -> int:
+        return len(self._parameters)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._parameters.items()))
+
+    def __or__(self, other: "ParameterSet") -> "ParameterSet":
+        """Join two sets; on a shared name the right one wins."""
+        return ParameterSet({**self._parameters, **other._parameters})
+
+    def __repr__(self) -> str:
+        width = max((len(n) for n in self), default=0)
+        return "\n".join(f"{n:<{width}}  {_describe(p)}" for n, p in self.items())
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in order."""
+        return tuple(n for n, p in self.items() if p.free)
+
+    def value(self, name: str) -> float:
+        """The value of one parameter [its unit]."""
+        return self[name].value
+
+    def matching(self, *patterns: str) -> tuple[str, ...]:
+        """Names that match any of the shell patterns; a pattern without a match is an error."""
+        names: list[str] = []
+        for pattern in patterns:
+            found = fnmatch.filter(self, pattern)
+            if not found:
+                raise UnknownNameError("parameter", pattern, self)
+            names += [n for n in found if n not in names]
+        return tuple(names)
+
+    def freed(self, *patterns: str) -> "ParameterSet":
+        """Mark the matching parameters as free, by copy."""
+        return self._edited({n: replace(self[n], free=True) for n in self.matching(*patterns)})
+
+    def fixed(self, *patterns: str) -> "ParameterSet":
+        """Mark the matching parameters as fixed, by copy."""
+        return self._edited({n: replace(self[n], free=False) for n in self.matching(*patterns)})
+
+    def with_values(self, values: Mapping[str, float]) -> "ParameterSet":
+        """Give the named parameters new values, by copy; one outside its bounds is an error that names it."""
+        return self._edited({n: self._replaced(n, value=float(v)) for n, v in values.items()})
+
+    def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> "ParameterSet":
+        """Give the named parameters new bounds, by copy."""
+        return self._edited({n: self._replaced(n, lower=lo, upper=up) for n, (lo, up) in bounds.items()})
+
+    def select(self, names: Iterable[str]) -> "ParameterSet":
+        """Keep the named parameters, in that order."""
+        return ParameterSet({n: self[n] for n in names})
+
+    def prefixed(self, prefix: str) -> "ParameterSet":
+        """Put `prefix.` before every name."""
+        return ParameterSet({f"{prefix}.{n}": p for n, p in self.items()})
+
+    def to_frame(self) -> "pd.DataFrame":
+        """Tabulate: a row a parameter, a column a field."""
+        import pandas as pd
+
+        fields = ["value", "unit", "lower", "upper", "log", "free", "per_log", "source"]
+        rows = {n: [getattr(p, f) for f in fields] for n, p in self.items()}
+        return pd.DataFrame.from_dict(rows, orient="index", columns=fields)
+
+    def _replaced(self, name: str, **fields: float) -> Parameter:
+        try:
+            return replace(self[name], **fields)  # type: ignore[arg-type]
+        except InputError as error:
+            if isinstance(error, UnknownNameError):
+                raise
+            raise InputError(f"{name}: {error}") from None
+
+    def _edited(self, edits: Mapping[str, Parameter]) -> "ParameterSet":
+        check_known("parameter", edits, self)
+        return ParameterSet({**self._parameters, **edits})
+
+
+def _describe(parameter: Parameter) -> str:
+    marks = [m for m in ("free", "log", "per_log") if getattr(parameter, m)]
+    finite = math.isfinite(parameter.lower) or math.isfinite(parameter.upper)
+    bounds = f" in [{parameter.lower:g}, {parameter.upper:g}]" if finite else ""
+    source = f"  # {parameter.source}" if parameter.source else ""
+    return f"{parameter.value:g} {parameter.unit}{bounds}{' ' + ', '.join(marks) if marks else ''}{source}"

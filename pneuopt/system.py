@@ -1,0 +1,289 @@
+"""`System` (an ODE with named signals) and `DiscreteSystem` (its sampled step), which every solver reads."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import ConvergenceError, ModelError, check_known, require
+from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+Symbols = Mapping[str, ca.SX]
+Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
+Update = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A candidate to start an identification from: states along a log, and parameters."""
+
+    states: Trajectory
+    parameters: Mapping[str, float]
+    label: str = ""
+
+
+class StartFinder(Protocol):
+    """What a model knows about starting from a log (equation error); see `System.starts`."""
+
+    def __call__(self, measured: Trajectory, parameters: ParameterSet) -> Sequence[Start]:
+        """Return candidates, the most plausible first."""
+        ...
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """`dx/dt = A x + B u, y = C x + D u` about an operating point; names in the order of the matrices."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """An ODE with named states, inputs, outputs and parameters.
+
+    Parameters
+    ----------
+    states, inputs, outputs : tuple of Quantity
+        The signals, in the order of the vectors x, u, y.
+    parameters : ParameterSet
+        Every parameter with its default; their order is that of the vector p.
+    ode : casadi.Function
+        ``(t, x, u, p) -> (xdot, y)`` in SI units, built from SX.
+    start_finder : StartFinder, optional
+        How this model starts from a log.
+    """
+
+    states: tuple[Quantity, ...]
+    inputs: tuple[Quantity, ...]
+    outputs: tuple[Quantity, ...]
+    parameters: ParameterSet
+    ode: ca.Function
+    start_finder: StartFinder | None = None
+
+    def __repr__(self) -> str:
+        return describe(self)
+
+    def starts(self, measured: Trajectory, parameters: ParameterSet) -> Sequence[Start]:
+        """Candidates from which an identification can start, from one log.
+
+        Parameters
+        ----------
+        measured : Trajectory
+            The log's channels.
+        parameters : ParameterSet
+            The known values, and which are free.
+
+        Returns
+        -------
+        sequence of Start
+            The most plausible first; without a finder, the measured outputs of a state's name and the given values.
+        """
+        if self.start_finder is not None:
+            return self.start_finder(measured, parameters)
+        columns = {s.name: measured[s.name] if s.name in measured else np.zeros(len(measured)) for s in self.states}
+        return [Start(Trajectory(measured.t, columns), {}, "as given")]
+
+    def equilibrium(self, u: Mapping[str, float], p: ParameterSet, guess: Mapping[str, float] | None = None) -> Array:
+        """Solve ``xdot(x, u, p) = 0`` by Newton from `guess` (zeros where absent), by least-norm steps.
+
+        Returns
+        -------
+        ndarray, shape (n_states,)
+
+        Raises
+        ------
+        ConvergenceError
+            If no equilibrium is found; the message names the state whose rate stays largest.
+        """
+        guess = dict(guess or {})
+        check_known("state", guess, names(self.states))
+        scale = np.array([s.nominal for s in self.states])
+        x = np.array([guess.get(s.name, 0.0) for s in self.states])
+        us, ps = self._inputs(u), vector(self.parameters, p)
+        for _ in range(100):
+            rate = np.array(self.ode(0, x, us, ps)[0]).ravel()
+            step, *_ = np.linalg.lstsq(np.array(self._jacobian(0, x, us, ps)[0]) * scale, -rate, rcond=1e-12)
+            x = x + step * scale
+            if np.max(np.abs(step), initial=0.0) < 1e-12:
+                break
+        rate = np.abs(np.array(self.ode(0, x, us, ps)[0]).ravel() / scale)
+        if not np.max(rate, initial=0.0) < 1e-6:
+            worst = self.states[int(np.argmax(rate))]
+            raise ConvergenceError(
+                f"no equilibrium found: d({worst.name})/dt stays at {rate.max() * worst.nominal:.3g} {worst.unit}/s", x
+            )
+        return x
+
+    def linearise(self, x: Array, u: Mapping[str, float], p: ParameterSet) -> Linearisation:
+        """Differentiate (AD) about a point; it need not be an equilibrium.
+
+        Parameters
+        ----------
+        x : array_like, shape (n_states,)
+        u : mapping of input name to value; absent ones are zero
+        p : ParameterSet
+
+        Returns
+        -------
+        Linearisation
+        """
+        matrices = self._jacobian(0, x, self._inputs(u), vector(self.parameters, p))
+        A, B, C, D = (np.array(m) for m in matrices)
+        return Linearisation(A, B, C, D, names(self.states), names(self.inputs), names(self.outputs))
+
+    @cached_property
+    def _jacobian(self) -> ca.Function:
+        t, x, u, p = (ca.SX.sym(n, self.ode.size1_in(i)) for i, n in enumerate("txup"))
+        xdot, y = self.ode(t, x, u, p)
+        return ca.Function("jacobian", [t, x, u, p], [ca.jacobian(f, v) for f in (xdot, y) for v in (x, u)])
+
+    def _inputs(self, u: Mapping[str, float]) -> Array:
+        check_known("input", u, names(self.inputs))
+        return np.array([u.get(q.name, 0.0) for q in self.inputs], dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteSystem:
+    """What happens from one sample to the next: an optional update at the instant, then `substeps` integration steps.
+
+    Parameters
+    ----------
+    states, inputs, outputs, parameters
+        As for `System`; the inputs are held from sample to sample.
+    step : casadi.Function
+        ``(t, h, x, u, p) -> (x_next, y)``: one integration step of length h [s], and the output at its beginning.
+    update : casadi.Function, optional
+        ``(t, x, u, p) -> x``: what a sampled controller does at the instant, before the steps and before y is read.
+    substeps : int
+        Integration steps from one sample to the next.
+    sample_time : float, optional
+        The controller's sample time [s]; None if any grid will do.
+    """
+
+    states: tuple[Quantity, ...]
+    inputs: tuple[Quantity, ...]
+    outputs: tuple[Quantity, ...]
+    parameters: ParameterSet
+    step: ca.Function
+    update: ca.Function | None = None
+    substeps: int = 1
+    sample_time: float | None = None
+
+    def __repr__(self) -> str:
+        return describe(self)
+
+    def with_substeps(self, substeps: int) -> "DiscreteSystem":
+        """Refine or coarsen the integration, by copy."""
+        require(substeps >= 1, f"substeps must be at least 1, got {substeps}")
+        return replace(self, substeps=substeps)
+
+    def sample(self, t: ca.MX, h: ca.MX, x: ca.MX, u: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Advance symbolically by one whole sample of length h; returns (x_next, y at the sample)."""
+        if self.update is not None:
+            x = self.update(t, x, u, p)
+        dt = h / self.substeps
+        y = self.step(t, dt, x, u, p)[1]
+        for k in range(self.substeps):
+            x = self.step(t + k * dt, dt, x, u, p)[0]
+        return x, y
+
+
+def define(
+    states: Sequence[Quantity],
+    inputs: Sequence[Quantity],
+    outputs: Sequence[Quantity],
+    parameters: ParameterSet,
+    rhs: Rhs,
+    start_finder: StartFinder | None = None,
+) -> System:
+    """Make a `System` from a right-hand side written with names.
+
+    Parameters
+    ----------
+    states, inputs, outputs : sequence of Quantity
+    parameters : ParameterSet
+    rhs : callable
+        ``rhs(t, x, u, p) -> (xdot, y)``: t an SX, the others mappings from name to SX.
+    start_finder : StartFinder, optional
+
+    Returns
+    -------
+    System
+
+    Raises
+    ------
+    ModelError
+        If the right-hand side leaves out a state's rate or an output.
+    """
+    t = ca.SX.sym("t")
+    x, u = symbols(states), symbols(inputs)
+    p = {n: ca.SX.sym(n) for n in parameters}
+    rates, measured = rhs(t, x, u, p)
+    xdot = _ordered("rate of state", rates, states)
+    y = _ordered("output", measured, outputs)
+    ode = ca.Function("ode", [t, *map(stacked, (x, u, p))], [xdot, y], ["t", "x", "u", "p"], ["xdot", "y"])
+    return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_finder)
+
+
+def discretise(system: System, substeps: int = 1) -> DiscreteSystem:
+    """Classical Runge-Kutta steps of fourth order (RK4); stable for h < 2.78/|lambda|."""
+    n = {k: system.ode.size1_in(i) for i, k in enumerate("txup")}
+    t, h = ca.SX.sym("t"), ca.SX.sym("h")
+    x, u, p = (ca.SX.sym(k, n[k]) for k in "xup")
+    k1, y = system.ode(t, x, u, p)
+    k2 = system.ode(t + h / 2, x + h / 2 * k1, u, p)[0]
+    k3 = system.ode(t + h / 2, x + h / 2 * k2, u, p)[0]
+    k4 = system.ode(t + h, x + h * k3, u, p)[0]
+    x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    step = ca.Function("step", [t, h, x, u, p], [x_next, y], ["t", "h", "x", "u", "p"], ["x_next", "y"])
+    return DiscreteSystem(
+        system.states, system.inputs, system.outputs, system.parameters, step, None, max(1, int(substeps))
+    )
+
+
+def symbols(quantities: Sequence[Quantity]) -> dict[str, ca.SX]:
+    """One SX scalar a signal, by name."""
+    return {q.name: ca.SX.sym(q.name) for q in quantities}
+
+
+def stacked(values: Symbols) -> ca.SX:
+    """The values of a mapping as one column, in order."""
+    return ca.vertcat(*values.values()) if values else ca.SX(0, 1)
+
+
+def names(quantities: Sequence[Quantity]) -> tuple[str, ...]:
+    """The signals' names, in order."""
+    return tuple(q.name for q in quantities)
+
+
+def vector(order: ParameterSet, values: ParameterSet) -> Array:
+    """The numbers of `values` in the order of `order`; a missing one keeps the default of `order`."""
+    return np.array([values.value(n) if n in values else order.value(n) for n in order], dtype=float)
+
+
+def describe(system: System | DiscreteSystem) -> str:
+    """Every state, input, output and parameter with its unit, a line each."""
+    lines = [type(system).__name__]
+    for kind in ("states", "inputs", "outputs"):
+        lines += [f"  {kind}: " + (", ".join(f"{q.name} [{q.unit}]" for q in getattr(system, kind)) or "none")]
+    lines += ["  parameters:"] + ["    " + line for line in repr(system.parameters).splitlines()]
+    return "\n".join(lines)
+
+
+def _ordered(kind: str, values: Symbols, quantities: Sequence[Quantity]) -> ca.SX:
+    check_known(kind, values, names(quantities))
+    for q in quantities:
+        require(q.name in values, f"the right-hand side gives no {kind} {q.name!r}", ModelError)
+    return ca.vertcat(*(values[q.name] for q in quantities)) if quantities else ca.SX(0, 1)
