@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -19,19 +19,35 @@ Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
 Update = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
 
 
+class Log(NamedTuple):
+    """One log as a start finder sees it: its channels, and the parameters as they are in it (conditions included)."""
+
+    measured: Trajectory
+    parameters: ParameterSet
+
+
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A candidate to start an identification from: states along a log, and parameters."""
+    """A candidate to start an identification from.
 
-    states: Trajectory
+    Attributes
+    ----------
+    states : mapping of str to Trajectory
+        States along each log, by the log's name.
+    parameters : mapping of str to float
+        By name; a `per_log` one as "name[log]".
+    label : str
+    """
+
+    states: Mapping[str, Trajectory]
     parameters: Mapping[str, float]
     label: str = ""
 
 
 class StartFinder(Protocol):
-    """What a model knows about starting from a log (equation error); see `System.starts`."""
+    """What a model knows about starting from logs (equation error); see `System.starts`."""
 
-    def __call__(self, measured: Trajectory, parameters: ParameterSet) -> Sequence[Start]:
+    def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates, the most plausible first."""
         ...
 
@@ -75,15 +91,13 @@ class System:
     def __repr__(self) -> str:
         return describe(self)
 
-    def starts(self, measured: Trajectory, parameters: ParameterSet) -> Sequence[Start]:
-        """Candidates from which an identification can start, from one log.
+    def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
+        """Candidates from which an identification can start.
 
         Parameters
         ----------
-        measured : Trajectory
-            The log's channels.
-        parameters : ParameterSet
-            The known values, and which are free.
+        logs : mapping of str to Log
+            By the log's name; which parameters are free is the same in all.
 
         Returns
         -------
@@ -91,9 +105,13 @@ class System:
             The most plausible first; without a finder, the measured outputs of a state's name and the given values.
         """
         if self.start_finder is not None:
-            return self.start_finder(measured, parameters)
-        columns = {s.name: measured[s.name] if s.name in measured else np.zeros(len(measured)) for s in self.states}
-        return [Start(Trajectory(measured.t, columns), {}, "as given")]
+            return self.start_finder(logs)
+        return [Start({name: self._as_logged(log.measured) for name, log in logs.items()}, {}, "as given")]
+
+    def _as_logged(self, measured: Trajectory) -> Trajectory:
+        zero = np.zeros(len(measured))
+        columns = {s.name: np.nan_to_num(measured[s.name]) if s.name in measured else zero for s in self.states}
+        return Trajectory(measured.t, columns)
 
     def equilibrium(self, u: Mapping[str, float], p: ParameterSet, guess: Mapping[str, float] | None = None) -> Array:
         """Solve ``xdot(x, u, p) = 0`` by Newton from `guess` (zeros where absent), by least-norm steps.

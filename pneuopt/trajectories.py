@@ -71,7 +71,7 @@ class Trajectory:
         """From the first sample to the last [s]."""
         return float(self.t[-1] - self.t[0])
 
-    def stack(self, names: Iterable[str]) -> Array:
+    def matrix(self, names: Iterable[str]) -> Array:
         """The named columns side by side, shape (n, len(names))."""
         columns = [self[name] for name in names]
         return np.column_stack(columns) if columns else np.empty((len(self), 0))

@@ -1,0 +1,217 @@
+"""Frequency response and robustness margins of a loop, and the sensitivity as a smooth limit for a tuner.
+
+How a tuner limits the maximum sensitivity Ms::
+
+    omega = frequency_grid(loop.open_loop(parameters), 20)   # or any grid of your own
+    terms = sensitivity_terms(loop, omega, parameters)       # once
+    terms(p) >= 1 / Ms**2                                    # p in the order of loop.parameters: numbers, SX or MX
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf, nan
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigvals
+from scipy.optimize import brentq, minimize_scalar
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.errors import ModelError, require
+from pneuopt.parameters import ParameterSet
+from pneuopt.system import Array, Linearisation
+
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far a loop is from instability; conventions of python-control.
+
+    Attributes
+    ----------
+    gain_margin : float
+        Factor on the gain that makes the loop oscillate, of several the closest to one; inf where there is none.
+    phase_margin : float
+        [deg], of several the smallest in size; inf where the gain never crosses one.
+    gain_crossover, phase_crossover : float
+        Where phase and gain margin are read [rad/s]; NaN where there is none.
+    max_sensitivity : float
+        ``Ms = max |1/(1 + L(jw))|``; its inverse is the Nyquist curve's distance from -1.
+    max_sensitivity_frequency : float
+        [rad/s]; inf if the sensitivity only approaches its maximum.
+    stable : bool
+        Whether the closed loop is stable; if not, the margins are no margins.
+    """
+
+    gain_margin: float
+    phase_margin: float
+    gain_crossover: float
+    phase_crossover: float
+    max_sensitivity: float
+    max_sensitivity_frequency: float
+    stable: bool
+
+
+def margins(open_loop: Linearisation) -> Margins:
+    """Margins of ``L(s)`` under negative feedback (`ClosedLoop.open_loop`).
+
+    Crossings are bracketed on `frequency_grid` and refined to machine precision.
+
+    Parameters
+    ----------
+    open_loop : Linearisation
+        One input, one output.
+
+    Returns
+    -------
+    Margins
+
+    Examples
+    --------
+    An integrator with two lags, ``L = 1/(s (s + 1)^2)``, crosses -180 deg at 1 rad/s with gain 1/2:
+
+    >>> A = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])
+    >>> B, C, D = np.array([[0.0], [0.0], [1.0]]), np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1))
+    >>> m = margins(Linearisation(A, B, C, D, ("x", "v", "a"), ("u",), ("x",)))
+    >>> round(m.gain_margin, 6), round(m.phase_crossover, 6), round(m.phase_margin, 2), m.stable
+    (2.0, 1.0, 21.39, True)
+    """
+
+    def response(omega: float) -> complex:
+        return complex(frequency_response(open_loop, [omega])[0])
+
+    omega = frequency_grid(open_loop)
+    L = frequency_response(open_loop, omega)
+    gain = _crossings(lambda w: float(np.log(abs(response(w)))), omega, np.log(np.abs(L)))
+    real = _crossings(lambda w: response(w).imag, omega, L.imag)
+    phases = [((float(np.angle(response(w), deg=True)) % 360) - 180, w) for w in gain]
+    gains = [(1 / abs(z), w) for w in real if (z := response(w)).real < 0]
+    gain_margin, phase_crossover = min(gains, key=lambda g: abs(np.log(g[0])), default=(inf, nan))
+    phase_margin, gain_crossover = min(phases, key=lambda m: abs(m[0]), default=(inf, nan))
+    peak, at = _max_sensitivity(open_loop, omega, L)
+    return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, peak, at, _stable(open_loop))
+
+
+def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:
+    """``C (jw I - A)^-1 B + D`` of a system with one input and one output.
+
+    Parameters
+    ----------
+    linearisation : Linearisation
+    omega : array_like, shape (n,)
+        [rad/s], positive.
+
+    Returns
+    -------
+    ndarray of complex, shape (n,)
+
+    Examples
+    --------
+    >>> lag = Linearisation(*(np.array([[v]]) for v in (-1.0, 1.0, 1.0, 0.0)), ("x",), ("u",), ("y",))
+    >>> complex(frequency_response(lag, [1.0])[0])
+    (0.5-0.5j)
+    """
+    single = linearisation.D.shape == (1, 1)
+    require(single, f"one input and one output expected, got D of shape {linearisation.D.shape}", ModelError)
+    w = np.asarray(omega, dtype=float)
+    require(bool(np.all(w > 0)), "frequencies must be positive [rad/s]")
+    resolvent = 1j * w[:, None, None] * np.eye(len(linearisation.A)) - linearisation.A
+    x = np.linalg.solve(resolvent, np.broadcast_to(linearisation.B.astype(complex), (len(w), *linearisation.B.shape)))
+    y: ComplexArray = np.asarray(linearisation.C @ x + linearisation.D, dtype=np.complex128)[:, 0, 0]
+    return y
+
+
+def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
+    """Frequencies that show every feature of a loop, open and closed [rad/s].
+
+    Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
+    """
+    roots = np.concatenate([eigvals(open_loop.A), _closed_poles(open_loop), _zeros(open_loop)])
+    size = [s for s in np.abs(roots) if s > 1e-10 * np.max(np.abs(roots))]
+    low, high = min(size, default=1.0), max(size, default=1.0)
+    decades = np.log10(high / low) + 6
+    grid = np.geomspace(1e-3 * low, 1e3 * high, int(np.ceil(decades * per_decade)) + 1)
+    ringing = roots[(roots.imag > 0) & (np.abs(roots.real) < 0.2 * roots.imag) & (roots.real != 0)]
+    around = [r.imag + abs(r.real) * np.linspace(-4, 4, 41) for r in ringing]
+    return np.unique(np.concatenate([grid, *around]))
+
+
+def sensitivity_terms(
+    loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet, x: Array | None = None
+) -> ca.Function:
+    """``|1 + L(jw)|^2`` as a smooth function of the PID's gains: at least ``1/Ms^2`` wherever Ms is kept.
+
+    The plant enters as numbers, its response at `parameters`; so a scenario with another plant has terms of its own.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    omega : array_like, shape (n,)
+        [rad/s], positive.
+    parameters : ParameterSet
+        The plant's values.
+    x : ndarray, shape (n_plant_states,), optional
+        The plant's operating point, as for `ClosedLoop.linear_plant`.
+
+    Returns
+    -------
+    casadi.Function
+        ``p -> terms``: p in the order of ``loop.parameters``, terms of shape (n,); depends on Kp, Ki, Kd and Tf only.
+
+    Raises
+    ------
+    ModelError
+        If a parameter of the plant is free: the terms would miss it.
+    """
+    free = [n for n in parameters.free_names if n in loop.plant.parameters]
+    require(not free, f"{', '.join(free)}: free, but the sensitivity takes the plant as fixed; fix it", ModelError)
+    w = np.asarray(omega, dtype=float)
+    h = loop.pid.sample_time or 0.0
+    P = frequency_response(loop.linear_plant(parameters, x), w) * (1 - 0.25j * w * h) / (1 + 0.25j * w * h)
+    p = {n: ca.SX.sym(n) for n in loop.parameters}
+    Kp, Ki, Kd, Tf = (p[f"pid.{n}"] for n in ("Kp", "Ki", "Kd", "Tf"))
+    ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
+    lag = 1 / (1 + (Tf * ws) ** 2)
+    a, b = Kp + Kd * Tf * ws**2 * lag, Kd * ws * lag - Ki / ws
+    terms = (1 + a * re - b * im) ** 2 + (a * im + b * re) ** 2
+    return ca.Function("sensitivity_terms", [ca.vertcat(*p.values())], [terms], ["p"], ["terms"])
+
+
+def _crossings(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:
+    """Roots between the grid's sign changes."""
+    brackets = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
+    exact = [float(w) for w in omega[values == 0]]
+    return sorted(exact + [float(brentq(function, omega[k], omega[k + 1], xtol=1e-14 * omega[k])) for k in brackets])
+
+
+def _max_sensitivity(open_loop: Linearisation, omega: Array, L: ComplexArray) -> tuple[float, float]:
+    def distance(log_w: float) -> float:
+        return float(abs(1 + frequency_response(open_loop, [np.exp(log_w)])[0]))
+
+    k = int(np.argmin(np.abs(1 + L)))
+    ends = np.log(omega[[max(k - 1, 0), min(k + 1, len(omega) - 1)]])
+    best = minimize_scalar(distance, bounds=tuple(ends), method="bounded", options={"xatol": 1e-12})
+    nearest, at = min((float(best.fun), float(np.exp(best.x))), (float(abs(1 + L[k])), float(omega[k])))
+    limit = float(abs(1 + open_loop.D[0, 0]))
+    return (1 / nearest, at) if nearest < limit else (1 / limit, inf)
+
+
+def _closed_poles(open_loop: Linearisation) -> ComplexArray:
+    feedback = open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0])
+    return np.asarray(eigvals(open_loop.A - feedback), dtype=complex)
+
+
+def _zeros(open_loop: Linearisation) -> ComplexArray:
+    n = len(open_loop.A)
+    pencil = np.block([[open_loop.A, open_loop.B], [open_loop.C, open_loop.D]])
+    zeros = np.asarray(eigvals(pencil, np.diag([1.0] * n + [0.0])), dtype=complex)
+    fastest = np.max(np.abs(eigvals(open_loop.A)), initial=1.0)
+    return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
+
+
+def _stable(open_loop: Linearisation) -> bool:
+    """Allows for modes at the origin that the loop does not see (a position in a speed loop, an unused integral)."""
+    poles = _closed_poles(open_loop)
+    return bool(np.max(poles.real, initial=-1.0) <= 1e-7 * np.max(np.abs(poles), initial=1.0))

@@ -1,0 +1,283 @@
+"""`Experiment`: a measured `Trajectory` with its noise and conditions; reading logs, cutting and resampling them."""
+
+import hashlib
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import LogError, check_known, require
+from pneuopt.logfile import CHANNELS, read_columns
+from pneuopt.trajectories import Trajectory
+from pneuopt.units import read_si, read_value
+
+__all__ = ["CHANNELS", "COMMANDS", "Experiment", "differentiate", "read_log", "resample", "split"]
+
+Array = NDArray[np.float64]
+
+COMMANDS = ("valve_voltage", "speed_reference", "position_reference")
+"""Channels that a controller holds from sample to sample; the others vary in between."""
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """What was measured, how well, and under which conditions.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        The channels in SI units; NaN marks a missing sample.
+    noise : mapping of str to float
+        Standard deviation of a channel [its unit]; a channel without one gets it estimated.
+    conditions : mapping of str to float
+        Known values [SI] that override the parameter of that name in this log.
+    name : str
+        What tables call it.
+    sha256 : str
+        Of the file's bytes, for provenance.
+
+    Raises
+    ------
+    InputError
+        If the noise names an unknown channel or is not positive, or a condition is not finite.
+
+    Examples
+    --------
+    >>> run = Experiment(Trajectory([0.0, 0.1], {"speed": [0.0, 0.2], "force": [1.0, 1.0]}), name="run_01")
+    >>> run.select(["speed"]).with_noise({"speed": 1e-3}).noise
+    {'speed': 0.001}
+    """
+
+    trajectory: Trajectory
+    noise: Mapping[str, float] = field(default_factory=dict)
+    conditions: Mapping[str, float] = field(default_factory=dict)
+    name: str = ""
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        where = self.name or "experiment"
+        check_known("channel", self.noise, self.trajectory, f"{where}: noise")
+        for channel, sigma in self.noise.items():
+            require(
+                0 < sigma < math.inf, f"{where}: noise of {channel!r} must be positive, got {sigma:g}; leave it out"
+            )
+        for parameter, value in self.conditions.items():
+            require(math.isfinite(value), f"{where}: condition {parameter!r} must be finite, got {value}")
+        object.__setattr__(self, "noise", dict(self.noise))
+        object.__setattr__(self, "conditions", dict(self.conditions))
+
+    def select(self, names: Iterable[str]) -> "Experiment":
+        """Keep the named channels, in that order, by copy."""
+        kept = self.trajectory.select(names)
+        return replace(self, trajectory=kept, noise={n: s for n, s in self.noise.items() if n in kept})
+
+    def with_noise(self, noise: Mapping[str, float]) -> "Experiment":
+        """Give the named channels a standard deviation [SI], by copy."""
+        return replace(self, noise={**self.noise, **noise})
+
+    def with_conditions(self, conditions: Mapping[str, float]) -> "Experiment":
+        """Override the named parameters [SI] in this log, by copy."""
+        return replace(self, conditions={**self.conditions, **conditions})
+
+
+def read_log(
+    path: str | Path,
+    *,
+    columns: Mapping[str, str | Mapping[str, str | float]] | None = None,
+    sidecar: str | Path | None = None,
+) -> Experiment:
+    """Read a log: a CSV file with one header row, and what its sidecar says about it.
+
+    Parameters
+    ----------
+    path : str or Path
+        Columns apart by comma, semicolon or tab; decimal point or comma; an empty cell is a missing sample.
+    columns : mapping, optional
+        Channel to column, in place of the sidecar's [columns]: "t [ms]", or a mapping with `column`, `unit`,
+        `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied). Without either, the header has to say
+        "position [mm]" or "position_mm".
+    sidecar : str or Path, optional
+        TOML with [columns], [noise], [conditions]; by default the file of the same name, if there is one.
+
+    Returns
+    -------
+    Experiment
+
+    Raises
+    ------
+    LogError, UnitError, UnknownNameError
+        If anything in the files is missing, ambiguous or not a number; the message names file, row, column, remedy.
+    """
+    path = Path(path)
+    raw = _read_bytes(path)
+    side, said = _read_sidecar(path, sidecar)
+    entries, where = (columns, "columns") if columns is not None else (said.get("columns"), f"{side}: columns")
+    values = read_columns(path, raw, entries, where)
+    trajectory = Trajectory(values.pop("time"), values)
+    conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in said.get("conditions", {}).items()}
+    noise = _noise(said.get("noise", {}), trajectory, f"{side}: noise")
+    return Experiment(trajectory, noise, conditions, path.stem, hashlib.sha256(raw).hexdigest())
+
+
+def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
+    """Cut into consecutive windows that do not overlap; the incomplete last one is dropped.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    duration : float
+        Of a window [s]: each has exactly ``round(duration / median step)`` samples, and keeps its times.
+
+    Returns
+    -------
+    tuple of Experiment
+        Named "name@0", "name@1", ...
+
+    Raises
+    ------
+    InputError
+        If a window would hold fewer than two samples, or more than the log has.
+
+    Examples
+    --------
+    >>> run = Experiment(Trajectory([0.0, 0.1, 0.2, 0.3, 0.4], {"speed": [0, 1, 2, 3, 4]}), name="run")
+    >>> [(w.name, w.trajectory.t.tolist()) for w in split(run, 0.2)]
+    [('run@0', [0.0, 0.1]), ('run@1', [0.2, 0.3])]
+    """
+    trajectory = experiment.trajectory
+    step = _median_step(trajectory)
+    n = round(duration / step)
+    require(
+        2 <= n <= len(trajectory),
+        f"windows of {duration:g} s hold {n} samples of {experiment.name or 'the log'}, which has {len(trajectory)}, "
+        f"one every {step:g} s; choose between {2 * step:g} and {len(trajectory) * step:g} s",
+    )
+    starts = range(0, len(trajectory) - n + 1, n)
+    return tuple(
+        replace(experiment, trajectory=trajectory.rows(i, i + n), name=f"{experiment.name}@{k}")
+        for k, i in enumerate(starts)
+    )
+
+
+def resample(experiment: Experiment, step: float) -> Experiment:
+    """Bring onto a uniform grid: commands hold their last value, other channels are interpolated linearly.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    step : float
+        Of the new grid [s]. Nothing is filtered: a step far above the log's own folds its noise back.
+
+    Returns
+    -------
+    Experiment
+        A sample beside a missing one is missing, too.
+
+    Raises
+    ------
+    InputError
+        If the step is not positive, or longer than the log.
+    """
+    old = experiment.trajectory
+    require(0 < step <= old.duration, f"a step of {step:g} s does not fit a log of {old.duration:g} s")
+    grid = old.t[0] + step * np.arange(math.floor(old.duration / step * (1 + 1e-12)) + 1)
+    grid[-1] = min(grid[-1], old.t[-1])
+    # A grid point that rounding puts just before its sample still belongs to that sample.
+    held = np.searchsorted(old.t, grid + 1e-9 * step, side="right") - 1
+    values = {n: c[held] if n in COMMANDS else np.interp(grid, old.t, c) for n, c in old.values.items()}
+    return replace(experiment, trajectory=Trajectory(grid, values))
+
+
+def differentiate(experiment: Experiment, *, window: float, position: str = "position") -> Experiment:
+    """Add "speed": the slope of a parabola fitted to the positions around each sample (Savitzky-Golay on any grid).
+
+    Parameters
+    ----------
+    experiment : Experiment
+    window : float
+        Width of the fit [s]; noise falls with its power 1.5, the bandwidth with its first.
+    position : str
+        The channel to differentiate [m].
+
+    Returns
+    -------
+    Experiment
+        NaN where the position is missing or its window holds fewer than three samples.
+
+    Raises
+    ------
+    InputError
+        If there is a speed already, or the window is too narrow for the log's step.
+
+    Examples
+    --------
+    >>> run = Experiment(Trajectory([0.0, 0.1, 0.3, 0.4], {"position": [0.0, 0.01, 0.09, 0.16]}))
+    >>> differentiate(run, window=0.6).trajectory["speed"].round(9).tolist()
+    [0.0, 0.2, 0.6, 0.8]
+    """
+    old = experiment.trajectory
+    require("speed" not in old, "the log has a speed already; select the other channels first")
+    step = _median_step(old)
+    require(window >= 2 * step, f"a window of {window:g} s holds fewer than 3 samples; take {4 * step:g} s or more")
+    speed = _local_slope(old.t, old[position], window / 2)
+    return replace(experiment, trajectory=old.with_columns({"speed": speed}))
+
+
+def _local_slope(t: Array, x: Array, reach: float) -> Array:
+    """Slope at each sample of the least-squares parabola through the samples no farther than `reach`."""
+    known, n = np.isfinite(x), t.size
+    first, last = np.searchsorted(t, t - reach * (1 + 1e-9)), np.searchsorted(t, t + reach * (1 + 1e-9), side="right")
+    moments, loads = np.zeros((5, n)), np.zeros((3, n))
+    every = np.arange(n)
+    for shift in range(int((first - every).min()), int((last - every).max())):
+        j = np.clip(every + shift, 0, n - 1)
+        w = ((every + shift >= first) & (every + shift < last) & known[j]).astype(float)
+        s, dx = (t[j] - t) / reach, np.where(w > 0, x[j] - x, 0.0)
+        for power in range(5):
+            moments[power] += w
+            if power < 3:
+                loads[power] += w * dx
+            w = w * s
+    enough = known & (moments[0] >= 3)
+    normal = moments[np.add.outer(np.arange(3), np.arange(3))].transpose(2, 0, 1)[enough]
+    slope = np.full(n, np.nan)
+    slope[enough] = np.linalg.solve(normal, loads.T[enough][..., None])[:, 1, 0] / reach
+    return slope
+
+
+def _median_step(trajectory: Trajectory) -> float:
+    require(len(trajectory) > 1, "a log of one sample has no time step")
+    return float(np.median(np.diff(trajectory.t)))
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
+
+
+def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping[str, Any]]:
+    side = path.with_suffix(".toml") if sidecar is None else Path(sidecar)
+    if sidecar is None and not side.exists():
+        return side, {}
+    raw = _read_bytes(side)
+    try:
+        said = tomllib.loads(raw.decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise LogError(f"{side}: not valid TOML: {error}") from None
+    check_known("key", said, ("columns", "noise", "conditions"), str(side))
+    for key, section in said.items():
+        require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
+    return side, said
+
+
+def _noise(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, float]:
+    check_known("channel", entries, trajectory, where)
+    # A noise is a difference, so a pressure's takes no (a) or (g).
+    return {c: read_value(v, CHANNELS[c].partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}

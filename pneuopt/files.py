@@ -1,0 +1,383 @@
+"""Files that people edit: drive.toml, and fit.toml made from it; whole or not at all, comments kept.
+
+A value is "32 mm", or a table where it may be free: { value = "40 N", lower = "5 N", upper = "90 N", free = true }.
+"""
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import InlineTable, Table
+
+from pneuopt.errors import InputError, UnknownNameError, check_known, require
+from pneuopt.experiments import CHANNELS
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
+from pneuopt.models.load import Load
+from pneuopt.nlp.status import Code, Status
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.system import System
+from pneuopt.units import read_value, write_value
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Sections = Mapping[str, Mapping[str, Any]]
+
+FRICTION: Mapping[str, Callable[[], FrictionModel]] = {
+    "viscous": Viscous,
+    "coulomb": Coulomb,
+    "stribeck": Stribeck,
+    "lugre": LuGre,
+}
+PLANTS = ("first_order", "second_order", "integrator")
+CHAMBERS = ("pressure_a", "pressure_b")
+RESULTS = ("estimates", "status", "provenance")
+"""Sections that a result adds to a drive's file; reading the drive passes over them."""
+
+# What a section says about the drive's structure; every other key of it is a parameter.
+_STRUCTURE: Sections = {
+    "drive": {"kind": "text"},
+    "load": {"spring": "true or false"},
+    "friction": {"model": "text", "asymmetric": "true or false", "pressure_dependent": "true, false or a list"},
+    "plant": {"model": "text", "input": "text", "output": "text", "pade_order": "a whole number"},
+    "rig": {"chamber": "true or false"},
+}
+_TYPES: Mapping[str, tuple[type, ...]] = {
+    "text": (str,),
+    "true or false": (bool,),
+    "true, false or a list": (bool, list),
+    "a whole number": (int,),
+}
+_FLAGS = ("free", "log", "per_log")
+_FIELDS = ("value", "lower", "upper", *_FLAGS, "source")
+
+
+class Drive(Protocol):
+    """What a drive.toml describes."""
+
+    def system(self) -> System:
+        """Its equations, with every parameter's default."""
+        ...
+
+
+class Fitted(Protocol):
+    """What `write_fit` needs of a result."""
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """All parameters, the free ones as found."""
+        ...
+
+    @property
+    def estimates(self) -> "pd.DataFrame":
+        """A row a free parameter."""
+        ...
+
+    @property
+    def status(self) -> Status:
+        """How it ended."""
+        ...
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Versions, options, the data's sha256."""
+        ...
+
+
+def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
+    """Read a TOML file with its comments.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    TOMLDocument
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is not TOML; the message names the line.
+    """
+    try:
+        return tomlkit.parse(Path(path).read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file in UTF-8; save it so") from None
+    except TOMLKitError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a file whole or not at all: into a neighbour first, which then takes its place.
+
+    Parameters
+    ----------
+    path : str or Path
+    text : str
+        Lines end with a newline character on every system.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist, or cannot be written to.
+    """
+    path = Path(path)
+    require(path.parent.is_dir(), f"{path}: the folder does not exist; make it first")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
+    """Write a table as JSON: a list of records, one a row; what is not finite becomes null.
+
+    Parameters
+    ----------
+    path : str or Path
+    frame : DataFrame
+        An index that is more than a count goes into each record, as "name" if it has no name of its own.
+    """
+    import pandas as pd
+
+    numbered = isinstance(frame.index, pd.RangeIndex)
+    table = frame if numbered else frame.reset_index(names=str(frame.index.name or "name"))
+    records = [{str(k): _plain(v) for k, v in record.items()} for record in table.to_dict(orient="records")]
+    finite = [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in records]
+    write_text(path, json.dumps(finite, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
+    """Read a drive and its numbers.
+
+    Parameters
+    ----------
+    path : str or Path
+        A drive.toml, or a fit.toml made from one.
+
+    Returns
+    -------
+    drive : ForceDrive, MotionDrive, FirstOrder, SecondOrder or Integrator
+        By [drive] kind and the other sections.
+    parameters : ParameterSet
+        All of `drive.system().parameters`; one that the file leaves out keeps the model's default.
+
+    Raises
+    ------
+    InputError
+        UnitError, UnknownNameError or other; the message names file, section and key.
+    """
+    said = read_toml(path).unwrap()
+    sections = {name: section for name, section in said.items() if name not in RESULTS}
+    check_known("section", sections, (*_STRUCTURE, "ambient"), str(path))
+    for name, section in sections.items():
+        require(isinstance(section, dict), f"{path}: {name} must be a section, [{name}]")
+    drive = _build(sections, path)
+    defaults = drive.system().parameters
+    return drive, _filled(defaults, sections, path)
+
+
+def read_status(path: str | Path) -> Status | None:
+    """How the fit in a file ended; None for a file that no fit has written.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Status or None
+
+    Raises
+    ------
+    InputError
+        If the status is none that pneuopt writes.
+    """
+    said = read_toml(path).unwrap().get("status")
+    if said is None:
+        return None
+    codes = [code.value for code in Code]
+    require(isinstance(said, dict), f"{path}: status must be a section, [status]")
+    check_known("status", [str(said.get("code"))], codes, f"{path}: [status] code")
+    return Status(Code(said["code"]), str(said.get("message", "")))
+
+
+def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
+    """Write a drive's file with the values found: the user's text and comments, [estimates], [status], [provenance].
+
+    Parameters
+    ----------
+    path : str or Path
+        `read_drive` reads it; a result that did not converge is written, too, and `read_status` says so.
+    source : str or Path
+        The drive.toml that the result was made from.
+    result : Fitted
+        An `IdentificationResult`, say.
+
+    Raises
+    ------
+    InputError
+        If one of the files cannot be read or written.
+    """
+    document, given = read_toml(source), read_drive(source)[1]
+    for name, found in result.parameters.items():
+        if name in given and found != given[name]:
+            _fill(document, name, found, given[name])
+    rows = result.estimates.to_dict(orient="index")
+    document["estimates"] = _section({str(name): _inline(row) for name, row in rows.items()})
+    document["status"] = _section({"code": result.status.code.value, "message": result.status.message})
+    document["provenance"] = _section(_plain(result.provenance))
+    write_text(path, tomlkit.dumps(document))
+
+
+def _build(sections: Sections, path: str | Path) -> Drive:
+    for name, known in _STRUCTURE.items():
+        for key in known.keys() & sections.get(name, {}).keys():
+            right = type(sections[name][key]) in _TYPES[known[key]]
+            require(right, f"{path}: [{name}] {key} must be {known[key]}, got {sections[name][key]!r}")
+    kind = _choice(sections, "drive", "kind", _KINDS, path)
+    return _KINDS[kind](sections, path)
+
+
+def _force(sections: Sections, path: str | Path) -> Drive:
+    return ForceDrive(_friction(sections, path), Load(spring=sections.get("load", {}).get("spring", False)))
+
+
+def _motion(sections: Sections, path: str | Path) -> Drive:
+    return MotionDrive(_friction(sections, path), chamber=sections.get("rig", {}).get("chamber", True))
+
+
+def _linear(sections: Sections, path: str | Path) -> Drive:
+    plant = sections.get("plant", {})
+    model = _choice(sections, "plant", "model", PLANTS, path)
+    signals = [plant.get("input", "valve_voltage"), plant.get("output", "speed")]
+    check_known("channel", signals, CHANNELS, f"{path}: [plant]")
+    u, y = (Quantity(name, CHANNELS[name]) for name in signals)
+    # Order 3 follows a delay up to 4.6 rad of phase and adds three states; 0 leaves the dead time out.
+    order = plant.get("pade_order", 3 if "dead_time" in plant else 0)
+    if model == "second_order":
+        return SecondOrder(order, _friction(sections, path) if "friction" in sections else None, u, y)
+    return (FirstOrder if model == "first_order" else Integrator)(order, u, y)
+
+
+_KINDS: Mapping[str, Callable[[Sections, str | Path], Drive]] = {"force": _force, "motion": _motion, "linear": _linear}
+
+
+def _friction(sections: Sections, path: str | Path) -> FrictionModel:
+    said = sections.get("friction", {})
+    model = FRICTION[_choice(sections, "friction", "model", FRICTION, path)]()
+    if said.get("asymmetric", False):
+        model = Asymmetric(model)
+    dependent = said.get("pressure_dependent", False)
+    if not dependent:
+        return model
+    chambers = CHAMBERS if dependent is True else tuple(dependent)
+    check_known("chamber", chambers, CHAMBERS, f"{path}: [friction] pressure_dependent")
+    return PressureDependent(model, chambers)
+
+
+def _choice(
+    sections: Sections, section: str, key: str, known: Sequence[str] | Mapping[str, Any], path: str | Path
+) -> str:
+    value = sections.get(section, {}).get(key)
+    if value is None:
+        raise InputError(f'{path}: [{section}] says no {key}; write {key} = "...", one of: {", ".join(known)}')
+    check_known(key, [value], known, f"{path}: [{section}]")
+    return str(value)
+
+
+def _filled(defaults: ParameterSet, sections: Sections, path: str | Path) -> ParameterSet:
+    known = {name.partition(".")[0] for name in defaults} | {"drive"}
+    known |= {name for name in ("friction", "plant") if any(n.startswith(f"{name}.") for n in defaults)}
+    edits: dict[str, Parameter] = {}
+    for section, entries in sections.items():
+        if section not in known:
+            raise UnknownNameError("section", section, known, f"{path}: kind {sections['drive']['kind']!r}")
+        structure = _STRUCTURE.get(section, {})
+        keys = [name.partition(".")[2] for name in defaults if name.startswith(f"{section}.")]
+        check_known("key", entries, [*structure, *keys], f"{path}: [{section}]")
+        for key in (k for k in entries if k not in structure):
+            name = f"{section}.{key}"
+            edits[name] = _parameter(entries[key], defaults[name], f"{path}: [{section}] {key}")
+    return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
+
+
+def _parameter(entry: Any, default: Parameter, where: str) -> Parameter:
+    fields = entry if isinstance(entry, dict) else {"value": entry}
+    check_known("key", fields, _FIELDS, where)
+    numbers: dict[str, Any] = {f: read_value(fields[f], default.unit, where=where) for f in _FIELDS[:3] if f in fields}
+    for flag in _FLAGS:
+        require(isinstance(fields.get(flag, False), bool), f"{where}: {flag} must be true or false")
+    others = {f: fields[f] for f in (*_FLAGS, "source") if f in fields}
+    if "value" in fields:
+        others.setdefault("source", "")
+    try:
+        return replace(default, **numbers, **others)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _fill(document: tomlkit.TOMLDocument, name: str, found: Parameter, given: Parameter) -> None:
+    """Put a value in its place; the table form only where more than the value differs, or the user chose it."""
+    section, _, key = name.partition(".")
+    if section not in document:
+        document[section] = tomlkit.table()
+    entries: Any = document[section]
+    fields: dict[str, Any] = {f: _written(getattr(found, f), found) for f in _FIELDS[:3] if _differ(f, found, given)}
+    fields |= {f: getattr(found, f) for f in (*_FLAGS, "source") if _differ(f, found, given)}
+    entry = entries.get(key)
+    if isinstance(entry, InlineTable | Table):
+        entry.update(fields)
+    elif fields.keys() == {"value"}:
+        entries[key] = fields["value"]
+    else:
+        entries[key] = _inline({"value": entry or _written(found.value, found)} | fields)
+
+
+def _differ(field: str, found: Parameter, given: Parameter) -> bool:
+    return bool(getattr(found, field) != getattr(given, field))
+
+
+def _written(value: float, parameter: Parameter) -> str:
+    """Nine digits, or all of them where rounding would cross a bound."""
+    text = write_value(value, parameter.unit, 9)
+    inside = parameter.lower <= read_value(text, parameter.unit) <= parameter.upper
+    return text if inside else write_value(value, parameter.unit, 17)
+
+
+def _section(entries: Mapping[str, Any]) -> Table:
+    table = tomlkit.table()
+    table.update(entries)
+    return table
+
+
+def _inline(entries: Mapping[Any, Any]) -> InlineTable:
+    table = tomlkit.inline_table()
+    table.update(_plain(entries))
+    return table
+
+
+def _plain(value: Any) -> Any:
+    """What TOML and JSON can hold: NumPy's scalars as Python's, nothing for None, text for what is neither."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value if v is not None]
+    value = value.item() if hasattr(value, "item") else value
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

@@ -1,0 +1,328 @@
+"""`identify`: parameters with confidence intervals, from logs, by lifted multiple shooting; `validate`: held-out runs.
+
+Nothing here knows what the system is: it hands over its starts (`System.starts`) and is otherwise an ODE with names.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import ConvergenceError, LogError, check_known, require
+from pneuopt.experiments import Experiment
+from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
+from pneuopt.nlp.status import Code, Status
+from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.provenance import provenance
+from pneuopt.simulate import simulate
+from pneuopt.statistics import agreement, confidence_interval, noise_level
+from pneuopt.system import Log, Start, System, discretise, names
+from pneuopt.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+REFERENCES = ("speed_reference", "position_reference")  # a loop's set-points may stay in a log; no plant reads them
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationResult:
+    """What `identify` found.
+
+    Attributes
+    ----------
+    parameters : ParameterSet
+        The given ones with the estimates filled in; a `per_log` parameter keeps its given value here.
+    estimates : DataFrame
+        A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
+        at_bound, unit, source. No interval at a bound or where the data do not determine the parameter.
+    covariance : DataFrame
+        Of the estimates, scaled by the residuals' own level.
+    fit : DataFrame
+        A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit.
+    trajectories : mapping of str to Trajectory
+        Fitted states and outputs of each log.
+    status : Status
+    stats : mapping of str to float
+    provenance : mapping of str to str
+    """
+
+    parameters: ParameterSet
+    estimates: "pd.DataFrame"
+    covariance: "pd.DataFrame"
+    fit: "pd.DataFrame"
+    trajectories: Mapping[str, Trajectory]
+    status: Status
+    stats: Mapping[str, float]
+    provenance: Mapping[str, str]
+
+
+def identify(
+    system: System,
+    experiments: Sequence[Experiment],
+    parameters: ParameterSet,
+    *,
+    method: LeastSquares | None = None,
+    throw: bool = True,
+) -> IdentificationResult:
+    """Fit the free parameters and every log's start state to the logs; no guess is needed from the user.
+
+    Parameters
+    ----------
+    system : System
+    experiments : sequence of Experiment
+        Each with all inputs and at least one output of the system. Missing outputs and samples do not count.
+    parameters : ParameterSet
+        The free ones are estimated; the others are known, unless a log's conditions override them.
+    method : LeastSquares, optional
+    throw : bool
+        Raise if the fit did not converge; otherwise the result says so in its status.
+
+    Returns
+    -------
+    IdentificationResult
+
+    Raises
+    ------
+    InputError
+        If logs, system and parameters do not fit together; the message names log, channel or parameter.
+    ConvergenceError
+        If no candidate start converged; the error's `solution` is the result, marked.
+    """
+    method = method or LeastSquares()
+    experiments = _checked(system, experiments, parameters)
+    problem = _Problem(system, tuple(experiments), parameters, method)
+    fit, label = _best(problem, method)
+    result = problem.result(fit, label)
+    if throw and not result.status.converged:
+        raise ConvergenceError(f"identification {result.status}", result)
+    return result
+
+
+def validate(system: System, experiments: Sequence[Experiment], parameters: ParameterSet) -> "pd.DataFrame":
+    """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
+
+    Parameters
+    ----------
+    system : System
+    experiments : sequence of Experiment
+        Best such as no fit has seen.
+    parameters : ParameterSet
+
+    Returns
+    -------
+    DataFrame
+        A row a log and channel: rmse, nrmse, fit_percent, samples, unit.
+    """
+    import pandas as pd
+
+    fixed = parameters.fixed(*parameters.free_names)
+    whole = LeastSquares(segment_time=math.inf)
+    rows = []
+    for experiment in _checked(system, experiments, fixed):
+        problem = _Problem(system, (experiment,), fixed, whole)
+        start = problem.candidates()[0]
+        initial = solve_least_squares(problem.transcription(start), whole).solution.trajectories[0]
+        state = {s.name: float(initial[s.name][0]) for s in system.states}
+        run = simulate(system, experiment.trajectory, _conditioned(fixed, experiment), initial=state)
+        rows += _agreements(system, experiment, run)
+    return pd.DataFrame(rows).set_index(["log", "channel"])
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What is to be identified, and its translation to a transcription and back."""
+
+    system: System
+    experiments: tuple[Experiment, ...]
+    parameters: ParameterSet
+    method: LeastSquares
+
+    def candidates(self) -> Sequence[Start]:
+        """The model's own starts from all logs together."""
+        logs = {e.name: Log(e.trajectory, _conditioned(self.parameters, e)) for e in self.experiments}
+        return self.system.starts(logs)
+
+    def unknowns(self) -> ParameterSet:
+        """The problem's parameters: the system's, each log's conditions, each log's own copies."""
+        own: dict[str, Parameter] = {}
+        shared = dict(self.system.parameters | self.parameters)
+        for experiment in self.experiments:
+            for name, value in experiment.conditions.items():
+                own[f"{name}[{experiment.name}]"] = Parameter(value, shared[name].unit, source="condition of the log")
+        for name in self.parameters.free_names:
+            if self.parameters[name].per_log:
+                shared[name] = replace(self.parameters[name], free=False)
+                own |= {f"{name}[{e.name}]": self.parameters[name] for e in self.experiments}
+        return ParameterSet({**shared, **own})
+
+    def transcription(self, candidate: Start) -> Transcription:
+        """Pose the problem as multiple shooting, started from a candidate."""
+        phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
+        residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
+        parameters = self.unknowns().with_values(candidate.parameters)
+        return Transcription(discretise(self.system), parameters, phases, residuals)
+
+    def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
+        t = experiment.trajectory.t
+        h = np.append(np.diff(t), np.diff(t)[-1])
+        inputs = experiment.trajectory.matrix(names(self.system.inputs))
+        nodes = every(len(t), self._segment(h))
+        return Phase(experiment.name, t, h, inputs, nodes, guess=states.matrix(names(self.system.states)))
+
+    def _segment(self, h: Array) -> int:
+        """Samples between two nodes; a static map has no gaps, so its cut is only for batching."""
+        if not self.system.states:
+            return 100
+        samples = self.method.segment_time / float(np.median(h))
+        return len(h) if math.isinf(samples) else max(2, round(samples))
+
+    def _residuals(self, index: int, experiment: Experiment) -> Residuals:
+        outputs = _measured_outputs(self.system, experiment)
+        noise = np.array([experiment.noise[o] for o in outputs])
+        return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
+
+    def result(self, fit: Fit, label: str) -> IdentificationResult:
+        """Read the solver's answer back into parameters and tables."""
+        solution = fit.solution
+        free = solution.parameters.free_names
+        variance = fit.chi_square / max(1, fit.count - len(free))
+        covariance = None if fit.covariance is None else fit.covariance * variance
+        shared = [n for n in free if n in self.parameters]
+        values = {n: solution.parameters.value(n) for n in shared}
+        runs = {e.name: t for e, t in zip(self.experiments, solution.trajectories, strict=True)}
+        return IdentificationResult(
+            self.parameters.with_values(values),
+            _estimates(solution.parameters.select(free), covariance, fit.at_bound, solution.status),
+            _square(free, covariance),
+            _fit_table(self.system, self.experiments, runs),
+            runs,
+            solution.status,
+            {**solution.stats, "chi_square_ratio": variance},
+            {**provenance(self.method), "start": label, **{f"sha256[{e.name}]": e.sha256 for e in self.experiments}},
+        )
+
+
+def _best(problem: _Problem, method: LeastSquares) -> tuple[Fit, str]:
+    """The first candidate that converges; if none does, the one of least cost, with how many were tried."""
+    candidates = problem.candidates()
+    fits: list[tuple[Fit, str]] = []
+    for candidate in candidates:
+        fit = solve_least_squares(problem.transcription(candidate), method)
+        if fit.solution.status.code in (Code.CONVERGED, Code.INTERRUPTED):
+            return fit, candidate.label
+        fits.append((fit, candidate.label))
+    fit, label = min(fits, key=lambda f: f[0].solution.stats["cost"])
+    status = fit.solution.status
+    told = Status(status.code, f"none of {len(fits)} starts converged; in the best, {status.message}")
+    return replace(fit, solution=replace(fit.solution, status=told)), label
+
+
+def _checked(system: System, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
+    """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
+    require(len(experiments) > 0, "no experiments: give at least one log", LogError)
+    check_known("parameter", parameters, system.parameters)
+    known = {*names(system.inputs), *names(system.outputs), *REFERENCES}
+    taken: set[str] = set()
+    out = []
+    for number, experiment in enumerate(experiments, 1):
+        name = experiment.name or f"log {number}"
+        name = name if name not in taken else f"{name} ({number})"
+        taken.add(name)
+        _check_channels(system, experiment, name, known)
+        check_known("parameter", experiment.conditions, system.parameters, f"{name}: condition")
+        out.append(replace(experiment, name=name))
+    return _with_noise(system, out)
+
+
+def _check_channels(system: System, experiment: Experiment, name: str, known: set[str]) -> None:
+    trajectory = experiment.trajectory
+    for q in system.inputs:
+        needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
+        require(q.name in trajectory, needed + ", ".join(trajectory.names), LogError)
+        missing = np.flatnonzero(~np.isfinite(trajectory[q.name]))
+        where = f"t = {trajectory.t[missing[0]]:g} s" if missing.size else ""
+        require(
+            not missing.size, f"{name}: input {q.name!r} is missing at {where}; cut or fill the log there", LogError
+        )
+    for channel in trajectory:
+        remedy = "leave it out (Experiment.select, or the sidecar's [columns])"
+        reads = ", ".join(sorted(known.difference(REFERENCES)))
+        message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
+        require(channel in known, message, LogError)
+    outputs = ", ".join(names(system.outputs))
+    require(bool(_measured_outputs(system, experiment)), f"{name}: none of the outputs is logged: {outputs}", LogError)
+    require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
+
+
+def _with_noise(system: System, experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Where a log declares no noise: the median over all logs of what the channel shows, for sensors are shared."""
+    found: dict[str, list[float]] = {}
+    for experiment in experiments:
+        for channel in set(_measured_outputs(system, experiment)).difference(experiment.noise):
+            found.setdefault(channel, []).append(noise_level(experiment.trajectory[channel]))
+    pooled = {channel: float(np.nanmedian(levels)) for channel, levels in found.items() if not np.isnan(levels).all()}
+    for channel in found:
+        message = (
+            f"{experiments[0].name}: channel {channel!r} is constant; leave it out, or log a run in which it moves"
+        )
+        require(channel in pooled, message, LogError)
+    return [
+        e.with_noise({n: s for n, s in pooled.items() if n in e.trajectory and n not in e.noise}) for e in experiments
+    ]
+
+
+def _measured_outputs(system: System, experiment: Experiment) -> tuple[str, ...]:
+    inputs = names(system.inputs)
+    return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)
+
+
+def _conditioned(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:
+    """The parameters as they are in one log."""
+    conditions = {n: v for n, v in experiment.conditions.items() if n in parameters}
+    return parameters.with_values(conditions)
+
+
+def _fit_table(system: System, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
+    import pandas as pd
+
+    rows = [row for e in experiments for row in _agreements(system, e, runs[e.name])]
+    return pd.DataFrame(rows).set_index(["log", "channel"])
+
+
+def _agreements(system: System, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
+    units = {q.name: q.unit for q in system.outputs}
+    rows: list[dict[str, object]] = []
+    for channel in _measured_outputs(system, experiment):
+        figures = agreement(experiment.trajectory[channel], run[channel])
+        noise = experiment.noise[channel]
+        rows.append({"log": experiment.name, "channel": channel, **figures, "noise": noise, "unit": units[channel]})
+    return rows
+
+
+def _estimates(
+    parameters: ParameterSet, covariance: Array | None, at_bound: NDArray[np.bool_], status: Status
+) -> "pd.DataFrame":
+    import pandas as pd
+
+    usable = covariance is not None and status.code is not Code.DIVERGED
+    stderr = np.sqrt(np.diag(covariance)) if usable and covariance is not None else np.full(len(parameters), math.nan)
+    rows = {}
+    for (name, p), spread, bound in zip(parameters.items(), stderr, at_bound, strict=True):
+        deviation = math.nan if bound else float(spread)
+        low, high = confidence_interval(p.value, deviation, log=p.log)
+        rows[name] = [p.value, deviation, low, high, p.lower, p.upper, bool(bound), p.unit, p.source]
+    columns = ["value", "stderr", "ci_low", "ci_high", "lower", "upper", "at_bound", "unit", "source"]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+
+
+def _square(free: Sequence[str], covariance: Array | None) -> "pd.DataFrame":
+    import pandas as pd
+
+    values = np.full((len(free), len(free)), math.nan) if covariance is None else covariance
+    return pd.DataFrame(values, index=list(free), columns=list(free))

@@ -1,0 +1,128 @@
+"""Drives wired from parts: `ForceDrive` (pushed by a known force), `MotionDrive` (moved, its friction measured)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+
+from pneuopt.models.friction import FrictionModel
+from pneuopt.models.friction_start import force_starts, motion_starts
+from pneuopt.models.load import Load
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.system import System, define
+
+Symbols = Mapping[str, ca.SX]
+ATMOSPHERE = 101325.0  # [Pa] standard atmosphere, ISO 2533
+POSITION = Quantity("position", "m", nominal=0.1)
+SPEED = Quantity("speed", "m/s", nominal=0.5)
+FORCE = Quantity("force", "N", nominal=100.0)
+
+
+@dataclass(frozen=True)
+class ForceDrive:
+    """Load and friction pushed by a known force: any servo axis, or a cylinder whose chamber pressures are logged.
+
+    M dv/dt = F - F_f(v) - F_L. Inputs: force [N], and the chambers' absolute pressures where friction depends on them.
+
+    Parameters
+    ----------
+    friction : FrictionModel
+    load : Load
+    """
+
+    friction: FrictionModel
+    load: Load = field(default_factory=Load)
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """load.*, friction.*, and ambient.pressure where friction depends on pressure."""
+        own = self.load.parameters.prefixed("load") | self.friction.parameters.prefixed("friction")
+        return own | _ambient(self.friction)
+
+    def system(self) -> System:
+        """Wire the parts: states position, speed and the friction's; outputs position, speed."""
+        inner = tuple(_renamed(q, f"friction.{q.name}") for q in self.friction.states)
+
+        def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
+            v, y = x["speed"], x["position"]
+            force = self.friction.force(v, _part(x, "friction"), _gauge(self.friction, u, p), _part(p, "friction"))
+            acceleration = self.load.acceleration(u["force"] - force.value, y, _part(p, "load"))
+            rates = {f"friction.{n}": rate for n, rate in force.rates.items()}
+            return {"position": v, "speed": acceleration, **rates}, {"position": y, "speed": v}
+
+        inputs = (FORCE, *_pressures(self.friction))
+        return define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, force_starts)
+
+
+@dataclass(frozen=True)
+class MotionDrive:
+    """A friction rig: the piston is moved at a known speed, the force on it is measured.
+
+    force = area * (1 + area_bias) * (p_a - p_ambient) + F_f(v, p) + force_offset, with the pressure in one chamber, the
+    other open. Without a chamber: force = F_f(v) + force_offset.
+
+    Parameters
+    ----------
+    friction : FrictionModel
+    chamber : bool
+        Whether the pressure of a chamber acts on the piston; input pressure_a [Pa(a)].
+    """
+
+    friction: FrictionModel
+    chamber: bool = True
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """rig.*, friction.*, and ambient.pressure where a pressure acts."""
+        area = Parameter(4.908738521e-4, "m^2", lower=1e-7, upper=10.0, source="bore 25 mm")
+        bias = Parameter(0.0, "1", lower=-0.5, upper=0.5)
+        rig = {"rig.area": area, "rig.area_bias": bias} if self.chamber else {}
+        offset = ParameterSet({**rig, "rig.force_offset": Parameter(0.0, "N", lower=-1e4, upper=1e4)})
+        ambient = _AMBIENT if self.chamber else _ambient(self.friction)
+        return offset | self.friction.parameters.prefixed("friction") | ambient
+
+    def system(self) -> System:
+        """Wire the parts: no state but the friction's; output force."""
+        inner = tuple(_renamed(q, f"friction.{q.name}") for q in self.friction.states)
+
+        def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
+            force = self.friction.force(
+                u["speed"], _part(x, "friction"), _gauge(self.friction, u, p), _part(p, "friction")
+            )
+            push = p["rig.force_offset"] + force.value
+            if self.chamber:
+                push += p["rig.area"] * (1 + p["rig.area_bias"]) * (u["pressure_a"] - p["ambient.pressure"])
+            return {f"friction.{n}": rate for n, rate in force.rates.items()}, {"force": push}
+
+        pressures = _pressures(self.friction)
+        if self.chamber and "pressure_a" not in (q.name for q in pressures):
+            pressures = (_PRESSURE_A, *pressures)
+        return define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, motion_starts)
+
+
+_AMBIENT = ParameterSet(
+    {"ambient.pressure": Parameter(ATMOSPHERE, "Pa(a)", lower=1e4, upper=2e5, source="ISO 2533 standard atmosphere")}
+)
+_PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
+
+
+def _ambient(friction: FrictionModel) -> ParameterSet:
+    return _AMBIENT if friction.inputs else ParameterSet()
+
+
+def _pressures(friction: FrictionModel) -> tuple[Quantity, ...]:
+    """The absolute pressures that a pressure-dependent friction needs as inputs."""
+    return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs)
+
+
+def _gauge(friction: FrictionModel, u: Symbols, p: Symbols) -> Symbols:
+    return {q.name: u[q.name] - p["ambient.pressure"] for q in friction.inputs}
+
+
+def _part(values: Symbols, prefix: str) -> Symbols:
+    """The entries ``prefix.name`` by their own name."""
+    return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
+
+
+def _renamed(quantity: Quantity, name: str) -> Quantity:
+    return Quantity(name, quantity.unit, quantity.nominal, quantity.lower, quantity.upper)

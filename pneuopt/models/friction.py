@@ -1,0 +1,248 @@
+"""Friction of seals, guides and bearings, from viscous to LuGre; wrappers add asymmetry and pressure dependence.
+
+Signs: the force opposes positive speed when positive. Every map is smooth; `smoothing` is the speed over which the
+Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import casadi as ca
+
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+
+Symbols = Mapping[str, ca.SX]
+STICKING_SPEED = 1e-6  # [m/s] rounds |v| in LuGre; larger values creep visibly (PHYSICS section 3)
+
+
+class Force(NamedTuple):
+    """A friction force and the rates of its internal states.
+
+    Attributes
+    ----------
+    value : SX
+        [N]
+    rates : mapping of str to SX
+        One an internal state, by name.
+    """
+
+    value: ca.SX
+    rates: Symbols
+
+
+class FrictionModel(Protocol):
+    """What a drive needs of a friction model; one level, no inheritance."""
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """Internal states; none for a static map."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Gauge pressures, where friction depends on them."""
+        ...
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Defaults, with units and bounds."""
+        ...
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
+        """Force at speed v [m/s] with internal states z, inputs u and parameters p."""
+        ...
+
+
+@dataclass(frozen=True)
+class Viscous:
+    """F = viscous * v."""
+
+    states: tuple[Quantity, ...] = ()
+    inputs: tuple[Quantity, ...] = ()
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Its one number: viscous [N*s/m]."""
+        return ParameterSet({"viscous": _VISCOUS})
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
+        """See the class."""
+        return Force(p["viscous"] * v, {})
+
+
+@dataclass(frozen=True)
+class Coulomb:
+    """F = coulomb * tanh(v / smoothing) + viscous * v."""
+
+    states: tuple[Quantity, ...] = ()
+    inputs: tuple[Quantity, ...] = ()
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Numbers: coulomb [N], viscous [N*s/m], smoothing [m/s]."""
+        return ParameterSet({"coulomb": _COULOMB, "viscous": _VISCOUS, "smoothing": _SMOOTHING})
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
+        """See the class."""
+        return Force(p["coulomb"] * ca.tanh(v / p["smoothing"]) + p["viscous"] * v, {})
+
+
+@dataclass(frozen=True)
+class Stribeck:
+    """F = g(v) tanh(v / smoothing) + viscous * v, with `stribeck_curve` g."""
+
+    states: tuple[Quantity, ...] = ()
+    inputs: tuple[Quantity, ...] = ()
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Numbers: coulomb, static [N], stribeck_velocity [m/s], viscous [N*s/m], smoothing [m/s]."""
+        return ParameterSet({**_STRIBECK, "viscous": _VISCOUS, "smoothing": _SMOOTHING})
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
+        """See the class."""
+        g = stribeck_curve(v, p["coulomb"], p["static"], p["stribeck_velocity"])
+        return Force(g * ca.tanh(v / p["smoothing"]) + p["viscous"] * v, {})
+
+
+@dataclass(frozen=True)
+class LuGre:
+    r"""Bristle deflection z with the Stribeck curve g (Canudas de Wit et al., IEEE TAC 40(3), 1995).
+
+    .. math:: \dot z = v - \sigma_0 |v| z / g(v), \qquad F = \sigma_0 z + \sigma_1 e^{-(v/v_d)^2} \dot z + \sigma_2 v
+
+    The damping fades with speed (v_d), which keeps the model passive for any viscous friction (PHYSICS section 3).
+    """
+
+    inputs: tuple[Quantity, ...] = ()
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """One: bristle [m], the mean deflection of the bristles."""
+        return (Quantity("bristle", "m", nominal=4e-4),)
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Numbers: coulomb, static [N], stribeck_velocity [m/s], viscous, and the bristles' stiffness and damping."""
+        bristles = {
+            "bristle_stiffness": Parameter(5e4, "N/m", lower=1e3, upper=1e7, log=True),
+            "bristle_damping": Parameter(300.0, "N*s/m", lower=1.0, upper=1e4, log=True),
+            "damping_velocity": Parameter(0.05, "m/s", lower=1e-4, upper=1e3, log=True),
+        }
+        return ParameterSet({**_STRIBECK, "viscous": _VISCOUS, **bristles})
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
+        """See the class."""
+        g = stribeck_curve(v, p["coulomb"], p["static"], p["stribeck_velocity"])
+        rate = v - p["bristle_stiffness"] * ca.sqrt(v**2 + STICKING_SPEED**2) * z["bristle"] / g
+        damping = p["bristle_damping"] * ca.exp(-((v / p["damping_velocity"]) ** 2))
+        force = p["bristle_stiffness"] * z["bristle"] + damping * rate + p["viscous"] * v
+        return Force(force, {"bristle": rate})
+
+
+@dataclass(frozen=True)
+class Asymmetric:
+    """A base model whose levels differ between the directions: times ``1 + asymmetry * tanh(v / asymmetry_width)``.
+
+    Coulomb friction is ``coulomb * (1 + coulomb_asymmetry)`` forwards, ``coulomb * (1 - coulomb_asymmetry)`` backwards.
+    """
+
+    base: FrictionModel
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """Those of the base model."""
+        return self.base.states
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Those of the base model."""
+        return self.base.inputs
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Those of the base, coulomb_asymmetry (static shares it), viscous_asymmetry [1], asymmetry_width [m/s]."""
+        ratio = Parameter(0.0, "1", lower=-0.95, upper=0.95)
+        added = {"viscous_asymmetry": ratio, "asymmetry_width": _SMOOTHING}
+        coulomb = {"coulomb_asymmetry": ratio} if "coulomb" in self.base.parameters else {}
+        return self.base.parameters | ParameterSet({**coulomb, **added})
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
+        """See the class."""
+        side = ca.tanh(v / p["asymmetry_width"])
+        levels = {"coulomb": "coulomb_asymmetry", "static": "coulomb_asymmetry", "viscous": "viscous_asymmetry"}
+        scaled = {n: p[n] * (1 + p[a] * side) for n, a in levels.items() if n in p}
+        return self.base.force(v, z, u, {**p, **scaled})
+
+
+@dataclass(frozen=True)
+class PressureDependent:
+    """A base model whose Coulomb and static levels rise with both chambers' gauge pressures: + c_a p_a + c_b p_b.
+
+    Source: PHYSICS section 3; coefficients of 0.5-3e-5 m^2 are plausible for seals of 25-40 mm.
+    """
+
+    base: FrictionModel
+    chambers: tuple[str, ...] = ("pressure_a", "pressure_b")
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """Those of the base model."""
+        return self.base.states
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """The chambers' gauge pressures [Pa(g)]."""
+        return tuple(Quantity(name, "Pa(g)", nominal=1e5) for name in self.chambers)
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Those of the base, and one coefficient [N/Pa] a chamber."""
+        slope = Parameter(0.0, "N/Pa", lower=-1e-3, upper=1e-3)
+        return self.base.parameters | ParameterSet({f"coulomb_{name}": slope for name in self.chambers})
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
+        """See the class."""
+        rise = sum((p[f"coulomb_{name}"] * u[name] for name in self.chambers), start=ca.SX(0))
+        raised = {n: p[n] + rise for n in ("coulomb", "static") if n in p}
+        return self.base.force(v, z, u, {**p, **raised})
+
+
+def stribeck_curve(v: ca.SX, coulomb: ca.SX, static: ca.SX, stribeck_velocity: ca.SX) -> ca.SX:
+    """Sliding friction level g(v) = F_c + (F_s - F_c) exp(-(v/v_s)^2).
+
+    Parameters
+    ----------
+    v : SX or float
+        Speed [m/s].
+    coulomb, static : SX or float
+        F_c and F_s [N].
+    stribeck_velocity : SX or float
+        v_s [m/s], positive.
+
+    Returns
+    -------
+    SX or float
+        [N], between F_c and F_s.
+
+    Notes
+    -----
+    Source: Armstrong-Helouvry et al., Automatica 30(7), 1994, with the Gaussian exponent 2.
+
+    Examples
+    --------
+    >>> round(float(stribeck_curve(0.02, 40.0, 70.0, 0.02)), 4)
+    51.0364
+    """
+    return coulomb + (static - coulomb) * ca.exp(-((v / stribeck_velocity) ** 2))
+
+
+_VISCOUS = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5)
+_COULOMB = Parameter(30.0, "N", lower=0.0, upper=1e5)
+_SMOOTHING = Parameter(1e-3, "m/s", lower=1e-6, upper=1.0, log=True)
+_STRIBECK = {
+    "coulomb": _COULOMB,
+    "static": Parameter(45.0, "N", lower=0.0, upper=1e5),
+    "stribeck_velocity": Parameter(0.02, "m/s", lower=1e-4, upper=1.0, log=True),
+}

@@ -1,0 +1,225 @@
+"""Where an identification of friction starts, without a guess from the user: equation error on the filtered log.
+
+Given the Stribeck velocity, a drive's force is linear in its other parameters; so for each of a few velocities one
+bounded linear least squares gives a candidate, in milliseconds (NUMERICS section 3, steps 1 and 2).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from scipy.signal import savgol_filter
+
+from pneuopt.errors import LogError, require
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.system import Log, Start
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the order that succeeded most often
+FILTER_TIME = 0.031  # [s] window of the Savitzky-Golay filter, order 3
+SLIDING_SPEED = 4e-3  # [m/s] slower samples say nothing of sliding friction
+STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recipe
+
+
+def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
+    """Candidates for a `ForceDrive`: states from the filtered logs, parameters from M a + F_f(v) + F_L = F.
+
+    Raises
+    ------
+    LogError
+        If a log has neither position nor speed.
+    """
+    rows = {}
+    for name, (measured, parameters) in logs.items():
+        position, speed, acceleration = motion(measured)
+        inertia = {"load.mass": acceleration, "load.force": np.ones(len(measured))}
+        states = {"position": position, "speed": speed}
+        rows[name] = _Rows(measured, parameters, speed, measured["force"], inertia, states)
+    return _candidates(rows)
+
+
+def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
+    """Candidates for a `MotionDrive`: parameters from the measured force at the imposed speed and pressure."""
+    rows = {}
+    for name, (measured, parameters) in logs.items():
+        force, rig = measured["force"], {"rig.force_offset": np.ones(len(measured))}
+        if "rig.area" in parameters:
+            push = parameters.value("rig.area") * (measured["pressure_a"] - parameters.value("ambient.pressure"))
+            force = force - push
+            rig["rig.area_bias"] = push
+        rows[name] = _Rows(measured, parameters, measured["speed"], force, rig, {})
+    return _candidates(rows)
+
+
+def motion(measured: Trajectory) -> tuple[Array, Array, Array]:
+    """Filtered position [m], speed [m/s] and acceleration [m/s^2], from whichever of position and speed is logged."""
+    require(
+        "position" in measured or "speed" in measured,
+        "the log has neither 'position' nor 'speed'; friction cannot be told without motion",
+        LogError,
+    )
+    step = float(np.median(np.diff(measured.t)))
+    window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
+    window = min(window, (len(measured) - 1) // 2 * 2 + 1)
+
+    def filtered(column: Array, derivative: int) -> Array:
+        return np.asarray(savgol_filter(column, window, min(3, window - 1), deriv=derivative, delta=step))
+
+    if "position" in measured:
+        column = _filled(measured, "position")
+        position, acceleration = filtered(column, 0), filtered(column, 2)
+        speed = filtered(_filled(measured, "speed"), 0) if "speed" in measured else filtered(column, 1)
+        return position, speed, acceleration
+    column = _filled(measured, "speed")
+    speed, acceleration = filtered(column, 0), filtered(column, 1)
+    return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(measured.t))]), speed, acceleration
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """One log's part of the regression: ``force = sum(columns * parameters) + friction``."""
+
+    measured: Trajectory
+    parameters: ParameterSet
+    speed: Array
+    force: Array
+    columns: Mapping[str, Array]
+    states: Mapping[str, Array]
+
+
+def _candidates(logs: Mapping[str, _Rows]) -> Sequence[Start]:
+    parameters = next(iter(logs.values())).parameters
+    searched = "friction.stribeck_velocity" in parameters.free_names
+    given = parameters.value("friction.stribeck_velocity") if "friction.stribeck_velocity" in parameters else np.inf
+    starts = []
+    for velocity in STRIBECK_VELOCITIES if searched else (given,):
+        values = _regress(logs, parameters, velocity)
+        if searched:
+            bounds = parameters["friction.stribeck_velocity"]
+            values["friction.stribeck_velocity"] = float(np.clip(velocity, bounds.lower, bounds.upper))
+        label = f"stribeck velocity {velocity:g} m/s" if searched else "equation error"
+        bristles = _bristles(logs, values)
+        states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
+        starts.append(Start(states, values, label))
+    return starts
+
+
+def _regress(logs: Mapping[str, _Rows], parameters: ParameterSet, velocity: float) -> dict[str, float]:
+    """Bounded linear least squares over all logs' sliding samples, with four Cauchy reweights."""
+    parts = [_log_columns(name, rows, velocity) for name, rows in logs.items()]
+    free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
+    if not free:
+        return {}
+    A = np.vstack([np.column_stack([columns.get(n, np.zeros(len(y))) for n in free]) for columns, y in parts])
+    y = np.concatenate([y for _, y in parts])
+    known = np.isfinite(y)
+    sliding = known & (np.abs(np.concatenate([r.speed for r in logs.values()])) > SLIDING_SPEED)
+    rows = sliding if np.count_nonzero(sliding) > 10 * len(free) else known
+    bases = [parameters[n.split("[")[0]] for n in free]
+    lower, upper = _bounds(free, bases, float(np.median(np.abs(y[rows]))))
+    x = _robust(A[rows], y[rows], lower, upper)
+    values = dict(zip(free, x.tolist(), strict=True))
+    if "friction.static" in values:
+        values["friction.static"] += values.get("friction.coulomb", parameters.value("friction.coulomb"))
+    return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in zip(free, bases, strict=True)}
+
+
+def _log_columns(name: str, rows: _Rows, velocity: float) -> tuple[dict[str, Array], Array]:
+    """A log's free columns ("name[log]" if its own), and its force less what is known."""
+    p = rows.parameters
+    columns = {n: c for n, c in {**rows.columns, **_friction_columns(rows, velocity)}.items() if n in p}
+    known = {n: p.value(n) for n in columns}
+    if "friction.static" in known:
+        known["friction.static"] -= p.value("friction.coulomb")
+    target = rows.force - sum(
+        (known[n] * c for n, c in columns.items() if not p[n].free), start=np.zeros(len(rows.force))
+    )
+    return {f"{n}[{name}]" if p[n].per_log else n: c for n, c in columns.items() if p[n].free}, target
+
+
+def _friction_columns(rows: _Rows, velocity: float) -> dict[str, Array]:
+    """What multiplies each friction parameter in the force; static friction counts as the part above Coulomb's."""
+    parameters, speed = rows.parameters, rows.speed
+    smoothing = parameters.value("friction.smoothing") if "friction.smoothing" in parameters else 1e-3
+    side = np.tanh(speed / smoothing)
+    peak = np.exp(-((speed / velocity) ** 2))
+    columns = {"friction.coulomb": side, "friction.static": side * peak, "friction.viscous": speed}
+    for chamber in ("pressure_a", "pressure_b"):
+        if f"friction.coulomb_{chamber}" in parameters:
+            gauge = rows.measured[chamber] - parameters.value("ambient.pressure")
+            columns[f"friction.coulomb_{chamber}"] = side * gauge
+    return columns
+
+
+def _robust(A: Array, y: Array, lower: Array, upper: Array) -> Array:
+    scale = np.linalg.norm(A, axis=0) + 1e-300
+    weight, x = np.ones(len(A)), np.zeros(A.shape[1])
+    for _ in range(5):
+        fit = lsq_linear(A / scale * weight[:, None], y * weight, (lower * scale, upper * scale))
+        x = np.clip(np.asarray(fit.x) / scale, lower, upper)
+        error = y - A @ x
+        spread = 1.4826 * np.median(np.abs(error)) + 1e-12
+        weight = 1 / np.sqrt(1 + (error / (2.385 * spread)) ** 2)
+    return x
+
+
+def _bounds(free: Sequence[str], bases: Sequence[Parameter], level: float) -> tuple[Array, Array]:
+    """Of the regression: the parameters' own, and floors that keep friction positive (NUMERICS section 3, step 2)."""
+    floors = {"friction.coulomb": 0.05 * level, "friction.static": 0.0015 * level, "friction.viscous": 0.0}
+    given = [0.0 if n == "friction.static" else p.lower for n, p in zip(free, bases, strict=True)]
+    lower = np.array([max(floors.get(n, -np.inf), lo) for n, lo in zip(free, given, strict=True)])
+    upper = np.array([max(p.upper, lo + 1e-9) for p, lo in zip(bases, lower, strict=True)])
+    return lower, upper
+
+
+def _bristles(logs: Mapping[str, _Rows], values: dict[str, float]) -> dict[str, dict[str, Array]]:
+    """The bristle deflection along each log, and their stiffness from presliding motion (changes `values`)."""
+    parameters = next(iter(logs.values())).parameters
+    if "friction.bristle_stiffness" not in parameters:
+        return {}
+
+    def number(name: str) -> float:
+        return values.get(name, parameters.value(name))
+
+    friction = {n: _friction_force(n, rows, values) for n, rows in logs.items()}
+    stiffness = parameters["friction.bristle_stiffness"]
+    if stiffness.free:
+        slope = _presliding_slope(logs, friction, 0.6 * number("friction.coulomb"))
+        low, high = max(STIFFNESS_RANGE[0], stiffness.lower), min(STIFFNESS_RANGE[1], stiffness.upper)
+        values["friction.bristle_stiffness"] = float(np.clip(slope, low, high))
+    limit = number("friction.static") / number("friction.bristle_stiffness")
+    deflections = {
+        n: (friction[n] - number("friction.viscous") * rows.speed) / number("friction.bristle_stiffness")
+        for n, rows in logs.items()
+    }
+    return {n: {"friction.bristle": np.clip(z, -limit, limit)} for n, z in deflections.items()}
+
+
+def _presliding_slope(logs: Mapping[str, _Rows], friction: Mapping[str, Array], level: float) -> float:
+    """sum(dF/dt v) / sum(v^2) over slow samples below the sliding level [N/m]; zero where there are none."""
+    rate, speed = [], []
+    for n, rows in logs.items():
+        presliding = (np.abs(rows.speed) < 0.01) & (np.abs(friction[n]) < level)
+        rate.append(np.gradient(friction[n], rows.measured.t)[presliding])
+        speed.append(rows.speed[presliding])
+    v = np.concatenate(speed)
+    return float(np.concatenate(rate) @ v / max(float(v @ v), 1e-300))
+
+
+def _friction_force(name: str, rows: _Rows, values: Mapping[str, float]) -> Array:
+    """The force less what inertia, load and offsets take [N]."""
+    p = rows.parameters
+    used = {n: c for n, c in rows.columns.items() if n in p}
+    taken = (values.get(n, values.get(f"{n}[{name}]", p.value(n))) * c for n, c in used.items())
+    return np.asarray(rows.force - sum(taken))
+
+
+def _filled(measured: Trajectory, name: str) -> Array:
+    """The column with missing samples interpolated, for filters only."""
+    column = measured[name]
+    known = np.isfinite(column)
+    require(bool(known.any()), f"channel {name!r} has no samples", LogError)
+    return np.interp(measured.t, measured.t[known], column[known])

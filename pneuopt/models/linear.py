@@ -1,0 +1,295 @@
+"""Transfer-function plants with named signals: first order, second order, integrator; dead time; a delay by samples.
+
+A dead time is a Padé approximant of order 1 to 5, realised in states: a lossless ladder whose states keep the input's
+unit and size at every dead time, so that the dead time is an ordinary, differentiable parameter. Its fastest pole lies
+at 2, 3.5, 5.1, 6.8, 8.5 divided by the dead time (orders 1 to 5), and RK4 steps of h are stable for dead times above
+0.72, 1.22, 1.87, 2.57, 3.26 h: the lower limit. At zero the approximant is singular; `pade_order=0` leaves it out.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from pneuopt.errors import ModelError, check_known, require
+from pneuopt.models.friction import FrictionModel
+from pneuopt.models.linear_starts import LinearStarts, Shape
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.system import DiscreteSystem, Symbols, System, define, names
+
+VALVE_VOLTAGE = Quantity("valve_voltage", "V")
+SPEED = Quantity("speed", "m/s")
+HIGHEST_PADE_ORDER = 5
+Dynamics = Callable[[ca.SX, Symbols, Symbols], dict[str, ca.SX]]
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """``time_constant dy/dt + y = gain u(t - dead_time)``.
+
+    Parameters
+    ----------
+    pade_order : int
+        Order of the dead time's approximant; 0: no dead time.
+    input, output : Quantity
+        The signals u and y; the parameters' units follow from theirs.
+
+    Examples
+    --------
+    >>> plant = FirstOrder().system()
+    >>> plant.linearise([0.0], {}, plant.parameters.with_values({"plant.time_constant": 0.5})).A.item()
+    -2.0
+    """
+
+    pade_order: int = 0
+    input: Quantity = VALVE_VOLTAGE
+    output: Quantity = SPEED
+
+    def system(self) -> System:
+        """The plant as an ODE."""
+        y = self.output.name
+
+        def dynamics(u: ca.SX, x: Symbols, p: Symbols) -> dict[str, ca.SX]:
+            return {y: (p["plant.gain"] * u - x[y]) / p["plant.time_constant"]}
+
+        own = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True)}
+        shape = Shape(("plant.time_constant",), lambda tau: ([1.0], [tau, 1.0]))
+        return _plant(self, (self.output,), _gain(self.input, self.output, ""), ParameterSet(own), dynamics, shape)
+
+
+@dataclass(frozen=True)
+class SecondOrder:
+    r"""``y'' + 2 damping w y' + w² y = gain w² u(t - dead_time)``, w the natural frequency; with friction if wanted.
+
+    Friction is an equivalent input: in steady motion the speed y takes the voltage ``y / gain + F(y)``. It acts where
+    the force does, behind the drive's own lag, so that the drive sticks; with d, the acceleration without friction::
+
+        y' = d - gain w F(y) / (2 damping)        d' = w² (gain u(t - dead_time) - y) - 2 damping w d
+
+    Without friction, d is y' and the two equations are the transfer function above. All damping is taken as the drive's
+    (a motor's winding, a valve's leakage). F is smooth and in the input's unit; its viscous part is zero by default,
+    because the gain holds it already.
+
+    Parameters
+    ----------
+    pade_order : int
+        Order of the dead time's approximant; 0: no dead time.
+    friction : FrictionModel, optional
+        Its forces are read in the unit of the input, its speed is the output.
+    input, output : Quantity
+        The signals u and y; the parameters' units follow from theirs.
+
+    Examples
+    --------
+    >>> plant = SecondOrder().system()
+    >>> rest = plant.equilibrium({"valve_voltage": 2.0}, plant.parameters.with_values({"plant.gain": 0.5}))
+    >>> round(float(rest[0]), 9)
+    1.0
+    """
+
+    pade_order: int = 0
+    friction: FrictionModel | None = None
+    input: Quantity = VALVE_VOLTAGE
+    output: Quantity = SPEED
+
+    def __post_init__(self) -> None:
+        require(
+            self.friction is None or not self.friction.inputs,
+            f"{type(self.friction).__name__} needs pressures, which this plant has not; choose another friction",
+            ModelError,
+        )
+
+    def system(self) -> System:
+        """The plant as an ODE; its states are the output, "drive" (d above), then those of friction and dead time."""
+        y, friction = self.output.name, self.friction
+
+        def dynamics(u: ca.SX, x: Symbols, p: Symbols) -> dict[str, ca.SX]:
+            gain, w, zeta = (p[f"plant.{n}"] for n in ("gain", "natural_frequency", "damping"))
+            rates = {y: x["drive"], "drive": w**2 * (gain * u - x[y]) - 2 * zeta * w * x["drive"]}
+            if friction is None:
+                return rates
+            force = friction.force(x[y], _without_prefix(x), {}, _without_prefix(p))
+            rates[y] -= gain * w / (2 * zeta) * force.value
+            return rates | {f"friction.{n}": rate for n, rate in force.rates.items()}
+
+        own = ParameterSet(
+            {
+                "plant.natural_frequency": Parameter(10.0, "rad/s", 1e-3, 1e5, log=True),
+                "plant.damping": Parameter(0.7, "1", 1e-3, 1e3, log=True),
+            }
+        )
+        if friction is not None:
+            own = own | _as_input(friction.parameters, self.input).prefixed("friction")
+        inner = friction.states if friction is not None else ()
+        drive = Quantity("drive", _over(self.output, "s"), 10 * self.output.nominal)
+        states = (self.output, drive, *(replace(s, name=f"friction.{s.name}") for s in inner))
+        shape = Shape(tuple(own)[:2], lambda w, zeta: ([w**2], [1.0, 2 * zeta * w, w**2]), self._resisting())
+        return _plant(self, states, _gain(self.input, self.output, ""), own, dynamics, shape)
+
+    def _resisting(self) -> Callable[[float, float], tuple[list[float], list[float]]] | None:
+        """Response to friction, of unit gain: ``w² (s / (2 damping w) + 1)`` over the plant's denominator."""
+        if self.friction is None:
+            return None
+        return lambda w, zeta: ([w / (2 * zeta), w**2], [1.0, 2 * zeta * w, w**2])
+
+
+@dataclass(frozen=True)
+class Integrator:
+    """``dy/dt = gain u(t - dead_time)``: a valve's opening to a position, say.
+
+    Parameters
+    ----------
+    pade_order : int
+        Order of the dead time's approximant; 0: no dead time.
+    input, output : Quantity
+        The signals u and y; the gain's unit follows from theirs.
+
+    Examples
+    --------
+    >>> Integrator(output=Quantity("position", "m")).system().parameters["plant.gain"].unit
+    'm/(V*s)'
+    """
+
+    pade_order: int = 0
+    input: Quantity = VALVE_VOLTAGE
+    output: Quantity = SPEED
+
+    def system(self) -> System:
+        """The plant as an ODE."""
+        y = self.output.name
+
+        def dynamics(u: ca.SX, _: Symbols, p: Symbols) -> dict[str, ca.SX]:
+            return {y: p["plant.gain"] * u}
+
+        shape = Shape((), lambda: ([1.0], [1.0, 0.0]))
+        return _plant(self, (self.output,), _gain(self.input, self.output, "*s"), ParameterSet(), dynamics, shape)
+
+
+Plant = FirstOrder | SecondOrder | Integrator
+
+
+def delayed(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) -> DiscreteSystem:
+    """Delay inputs by whole samples: a shift register that moves at each sample's update.
+
+    Parameters
+    ----------
+    system : DiscreteSystem
+    samples : int
+        At least 1; the step at sample k then sees the input of sample k - samples, and zero before the first.
+    inputs : tuple of str
+        Which inputs are delayed; empty: all of them.
+
+    Returns
+    -------
+    DiscreteSystem
+        With `samples` + 1 more states an input, named "valve_voltage_delay_0" (now) and so on.
+
+    Raises
+    ------
+    ModelError
+        If `samples` is below 1.
+    UnknownNameError
+        If one of `inputs` is no input of the system.
+    """
+    require(
+        samples >= 1,
+        f"a delay needs at least 1 sample, got {samples}; without a delay use the system itself",
+        ModelError,
+    )
+    check_known("input", inputs, names(system.inputs))
+    chosen = [q for q in system.inputs if not inputs or q.name in inputs]
+    registers = tuple(replace(q, name=f"{q.name}_delay_{k}") for q in chosen for k in range(samples + 1))
+    n, m = len(system.states), samples + 1
+    t, h = ca.SX.sym("t"), ca.SX.sym("h")
+    x, u = ca.SX.sym("x", n + len(registers)), ca.SX.sym("u", len(system.inputs))
+    p = ca.SX.sym("p", len(system.parameters))
+    late, shifted, place = ca.SX(u), ca.SX(x), {q.name: i for i, q in enumerate(system.inputs)}
+    for i, q in enumerate(chosen):
+        first = n + i * m
+        shifted[first : first + m] = ca.vertcat(u[place[q.name]], x[first : first + m - 1])
+        late[place[q.name]] = x[first + m - 1]
+    x_next, y = system.step(t, h, x[:n], late, p)
+    step = ca.Function(
+        "step", [t, h, x, u, p], [ca.vertcat(x_next, x[n:]), y], ["t", "h", "x", "u", "p"], ["x_next", "y"]
+    )
+    if system.update is not None:
+        now = ca.substitute(late, x, shifted)
+        shifted[:n] = system.update(t, x[:n], now, p)
+    update = ca.Function("update", [t, x, u, p], [shifted], ["t", "x", "u", "p"], ["x"])
+    return replace(system, states=system.states + registers, step=step, update=update)
+
+
+def _plant(
+    plant: Plant, states: tuple[Quantity, ...], gain: Parameter, own: ParameterSet, dynamics: Dynamics, shape: Shape
+) -> System:
+    """Put the gain and the dead time around a plant's own dynamics."""
+    order, source = plant.pade_order, plant.input
+    line = _delay_line(source, order)
+    parameters = ParameterSet({"plant.gain": gain}) | own
+    if order:
+        parameters = parameters | ParameterSet({"plant.dead_time": Parameter(0.01, "s", 1e-3, 10.0, log=True)})
+
+    def rhs(_: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
+        late, rates = _pade(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
+        moving = dynamics(late, x, p) | {q.name: r for q, r in zip(line, rates, strict=True)}
+        return moving, {plant.output.name: x[plant.output.name]}
+
+    others = tuple(n for n in names(states) if n not in {plant.output.name, "drive"})
+    find = LinearStarts(shape, source.name, plant.output.name, names(line), others)
+    return define(states + line, (source,), (plant.output,), parameters, rhs, find)
+
+
+def _delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:
+    valid = isinstance(order, int) and 0 <= order <= HIGHEST_PADE_ORDER
+    require(valid, f"pade_order must be 0 to {HIGHEST_PADE_ORDER}, got {order}", ModelError)
+    return tuple(Quantity(f"{source.name}_delay_{k}", source.unit, source.nominal) for k in range(1, order + 1))
+
+
+def _pade(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX]]:
+    """Padé approximant [n/n] of a delay: the ladder that Lambert's continued fraction of tanh(s/2) stands for.
+
+    ``exp(-s) = (1 - tanh(s/2)) / (1 + tanh(s/2))``: a wave u meets inductors and capacitors of 1 / (2 (2k - 1)) in
+    turn; u - v, with v the voltage at the port, is minus the wave sent back: the delayed one.
+    """
+    if not x:
+        return u, []
+    along, across = sum(x[0::2], ca.SX(0)), sum(x[1::2], ca.SX(0))
+    voltage, current = (across, 2 * u - across) if len(x) % 2 == 0 else (2 * u - along, along)
+    rates = []
+    for k in range(1, len(x) + 1):
+        passed = sum(x[k % 2 : k - 1 : 2], ca.SX(0))
+        rates.append(2 * (2 * k - 1) / dead_time * ((current if k % 2 == 0 else voltage) - passed))
+    return u - voltage, rates
+
+
+def _gain(source: Quantity, output: Quantity, per: str) -> Parameter:
+    unit = _over(output, f"({_bare(source)}{per})" if per else _bare(source))
+    return Parameter(1.0, unit)
+
+
+def _over(output: Quantity, unit: str) -> str:
+    return f"{_bare(output)}/{unit if unit.isalnum() or unit.startswith('(') else f'({unit})'}"
+
+
+def _bare(quantity: Quantity) -> str:
+    """Its unit as that of a difference: a pressure level loses its mark."""
+    return quantity.unit.removesuffix("(a)").removesuffix("(g)")
+
+
+def _as_input(parameters: ParameterSet, source: Quantity) -> ParameterSet:
+    """Friction's parameters in the unit of the input instead of newtons; the defaults shrink to a hundredth."""
+    shrunk = {n: _scaled(q, _bare(source)) for n, q in parameters.items()}
+    return ParameterSet({n: replace(q, value=0.0) if n == "viscous" else q for n, q in shrunk.items()})
+
+
+def _scaled(parameter: Parameter, unit: str) -> Parameter:
+    is_force = re.search(r"\bN\b", parameter.unit) is not None
+    if not is_force:
+        return parameter
+    low, value, high = (0.01 * number for number in (parameter.lower, parameter.value, parameter.upper))
+    return replace(parameter, value=value, lower=low, upper=high, unit=re.sub(r"\bN\b", unit, parameter.unit))
+
+
+def _without_prefix(values: Symbols) -> Symbols:
+    return {n.removeprefix("friction."): s for n, s in values.items() if n.startswith("friction.")}

@@ -1,0 +1,138 @@
+"""The lifted least squares at one iterate: data and gap residuals of all segments as normal equations."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.nlp.arrow import Arrow, scaled_inverse
+from pneuopt.nlp.segments import Segments
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The problem linearised at an iterate.
+
+    Attributes
+    ----------
+    arrow : Arrow
+        Of data and gaps together.
+    grams : ndarray, shape (m, n + c, n + c)
+        The data's own Gram matrix of each segment, in its states and sensitivity columns.
+    selection : ndarray, shape (m, c, k)
+        d(column)/d(searched parameter).
+    chain : ndarray, shape (k,)
+        d(parameter)/d(searched parameter).
+    chi_square, cost, largest_gap : float
+        Squared data residuals; half the sum of all squares; largest gap in nominal sizes.
+    count : int
+        Number of data residuals.
+    """
+
+    arrow: Arrow
+    grams: Array
+    selection: Array
+    chain: Array
+    chi_square: float
+    cost: float
+    largest_gap: float
+    count: int
+
+    def covariance(self, keep: Mask) -> Array | None:
+        """Covariance of the parameters (own units, unit noise): the sandwich over true data noise only.
+
+        The gaps carry no noise, so the plain inverse is too wide (NUMERICS section 3, step 7). Rows of parameters that
+        are not kept are NaN; None where the data do not determine the kept ones.
+        """
+        solved = self.arrow.solve(0.0, keep)
+        if solved is None:
+            return None
+        bread = scaled_inverse(solved.schur[np.ix_(keep, keep)])
+        if bread is None:
+            return None
+        E = np.concatenate([-solved.eliminated, self.selection], axis=1)[:, :, keep]
+        meat = np.einsum("mak,mab,mbl->kl", E, self.grams, E, optimize=True)
+        out = np.full((len(keep), len(keep)), np.nan)
+        out[np.ix_(keep, keep)] = bread @ meat @ bread
+        return np.asarray(out * np.outer(self.chain, self.chain))
+
+
+def normal_equations(
+    segments: Segments, nodes: Array, q: Array, chain: Array, sigma: Array, substeps: int
+) -> Equations:
+    """Run all segments with sensitivities and assemble data and gap residuals.
+
+    Parameters
+    ----------
+    segments : Segments
+    nodes : ndarray, shape (m, n)
+    q : ndarray
+        All the problem's parameter values.
+    chain : ndarray, shape (k,)
+        d(parameter)/d(searched parameter) of the free ones.
+    sigma : ndarray, shape (n,)
+        Standard deviation of a gap, in nominal sizes.
+    substeps : int
+    """
+    run = segments.run(nodes, q, substeps, sensitivities=True)
+    assert run.dy is not None
+    assert run.dx_end is not None
+    m, n = nodes.shape
+    scale = np.concatenate([segments.nominal, np.ones(run.dy.shape[-1] - n)])
+    known = np.isfinite(segments.measured)
+    residual = np.where(known, run.y - segments.measured, 0.0) / segments.noise
+    E = np.where(known[..., None], run.dy, 0.0) / segments.noise[..., None] * scale
+    E = E.reshape(m, -1, E.shape[-1])
+    grams, gradient = np.swapaxes(E, 1, 2) @ E, np.einsum("mra,mr->ma", E, residual.reshape(m, -1))
+    selection = np.zeros((m, segments.unknowns.shape[1], len(chain)))
+    row, column = np.nonzero(segments.unknowns >= 0)
+    unknown = segments.unknowns[row, column]
+    selection[row, column, unknown] = chain[unknown]
+    arrow = Arrow(
+        grams[:, :n, :n].copy(),
+        np.zeros((m, n, n)),
+        grams[:, :n, n:] @ selection,
+        np.einsum("mak,mab,mbl->kl", selection, grams[:, n:, n:], selection, optimize=True),
+        gradient[:, :n].copy(),
+        np.einsum("mak,ma->k", selection, gradient[:, n:]),
+    )
+    chi_square = float(np.sum(residual**2))
+    gaps = _add_gaps(arrow, segments, nodes, run.x_end, run.dx_end * scale, selection, sigma)
+    cost = 0.5 * (chi_square + float(np.sum((gaps / sigma) ** 2)))
+    largest = float(np.max(np.abs(gaps), initial=0.0))
+    finite = math.isfinite(cost) and bool(np.isfinite(grams).all())
+    return Equations(
+        arrow, grams, selection, chain, chi_square, cost if finite else math.inf, largest, int(known.sum())
+    )
+
+
+def _add_gaps(
+    arrow: Arrow, segments: Segments, nodes: Array, x_end: Array, dx_end: Array, selection: Array, sigma: Array
+) -> Array:
+    """Add the gaps between linked segments, and known starts, as residuals; returns the gaps in nominal sizes."""
+    n = nodes.shape[1]
+    weight = 1 / sigma
+    here = np.flatnonzero(segments.linked)
+    gap = (x_end[here] - nodes[here + 1]) / segments.nominal
+    e = gap * weight
+    own = dx_end[here, :, :n] / segments.nominal[:, None] * weight[:, None]
+    ours = dx_end[here, :, n:] / segments.nominal[:, None] * weight[:, None] @ selection[here]
+    own_t = np.swapaxes(own, 1, 2)
+    arrow.diagonal[here] += own_t @ own
+    arrow.diagonal[here + 1] += np.diag(weight**2)
+    arrow.coupling[here] -= own_t * weight
+    arrow.border[here] += own_t @ ours
+    arrow.border[here + 1] -= weight[:, None] * ours
+    arrow.corner[:] += np.einsum("mak,mal->kl", ours, ours, optimize=True)
+    arrow.node_gradient[here] += (own_t @ e[..., None])[..., 0]
+    arrow.node_gradient[here + 1] -= weight * e
+    arrow.gradient[:] += np.einsum("mak,ma->k", ours, e)
+    given = np.isfinite(segments.fixed_start)
+    off = np.where(given, nodes - segments.fixed_start, 0.0) / segments.nominal
+    arrow.diagonal[:, range(n), range(n)] += given * weight**2
+    arrow.node_gradient[:] += off * weight**2
+    return np.concatenate([gap, off[given.any(axis=1)]])

@@ -1,0 +1,244 @@
+"""Full-space multiple shooting with IPOPT: every node's state is an unknown, derivatives are exact. The reference path.
+
+`prepare` makes the graph and its derivatives once; `solve_from` solves it from any start.
+"""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import ModelError, require
+from pneuopt.nlp.graph import Graph, Rows, flatten, node_guesses, scale, to_unknowns, to_values, variable_bounds
+from pneuopt.nlp.status import Code, Solution, Status
+from pneuopt.nlp.transcription import Transcription
+from pneuopt.parameters import ParameterSet
+from pneuopt.system import names
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FullSpace:
+    """Full-space multiple shooting with IPOPT and exact second derivatives.
+
+    Parameters
+    ----------
+    max_iterations : int
+    tolerance : float
+        IPOPT's `tol`, on the scaled problem.
+    max_seconds : float
+        Wall time after which the solver gives up [s].
+    verbose : bool
+        Print IPOPT's own table.
+    """
+
+    max_iterations: int = 500
+    tolerance: float = 1e-8
+    max_seconds: float = 3600.0
+    verbose: bool = False
+
+    def __post_init__(self) -> None:
+        require(self.max_iterations >= 1, f"max_iterations must be at least 1, got {self.max_iterations}")
+        require(0 < self.tolerance < 1, f"tolerance must lie between 0 and 1, got {self.tolerance}")
+        require(self.max_seconds > 0, f"max_seconds must be positive, got {self.max_seconds}")
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A graph and the solver made from it."""
+
+    graph: Graph
+    solver: ca.Function
+
+
+def solve_full_space(transcription: Transcription, method: FullSpace | None = None) -> Solution:
+    """Solve a multiple-shooting problem with all nodes as unknowns.
+
+    Parameters
+    ----------
+    transcription : Transcription
+        Each phase starts from its `guess`, or from a simulation with the given parameters where it has none. The
+        physical ranges of the states (`Quantity.lower`, `upper`) bound the nodes.
+    method : FullSpace, optional
+
+    Returns
+    -------
+    Solution
+        Its status says in words whether it converged; where not, it names the limit, the state or the equation.
+    """
+    return solve_from(prepare(transcription, method), transcription.parameters)
+
+
+def prepare(transcription: Transcription, method: FullSpace | None = None) -> Problem:
+    """Flatten a problem and differentiate it, once for any number of starts."""
+    graph, method = flatten(transcription), method or FullSpace()
+    ipopt = {
+        "print_level": 5 if method.verbose else 0,
+        "sb": "yes",
+        "max_iter": method.max_iterations,
+        "tol": method.tolerance,
+        "acceptable_iter": 0,
+        "max_wall_time": method.max_seconds,
+    }
+    nlp: Any = {"x": graph.w, "p": graph.q, "f": ca.sum1(graph.parts), "g": graph.g}
+    options: Any = {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
+    return Problem(graph, ca.nlpsol("full_space", "ipopt", nlp, options))
+
+
+def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | None] = ()) -> Solution:
+    """Solve a prepared problem from the given parameters.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : ParameterSet
+        Names as in the problem; the values may differ, those of the fixed ones too.
+    guesses : sequence of ndarray, shape (n, n_states), optional
+        States to start from, one a phase, in place of the phases' own.
+
+    Returns
+    -------
+    Solution
+    """
+    transcription, begun = problem.graph.transcription, time.perf_counter()
+    require(tuple(start) == tuple(transcription.parameters), "the start's names are not the problem's", ModelError)
+    q = np.array([p.value for p in start.values()])
+    low, up = variable_bounds(transcription)
+    nodes = node_guesses(transcription, q, guesses)
+    w = np.clip(np.concatenate([to_unknowns(transcription, q), *nodes]), low, up)
+    fault = _find_nan(problem, w, q)
+    if fault:
+        return _solution(problem, w, q, Status(Code.DIVERGED, f"at the start {fault}; start elsewhere"), {}, {})
+    low_g, up_g = (
+        np.concatenate([np.zeros(0), *(getattr(r, s) for r in problem.graph.table)]) for s in ("lower", "upper")
+    )
+    found = {k: np.array(v).ravel() for k, v in problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g).items()}
+    stats = problem.solver.stats()
+    figures = {
+        "iterations": float(stats.get("iter_count", 0)),
+        "seconds": time.perf_counter() - begun,
+        "cost": float(found["f"][0]),
+        "largest_gap": _violation(problem, found["g"], continuity=True),
+        "largest_violation": _violation(problem, found["g"], continuity=False),
+    }
+    status = _status(problem, str(stats["return_status"]), found, q, figures)
+    return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up))
+
+
+# What the solver found, in words.
+
+
+def _status(problem: Problem, ended: str, found: Mapping[str, Array], q: Array, figures: Mapping[str, float]) -> Status:
+    worst = _worst(problem, found["g"])
+    taken = f"after {figures['iterations']:.0f} iterations and {figures['seconds']:.2f} s"
+    if ended == "Solve_Succeeded" and bool(np.all(np.isfinite(found["x"]))):
+        return Status(Code.CONVERGED, f"{taken}, largest gap {figures['largest_gap']:.1e} of the states' nominal size")
+    if ended in {"Infeasible_Problem_Detected", "Restoration_Failed"}:
+        return Status(Code.INFEASIBLE, f"{taken}, {worst}; relax this limit or widen the parameters' bounds")
+    if ended in {"Maximum_Iterations_Exceeded", "Maximum_WallTime_Exceeded"}:
+        return Status(Code.ITERATION_LIMIT, f"{taken}, {worst}; start nearer or allow more")
+    if ended in {"Invalid_Number_Detected", "Diverging_Iterates"}:
+        fault = _find_nan(problem, found["x"], q) or f"the iterates diverge, {worst}"
+        return Status(Code.DIVERGED, f"{taken}, {fault}; bound the parameters or refine the integration")
+    if ended == "User_Requested_Stop":
+        return Status(Code.INTERRUPTED, taken)
+    return Status(Code.NOT_CONVERGED, f"IPOPT says {ended} {taken}, {worst}; rescale or start elsewhere")
+
+
+def _excess(rows: Rows, g: Array) -> Array:
+    values = g[rows.rows]
+    return np.maximum(np.maximum(rows.lower - values, values - rows.upper), 0.0)
+
+
+def _violation(problem: Problem, g: Array, continuity: bool) -> float:
+    pieces = [float(np.max(_excess(r, g), initial=0.0)) for r in problem.graph.table if r.continuity is continuity]
+    return max(pieces, default=0.0)
+
+
+def _worst(problem: Problem, g: Array) -> str:
+    """The piece that is violated most, relative to the size of its bound."""
+    table = [r for r in problem.graph.table if r.rows.stop > r.rows.start]
+    if not table:
+        return "there are no limits"
+    relative = [float(np.max(_excess(r, g) / _size(r))) for r in table]
+    rows = table[int(np.argmax(relative))]
+    if max(relative) < 1e-6:
+        return "no limit is violated"
+    k = int(np.argmax(_excess(rows, g)))
+    return f"worst is {_title(problem, rows, k)}: {g[rows.rows][k]:.6g}, allowed {_range(rows.lower[k], rows.upper[k])}"
+
+
+def _size(rows: Rows) -> Array:
+    finite = [np.where(np.isfinite(side), np.abs(side), 0.0) for side in (rows.lower, rows.upper)]
+    return np.maximum(*finite) + 1e-3
+
+
+def _range(lower: float, upper: float) -> str:
+    return f"{lower:.6g}" if lower == upper else f"{lower:.6g} to {upper:.6g}"
+
+
+def _title(problem: Problem, rows: Rows, k: int) -> str:
+    if not rows.continuity:
+        return f"limit {rows.name!r}" + (f" in phase {rows.phase!r}" if rows.phase else "")
+    states = problem.graph.transcription.system.states
+    return f"the continuity of state {states[k % len(states)].name!r} in phase {rows.phase!r}"
+
+
+def _find_nan(problem: Problem, w: Array, q: Array) -> str:
+    """Name the equation that is not a number; empty if all are finite."""
+    f, g = (np.array(v).ravel() for v in problem.graph.evaluate(w, q))
+    for name, value in zip(problem.graph.costs, f, strict=False):
+        if not math.isfinite(value):
+            return f"{name} is {value}"
+    jacobian = np.array(problem.solver.get_function("nlp_jac_g")(w, q)[1])
+    for rows in problem.graph.table:
+        bad = ~np.isfinite(g[rows.rows]) | ~np.isfinite(jacobian[rows.rows]).all(axis=1)
+        if bad.any():
+            return f"{_title(problem, rows, int(np.argmax(bad)))} or its derivative is not a number"
+    return ""
+
+
+def _multipliers(problem: Problem, found: Mapping[str, Array], low: Array, up: Array) -> dict[str, float]:
+    """Of what is active: its multiplier exceeds its slack."""
+    transcription, active = problem.graph.transcription, dict[str, float]()
+
+    def note(name: str, multiplier: Array, slack: Array, unit: float = 1.0) -> None:
+        held = np.abs(multiplier) > np.maximum(slack, 1e-8)
+        if held.any():
+            active[name] = max(active.get(name, 0.0), float(np.max(np.abs(multiplier[held]))) / unit)
+
+    slack, multiplier = np.minimum(found["x"] - low, up - found["x"]), np.where(low < up, found["lam_x"], 0.0)
+    values = to_values(transcription, found["x"])
+    for k, (name, value) in enumerate(values.items()):
+        parameter = transcription.parameters[name]
+        note(name, multiplier[[k]], slack[[k]], value if parameter.log else scale(parameter))
+    n_states = len(transcription.system.states)
+    for j, state in enumerate(transcription.system.states):
+        nodes = slice(len(values) + j, None, n_states)
+        note(state.name, multiplier[nodes], slack[nodes], state.nominal)
+    for rows in problem.graph.table:
+        if not rows.continuity:
+            room = np.minimum(found["g"][rows.rows] - rows.lower, rows.upper - found["g"][rows.rows])
+            note(rows.name, found["lam_g"][rows.rows], room)
+    return active
+
+
+def _solution(
+    problem: Problem, w: Array, q: Array, status: Status, figures: Mapping[str, float], multipliers: Mapping[str, float]
+) -> Solution:
+    transcription = problem.graph.transcription
+    columns = (*names(transcription.system.states), *names(transcription.system.outputs))
+    trajectories = []
+    for rollout in problem.graph.rollouts:
+        t, x, y = (np.array(v) for v in rollout(w, q))
+        trajectories.append(Trajectory(t.ravel(), dict(zip(columns, (*x, *y), strict=True))))
+    given = dict(zip(transcription.parameters, q.tolist(), strict=True))
+    parameters = transcription.parameters.with_values({**given, **to_values(transcription, w)})
+    return Solution(tuple(trajectories), parameters, status, figures, multipliers)

@@ -1,0 +1,215 @@
+"""A transcription as batched, compiled segments: every segment of every phase side by side, with its sensitivities."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.codegen import Pieces, Rollout, Run
+from pneuopt.errors import ModelError, require
+from pneuopt.nlp.transcription import Phase, Residuals, Transcription
+from pneuopt.system import DiscreteSystem, names
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """All segments of a transcription, padded to one length of n samples (a padded sample has h = 0 and no data).
+
+    Attributes
+    ----------
+    transcription : Transcription
+    t, h : ndarray, shape (m, n)
+    inputs : ndarray, shape (m, n, n_inputs)
+    measured, noise : ndarray, shape (m, n, n_outputs)
+        NaN where nothing was measured.
+    gather : ndarray of int, shape (m, n_system_parameters)
+        Positions of each segment's parameter vector among the problem's parameters.
+    linked : ndarray of bool, shape (m,)
+        Whether the next segment continues this one.
+    fixed_start : ndarray, shape (m, n_states)
+        The known start state; NaN where the node is an unknown.
+    phase, lengths : ndarray of int, shape (m,)
+        The phase of each segment, and its samples without padding.
+    """
+
+    transcription: Transcription
+    t: Array
+    h: Array
+    inputs: Array
+    measured: Array
+    noise: Array
+    gather: Indices
+    linked: Mask
+    fixed_start: Array
+    phase: Indices
+    lengths: Indices
+
+    @property
+    def system(self) -> DiscreteSystem:
+        """The system that runs in each segment."""
+        return self.transcription.system
+
+    @cached_property
+    def nominal(self) -> Array:
+        """The states' nominal sizes, by which nodes and gaps are scaled."""
+        return np.array([s.nominal for s in self.system.states])
+
+    @property
+    def count(self) -> int:
+        """Number of segments m."""
+        return len(self.t)
+
+    @cached_property
+    def columns(self) -> Indices:
+        """Positions, in the system's parameter vector, of those that are free in some segment."""
+        free = np.isin(self.gather, self.transcription.free)
+        return np.flatnonzero(free.any(axis=0)).astype(np.intp)
+
+    @cached_property
+    def unknowns(self) -> Indices:
+        """For each segment and column, which free parameter it is; -1 where it is fixed. Shape (m, n_columns)."""
+        index = np.full(len(self.transcription.parameters), -1, dtype=np.intp)
+        index[self.transcription.free] = np.arange(len(self.transcription.free))
+        return np.asarray(index[self.gather[:, self.columns]])
+
+    @cached_property
+    def sensitivities(self) -> Rollout:
+        """The compiled run with sensitivities to start states and free parameters."""
+        pieces = Pieces(self.system.step, self.system.update)
+        return Rollout(pieces, wrt=self.columns.tolist(), start=True)
+
+    @cached_property
+    def plain(self) -> Rollout:
+        """The compiled run without sensitivities."""
+        return Rollout(Pieces(self.system.step, self.system.update))
+
+    def run(self, nodes: Array, q: Array, substeps: int, *, sensitivities: bool, states: bool = False) -> Run:
+        """Integrate all segments from their nodes, shape (m, n_states), at the problem's parameter values q."""
+        rollout = self.sensitivities if sensitivities else self.plain
+        return rollout.run(nodes, self.inputs, q[self.gather], self.t, self.h, substeps=substeps, states=states)
+
+    def trajectories(self, nodes: Array, q: Array, substeps: int) -> tuple[Trajectory, ...]:
+        """States and outputs at every sample, one trajectory a phase."""
+        run = self.run(nodes, q, substeps, sensitivities=False, states=True)
+        assert run.x is not None
+        real = np.arange(self.t.shape[1]) < self.lengths[:, None]
+        out = []
+        for i, phase in enumerate(self.transcription.phases):
+            rows = self.phase == i
+            x, y = (a[rows][real[rows]] for a in (run.x, run.y))
+            columns = dict(zip(names(self.system.states), x.T, strict=True))
+            columns |= dict(zip(names(self.system.outputs), y.T, strict=True))
+            out.append(Trajectory(phase.t, columns))
+        return tuple(out)
+
+
+def segment(transcription: Transcription) -> Segments:
+    """Cut a transcription into its segments.
+
+    Raises
+    ------
+    ModelError
+        For a free duration, which the compiled segments do not take.
+    """
+    system = transcription.system
+    length = max(int(np.diff(np.append(p.nodes, p.n)).max()) for p in transcription.phases)
+    measured = {r.phase: _data(r, system, transcription.phases[r.phase]) for r in transcription.residuals}
+    parts = []
+    for i, phase in enumerate(transcription.phases):
+        require(phase.duration is None, f"{phase.name}: a free duration needs another method", ModelError)
+        blank = np.full((phase.n, len(system.outputs)), np.nan)
+        data = measured.get(i, (blank, np.ones_like(blank)))
+        parts.append(_cut(i, phase, length, data, transcription))
+    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+    t, h, inputs, y, noise, gather, linked, start, index, lengths = joined
+    for i, phase in enumerate(transcription.phases[1:], 1):
+        linked[np.flatnonzero(index == i)[0] - 1] = phase.follows
+    return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
+
+
+def start_nodes(segments: Segments) -> Array:
+    """States at the nodes from the phases' guesses (zero without one), shape (m, n_states)."""
+    states = len(segments.system.states)
+    parts = []
+    for phase in segments.transcription.phases:
+        guess = np.zeros((phase.n, states)) if phase.guess is None else phase.guess
+        parts.append(guess[phase.nodes])
+    nodes = np.concatenate(parts)
+    return np.where(np.isfinite(segments.fixed_start), segments.fixed_start, nodes)
+
+
+def tightness(segments: Segments, kinematic: float) -> Array:
+    """How much tighter each state's gaps are kept: `kinematic` where its rate holds no free parameter, else 1."""
+    slope, symbols = _slope(segments.system)
+    free = symbols["p"][segments.columns.tolist()]
+    depends = [bool(ca.which_depends(slope[i], free, 1, True)[0]) for i in range(slope.numel())]
+    return np.where(depends, 1.0, kinematic)
+
+
+def substeps_for(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
+    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78."""
+    slope, s = _slope(segments.system)
+    if not slope.numel():
+        return 1
+    jacobian = ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
+    m, n = nodes.shape
+    # the regularised friction is stiffest at rest, which a node may just miss
+    points = np.concatenate([nodes, nodes * 0])
+    p = np.tile(q[segments.gather], (2, 1))
+    u, t = np.tile(segments.inputs[:, 0], (2, 1)), np.tile(segments.t[:, 0], 2)
+    J = np.array(jacobian.map(2 * m)(t[None], points.T, u.T, p.T)).reshape(n, 2 * m, n).transpose(1, 0, 2)
+    stiffness = np.abs(np.linalg.eigvals(J[np.isfinite(J).all(axis=(1, 2))])).max(initial=0.0)
+    return max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step))
+
+
+def _slope(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """The rate f(t, x, u, p) behind a step: d(x_next)/dh at h = 0, exact and with f's own sparsity; and its symbols."""
+    symbols = {n: ca.SX.sym(n, system.step.size1_in(i)) for i, n in enumerate(("t", "h", "x", "u", "p"))}
+    x_next = system.step(*symbols.values())[0]
+    return ca.substitute(ca.jacobian(x_next, symbols["h"]), symbols["h"], ca.SX(0)), symbols
+
+
+def _data(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[Array, Array]:
+    measured = np.full((phase.n, len(system.outputs)), np.nan)
+    noise = np.ones_like(measured)
+    position = {n: i for i, n in enumerate(names(system.outputs))}
+    for column, output in enumerate(residuals.outputs):
+        measured[:, position[output]] = residuals.measured[:, column]
+        noise[:, position[output]] = residuals.noise[column]
+    return measured, noise
+
+
+def _cut(
+    index: int, phase: Phase, length: int, data: tuple[Array, Array], transcription: Transcription
+) -> tuple[NDArray[Any], ...]:
+    """One phase's segments, in the order of the fields of `Segments`."""
+    measured, noise = data
+    ends = np.append(phase.nodes[1:], phase.n)
+    rows = phase.nodes[:, None] + np.arange(length)
+    real = rows < ends[:, None]
+    rows = np.minimum(rows, ends[:, None] - 1)
+    m = len(phase.nodes)
+    start = np.full((m, len(transcription.system.states)), np.nan)
+    if phase.start is not None:
+        start[0] = phase.start
+    return (
+        phase.t[rows],
+        np.where(real, phase.h[rows], 0.0),
+        phase.inputs[rows],
+        np.where(real[:, :, None], measured[rows], np.nan),
+        noise[rows],
+        np.tile(transcription.gather(phase), (m, 1)),
+        np.arange(m) < m - 1,
+        start,
+        np.full(m, index),
+        ends - phase.nodes,
+    )

@@ -1,0 +1,32 @@
+"""Where a result comes from: versions and options, as text that goes with it."""
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+
+def provenance(*options: object) -> dict[str, str]:
+    """Versions of what computed, and the options that were used.
+
+    Parameters
+    ----------
+    *options : dataclass instances
+        Their repr is recorded.
+
+    Returns
+    -------
+    dict of str to str
+    """
+    return {
+        "pneuopt": _version("pneuopt"),
+        "casadi": _version("casadi"),
+        "numpy": _version("numpy"),
+        "python": platform.python_version(),
+        "options": "; ".join(repr(o) for o in options),
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,92 @@
+"""What a fit is worth: confidence intervals, noise levels, agreement of a prediction with a measurement."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import norm
+
+Array = NDArray[np.float64]
+
+
+def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
+    """How well a prediction follows a measurement; missing samples (NaN) do not count.
+
+    Parameters
+    ----------
+    measured, predicted : array_like, shape (n,)
+
+    Returns
+    -------
+    mapping
+        rmse [unit of the channel]; nrmse = |error| / |measured - its mean| [1]; fit_percent = 100 (1 - nrmse), as in
+        MATLAB's `compare`; samples. NRMSE is NaN for a constant channel.
+
+    Examples
+    --------
+    >>> agreement([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 2.0, 2.0])["rmse"]
+    0.5
+    """
+    y, e = np.asarray(measured, dtype=float), np.asarray(predicted, dtype=float) - np.asarray(measured, dtype=float)
+    known = np.isfinite(y)
+    y, e = y[known], e[known]
+    spread = float(np.linalg.norm(y - y.mean())) if y.size else 0.0
+    nrmse = float(np.linalg.norm(e)) / spread if spread > 0 else math.nan
+    rmse = float(np.sqrt(np.mean(e**2))) if y.size else math.nan
+    return {"rmse": rmse, "nrmse": nrmse, "fit_percent": 100 * (1 - nrmse), "samples": float(y.size)}
+
+
+def noise_level(column: ArrayLike) -> float:
+    """Estimate white noise from a channel's second differences, with the quantisation step as floor.
+
+    Parameters
+    ----------
+    column : array_like, shape (n,)
+        NaN where a sample is missing.
+
+    Returns
+    -------
+    float
+        Standard deviation [unit of the channel]: 1.4826 MAD(second difference) / sqrt(6), which motion slower than
+        the sampling hardly touches; at least q / sqrt(12), with q the smallest difference between two samples. NaN
+        for a constant channel, which shows none.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> round(noise_level(np.sin(np.linspace(0, 6, 4000)) + 0.01 * rng.standard_normal(4000)), 3)
+    0.01
+    """
+    y = np.asarray(column, dtype=float)
+    y = y[np.isfinite(y)]
+    steps = np.abs(np.diff(y))
+    if not np.any(steps > 0):
+        return math.nan
+    second = np.diff(y, 2)
+    random = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / math.sqrt(6)
+    resolution = float(np.min(steps[steps > 1e-9 * np.max(steps)])) / math.sqrt(12)
+    return max(random, resolution)
+
+
+def confidence_interval(value: float, stderr: float, *, log: bool, level: float = 0.95) -> tuple[float, float]:
+    """Normal confidence interval; symmetric in the logarithm where the parameter was searched so.
+
+    Examples
+    --------
+    >>> low, high = confidence_interval(10.0, 1.0, log=False)
+    >>> round(low, 2), round(high, 2)
+    (8.04, 11.96)
+    """
+    width = float(norm.ppf(0.5 + level / 2)) * stderr
+    if log and math.isfinite(width):
+        ratio = math.exp(min(width / value, 700.0))
+        return value / ratio, value * ratio
+    return value - width, value + width
+
+
+def correlation(covariance: Array) -> Array:
+    """Correlation matrix of a covariance; NaN where a variance is not positive."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        deviation = np.sqrt(np.diag(covariance))
+        return np.asarray(covariance / np.outer(deviation, deviation))

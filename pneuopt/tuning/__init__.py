@@ -1,0 +1,1 @@
+"""How `tune` searches: the exact two-phase problem for linear loops, compiled screening for the others."""

@@ -1,0 +1,280 @@
+"""The exact settling-time problem of a linear loop, as a transcription: free duration, then inside the band for good.
+
+Phase "transient" is [0, Ts] with Ts unknown, phase "settled" the rest, where |y - r| <= band is a path limit; so the
+settling time is a smooth function of the gains. What is minimised beside it enters through one more unknown each (the
+overshoot and so on) that its path limit may not exceed. Fast dither leaves a linear loop's average alone; its offset is
+a step at the command.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import frequency_grid, sensitivity_terms
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError, require
+from pneuopt.nlp.full_space import FullSpace, prepare, solve_from
+from pneuopt.nlp.status import Solution
+from pneuopt.nlp.transcription import Cost, Limit, Phase, Transcription, Where, every
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.requirements import (
+    MaxSensitivity,
+    Overshoot,
+    PeakControl,
+    SettlingTime,
+    Specification,
+    SteadyStateError,
+)
+from pneuopt.system import DiscreteSystem, System, discretise, names
+from pneuopt.tuning.candidates import Space, fastest, substeps
+
+Array = NDArray[np.float64]
+KINDS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
+LARGEST = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
+SETTLING = "SettlingTime"
+SAME = 1e-3  # relative difference of two optima that count as one
+
+
+@dataclass(frozen=True)
+class TwoPhase:
+    """Solve the two-phase problem by full-space multiple shooting from several starts. For linear, continuous loops.
+
+    Parameters
+    ----------
+    nodes : tuple of int
+        Shooting nodes of the transient and of the settled phase.
+    margin : float
+        How much tighter the problem's band is than the one asked for; an optimum without it grazes the band.
+    starts : int
+        The given gains, then random ones within the bounds.
+    seed : int
+    digits : int, optional
+        Significant digits of the gains handed out; None: all.
+    solver : FullSpace
+    """
+
+    nodes: tuple[int, int] = (60, 80)
+    margin: float = 0.03
+    starts: int = 6
+    seed: int = 0
+    digits: int | None = 4
+    solver: FullSpace = FullSpace(max_iterations=400, first_barrier=1e-2)
+
+    def __post_init__(self) -> None:
+        require(min(self.nodes) >= 4, f"TwoPhase: each phase needs at least 4 nodes, got {self.nodes}")
+        require(0 <= self.margin < 1, f"TwoPhase: margin is a fraction below 1, got {self.margin}")
+        require(self.starts >= 1, f"TwoPhase: starts must be at least 1, got {self.starts}")
+        require(self.digits is None or self.digits >= 2, f"TwoPhase: digits must be at least 2, got {self.digits}")
+
+
+@dataclass(frozen=True, eq=False)
+class Optima:
+    """What the starts ended in: the best, and how many of them agree with it."""
+
+    best: Solution
+    starts: int
+    converged: int
+    agreeing: int
+
+
+def is_linear(loop: ClosedLoop, space: Space) -> bool:
+    """Whether the loop, its clip aside, is a linear ODE: its Jacobian is the same in states far apart."""
+    if loop.pid.sample_time is not None:
+        return False
+    system = unlimited(loop).system()
+    rng, scale = np.random.default_rng(0), np.array([q.nominal for q in system.states])
+    parameters = space.parameters
+    first, *others = (system.linearise(scale * x, {}, parameters) for x in rng.normal(0, 3, (4, len(scale))))
+    return all(
+        bool(np.allclose(getattr(first, k), getattr(o, k), rtol=1e-9, atol=1e-12)) for o in others for k in "ABCD"
+    )
+
+
+def unlimited(loop: ClosedLoop) -> ClosedLoop:
+    """The loop without its clip."""
+    return replace(loop, pid=replace(loop.pid, limits=False))
+
+
+def solve_two_phase(
+    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase, margin: float
+) -> Optima:
+    """Solve from every start.
+
+    Raises
+    ------
+    InputError
+        If the loop's rest depends on the gains, or a mode is too fast for the grid.
+    """
+    problem = prepare(transcribe(loop, references, space, spec, method, margin), method.solver)
+    parameters = problem.graph.transcription.parameters
+    rng = np.random.default_rng(method.seed)
+    found = []
+    for k in range(method.starts):
+        point = space.draw(rng.random(len(space.names))) if k else space.start
+        gains = dict(zip(space.names, point.tolist(), strict=True))
+        found.append(solve_from(problem, parameters.with_values(gains)))
+    good = [s for s in found if s.status.converged]
+    if not good:
+        return Optima(min(found, key=lambda s: s.stats.get("largest_violation", math.inf)), len(found), 0, 0)
+    best = min(good, key=_cost)
+    agreeing = sum(_cost(s) - _cost(best) <= SAME * abs(_cost(best)) for s in good)
+    return Optima(best, len(found), len(good), agreeing)
+
+
+def transcribe(
+    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase, margin: float
+) -> Transcription:
+    """Write the two-phase problem; the references share one settling time, the worst of them."""
+    free_loop = unlimited(loop)
+    averaged = space.parameters.select(free_loop.parameters)
+    if loop.dither:
+        averaged = averaged.with_values({"dither.amplitude": 0.0}).fixed("dither.amplitude")
+    extra = _extra(references, spec)
+    system = _extended(free_loop, extra, space, references, method)
+    parameters = ParameterSet({n: averaged.get(n, extra.get(n)) for n in system.parameters})
+    phases = [p for i, r in enumerate(references) for p in _phases(loop, space, i, r, method)]
+    parameters = parameters | _durations(references)
+    limits = [
+        *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r, margin)),
+        *_sensitivity_limit(free_loop, averaged, space, spec, parameters, margin),
+    ]
+    return Transcription(system, parameters, tuple(phases), (), _costs(spec, parameters), tuple(limits))
+
+
+def _cost(solution: Solution) -> float:
+    return float(solution.stats["cost"])
+
+
+def _extra(references: Sequence[Step], spec: Specification) -> ParameterSet:
+    """The settling time, and an unknown for each further term of the objective."""
+    horizon = min(r.horizon - r.at for r in references)
+    most = min(spec.limit(SettlingTime), horizon)
+    free = spec.weight(SettlingTime) > 0
+    given = {SETTLING: Parameter(0.5 * most if free or not spec.concerns(SettlingTime) else most, "s", 1e-3 * most, most, free=free)}
+    for kind in KINDS:
+        if spec.weight(kind) > 0:
+            least = 1.0 if kind is MaxSensitivity else 0.0
+            most = min(spec.limit(kind), LARGEST[kind.__name__])
+            start = min(2.0, most) if kind is MaxSensitivity else min(1.0, most)
+            given[kind.__name__] = Parameter(start, "1", least, most, free=True)
+    return ParameterSet(given)
+
+
+def _durations(references: Sequence[Step]) -> ParameterSet:
+    rest = {f"rest.{i}": Parameter(r.horizon - r.at, "s") for i, r in enumerate(references)}
+    return ParameterSet(rest | {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0})
+
+
+def _extended(
+    loop: ClosedLoop, extra: ParameterSet, space: Space, references: Sequence[Step], method: TwoPhase
+) -> DiscreteSystem:
+    """The loop with the extra unknowns among its parameters, so that path limits may depend on them."""
+    system = loop.system()
+    t, x, u, p = (ca.SX.sym(k, system.ode.size1_in(i)) for i, k in enumerate("txup"))
+    more = ca.SX.sym("more", len(extra))
+    ode = ca.Function("ode", [t, x, u, ca.vertcat(p, more)], [*system.ode(t, x, u, p)], ["t", "x", "u", "p"], ["xdot", "y"])
+    longest = max(max(extra[SETTLING].upper / method.nodes[0], r.horizon / method.nodes[1]) for r in references)
+    own = Space(space.parameters.select(loop.parameters), space.names)
+    steps = substeps(fastest(loop, own, [np.zeros(len(loop.states))]), longest, loop)
+    return discretise(System(system.states, system.inputs, system.outputs, system.parameters | extra, ode), max(2, steps))
+
+
+def _phases(loop: ClosedLoop, space: Space, i: int, reference: Step, method: TwoPhase) -> list[Phase]:
+    start = _rest(loop, space, reference)
+    others = len(loop.inputs) - 1
+
+    def phase(name: str, n: int, value: float, duration: str, first: Array | None) -> Phase:
+        inputs = np.tile([value, *np.zeros(others)], (n, 1))
+        grid, step = np.arange(n) / n, np.full(n, 1 / n)
+        return Phase(f"{name}.{i}", grid, step, inputs, every(n, 1), first, first is None, duration)
+
+    moved = reference.at > 0
+    before = [phase("before", method.nodes[0], reference.initial, f"before.{i}", start)] if moved else []
+    transient = phase("transient", method.nodes[0], reference.final, SETTLING, None if moved else start)
+    return [*before, transient, phase("settled", method.nodes[1], reference.final, f"rest.{i}", None)]
+
+
+def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array:
+    first = loop.initial(space.parameters, reference=reference.initial)
+    for share in (0.3, 0.8):
+        other = loop.initial(space.filled(space.draw(np.full(len(space.names), share))), reference=reference.initial)
+        scale = np.array([q.nominal for q in loop.states])
+        require(
+            bool(np.all(np.abs(first - other) <= 1e-9 * scale)),
+            f"before the step the loop rests in a state that depends on its gains (reference {reference.initial:g}, or a "
+            "load): the two-phase problem needs one that does not; step from zero, or use method=Screening()",
+        )
+    return first
+
+
+def _path_limits(
+    loop: ClosedLoop, space: Space, spec: Specification, system: DiscreteSystem, i: int, reference: Step, margin: float
+) -> list[Limit]:
+    t, x, u, p = (ca.SX.sym(k, system.step.size1_in(j)) for k, j in zip("txup", (0, 2, 3, 4), strict=True))
+    y = system.step(t, 0, x, u, p)[1]
+    outputs, at = names(system.outputs), list(system.parameters).index
+    error = (y[outputs.index(loop.feedback.name)] - u[0]) / reference.size
+    control = y[outputs.index("control")]
+    count = 3 if reference.at > 0 else 2
+    transient, settled = count * i + count - 2, count * i + count - 1
+    both = (transient, settled)
+    tight = 1 - margin
+
+    def limit(name: str, value: ca.SX, lower: float, upper: float, where: Where, phases: tuple[int, ...]) -> Limit:
+        return Limit(name, ca.Function("limit", [t, x, u, p], [value]), lower, upper, where, phases)
+
+    def below(kind: type, value: ca.SX, where: Where, phases: tuple[int, ...], share: float) -> list[Limit]:
+        """Value and, where it has a sign, its negative, at most the limit or the unknown."""
+        if spec.weight(kind) > 0:
+            return [limit(kind.__name__, value - share * p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
+        most = spec.limit(kind)
+        return [limit(kind.__name__, value, -math.inf, share * most, where, phases)] if most < math.inf else []
+
+    found = []
+    if spec.concerns(SettlingTime):
+        band = tight * spec.band
+        found += [limit("settling band", error, -band, band, w, (settled,)) for w in (Where.NODES, Where.END)]
+    found += below(Overshoot, error, Where.NODES, both, tight)
+    found += below(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,), tight)
+    found += below(PeakControl, ca.vertcat(control, -control), Where.NODES, both, 1 - margin / 300)
+    if loop.pid.limits:
+        ends = [space.parameters.value(f"pid.{n}") for n in ("lower", "upper")]
+        if np.isfinite(ends).any():
+            found.append(limit("the command's clip", control, ends[0], ends[1], Where.NODES, both))
+    return found
+
+
+def _sensitivity_limit(
+    loop: ClosedLoop, averaged: ParameterSet, space: Space, spec: Specification, parameters: ParameterSet, margin: float
+) -> list[Limit]:
+    if not spec.concerns(MaxSensitivity):
+        return []
+    grid = np.unique(np.concatenate([_grid(loop, averaged, space.draw(np.full(len(space.names), k)), space) for k in (0.2, 0.8)]))
+    terms = sensitivity_terms(loop, grid, averaged)
+    q = ca.SX.sym("q", len(parameters))
+    Ms = q[list(parameters).index("MaxSensitivity")] if spec.weight(MaxSensitivity) > 0 else spec.limit(MaxSensitivity)
+    value = terms(q[: len(loop.parameters)]) * (Ms * (1 - margin / 300)) ** 2
+    return [Limit("MaxSensitivity", ca.Function("limit", [q], [value]), 1.0, math.inf, Where.PARAMETERS)]
+
+
+def _grid(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) -> Array:
+    """Frequencies around those of the loop's modes, where the sensitivity peaks."""
+    own = Space(averaged, space.names).filled(point)
+    full = frequency_grid(loop.open_loop(own), 40)
+    inner = full[(full > 30 * full[0]) & (full < full[-1] / 30)]
+    return inner
+
+
+def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:
+    q = ca.SX.sym("q", len(parameters))
+    terms = {kind.__name__: spec.weight(kind) for kind in (SettlingTime, *KINDS)}
+    return tuple(
+        Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
+        for n, weight in terms.items()
+        if weight > 0
+    )

@@ -1,0 +1,322 @@
+"""Reading and writing numbers with units: "32 mm", "6 bar(g)", "2e-8 m^3/(s*Pa)"; SI inside.
+
+Units are read exactly (rational arithmetic), so "20 um" is the float 2e-05 and not its neighbour. A frequency in Hz, an
+angular frequency in rad/s and a rate in 1/s are three dimensions: nothing is converted by 2 pi behind one's back.
+"""
+
+import difflib
+import math
+import re
+from fractions import Fraction
+from functools import cache
+from typing import Any, NamedTuple
+
+from pneuopt.errors import UnitError, require
+
+ATMOSPHERE = 101325.0
+"""Standard atmosphere [Pa], which gauge pressures count from (ISO 2533)."""
+
+# The whole vocabulary; a short one of our own keeps surprises out ("Ns" as "newtons", "pt" as a pint) and loads fast.
+_DEFINITIONS = """
+nano- = 1e-9 = n-
+micro- = 1e-6 = µ- = μ- = u-
+milli- = 1e-3 = m-
+centi- = 1e-2 = c-
+deci- = 1e-1 = d-
+hecto- = 1e2 = h-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+giga- = 1e9 = G-
+meter = [length] = m = metre
+kilogram = [mass] = kg
+second = [time] = s = sec
+ampere = [current] = A = amp
+kelvin = [temperature] = K
+radian = [angle] = rad
+cycle = [cycle]
+percent = 0.01 = %
+permille = 0.001 = ‰
+ppm = 1e-6
+count = 1 = cnt
+gram = 1e-3 kilogram = g
+tonne = 1000 kilogram = t
+pound = 0.45359237 kilogram = lb
+minute = 60 second = min
+hour = 3600 second = h
+inch = 0.0254 meter = in
+foot = 0.3048 meter = ft
+degree_Celsius = kelvin; offset: 273.15 = °C = degC = celsius
+degree = 0.017453292519943295769 radian = deg = °
+revolution = 6.283185307179586477 radian = rev
+rpm = revolution / minute
+hertz = cycle / second = Hz
+newton = kilogram * meter / second ** 2 = N
+kilogram_force = 9.80665 newton = kgf = kp
+pound_force = 4.4482216152605 newton = lbf
+pascal = newton / meter ** 2 = Pa
+bar = 1e5 pascal
+psi = 6894.757293168361 pascal
+standard_atmosphere = 101325 pascal = atm
+joule = newton * meter = J
+watt = joule / second = W
+volt = watt / ampere = V
+coulomb = ampere * second = C
+ohm = volt / ampere = Ω
+liter = 1e-3 meter ** 3 = l = L = litre
+newton_meter = newton * meter = Nm
+newton_second = newton * second = Ns
+volt_second = volt * second = Vs
+"""
+_COMMON = """
+m mm um cm km in s ms us min h kg g t N kN Nm V mV A mA K degC Hz kHz rad deg rad/s rpm m/s mm/s m/s^2 m^2 m^3 mm^2
+cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count newton volt meter Pa kPa MPa bar mbar psi
+Pa(a) Pa(g) kPa(a) kPa(g) MPa(a) MPa(g) bar(a) bar(g) mbar(a) mbar(g) psi(a) psi(g)
+"""
+_NUMBER = re.compile(r"\s*([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?|inf(?![a-z])))\s*(.*?)\s*", re.DOTALL)
+_LEVEL = re.compile(r"(.+?)\s*\(([ag])\)")
+_READABLE = {
+    "m": (("um", 1e-4), ("mm", 1.0)),
+    "s": (("us", 1e-4), ("ms", 1.0)),
+    "m/s": (("mm/s", 0.1),),
+    "Pa": (("Pa", 1e3), ("bar", math.inf)),
+    "Pa(a)": (("bar(a)", math.inf),),
+    "Pa(g)": (("bar(g)", math.inf),),
+}
+
+
+def read_value(text: str | float, unit: str, *, where: str = "") -> float:
+    """Read one number with its unit.
+
+    Parameters
+    ----------
+    text : str or float
+        "32 mm"; a number without a unit only where `unit` is "1" ("0.3", 0.3 and "30 %" are the same).
+    unit : str
+        The SI unit to give it in. "Pa(a)" and "Pa(g)" are pressure levels, which need bar(a), kPa(g), ...;
+        "Pa" is a pressure difference, which refuses them.
+    where : str
+        What the message of an error begins with: file, key.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    UnitError
+        If the number or the unit is missing or unknown, or of another dimension.
+
+    Examples
+    --------
+    >>> read_value("32 mm", "m"), read_value("6 bar(g)", "Pa(a)"), read_value("30 %", "1")
+    (0.032, 701325.0, 0.3)
+    """
+    number, unit_text = _parts(text, where)
+    if not unit_text:
+        free = _parsed(_split_level(unit)[0]).dimension == ()
+        require(free, f'{_at(where)}{text!r} has no unit; write "{number} {_example(unit)}"', UnitError)
+        unit_text = "1"
+    factor, offset = _conversion(unit_text, unit, where)
+    value = _scaled(number, factor, offset)
+    _check_vacuum(value, _split_level(unit)[1], text, where)
+    return value
+
+
+def read_si(text: str | float, *, where: str = "") -> float:
+    """Read one number in the SI unit of its own dimension, where no other is known; gauge levels become absolute.
+
+    Parameters
+    ----------
+    text : str or float
+        "5 kg"; a pressure has to be a level, "6.3 bar(g)".
+    where : str
+        What the message of an error begins with.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    UnitError
+        If the number cannot be read, or a pressure does not say whether it is absolute or gauge.
+
+    Examples
+    --------
+    >>> read_si("5000 g"), read_si("6.3 bar(g)"), read_si(0.3)
+    (5.0, 731325.0, 0.3)
+    """
+    unit_text = _parts(text, where)[1]
+    base = _split_level(unit_text or "1")[0]
+    if _parsed(base, where).dimension == _parsed("Pa").dimension:
+        return read_value(text, "Pa(a)", where=where)
+    return read_value(text, _base_unit(base), where=where)
+
+
+def scale_of(unit_text: str, unit: str, *, where: str = "") -> tuple[float, float]:
+    """Find the factor and offset that bring a column of raw numbers to SI: ``si = factor * raw + offset``.
+
+    Parameters
+    ----------
+    unit_text : str
+        The column's unit: "mm", "bar(g)".
+    unit : str
+        The SI unit wanted, as for `read_value`.
+    where : str
+        What the message of an error begins with.
+
+    Returns
+    -------
+    factor, offset : float
+
+    Raises
+    ------
+    UnitError
+        If the unit is unknown or of another dimension, or a level does not say whether it is absolute or gauge.
+
+    Examples
+    --------
+    >>> scale_of("mm", "m"), scale_of("bar(g)", "Pa(a)")
+    ((0.001, 0.0), (100000.0, 101325.0))
+    """
+    factor, offset = _conversion(unit_text, unit, where)
+    return float(factor), float(offset)
+
+
+def write_value(value: float, unit: str, digits: int = 6) -> str:
+    """Write an SI number with a unit that reads well; `read_value` reads it back to the digits given.
+
+    Parameters
+    ----------
+    value : float
+        In `unit`.
+    unit : str
+        SI unit.
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> write_value(0.032, "m"), write_value(701325.0, "Pa(a)"), write_value(0.3, "1")
+    ('32 mm', '7.01325 bar(a)', '0.3')
+    """
+    require(not math.isnan(value), f"a value of NaN {unit} cannot be written")
+    readable = _READABLE.get(unit, ()) if math.isfinite(value) else ()
+    shown = next((name for name, below in readable if 0 < abs(value) < below), unit)
+    factor, offset = _conversion(shown, unit, "")
+    number = float((Fraction(value) - offset) / factor) if math.isfinite(value) else value
+    return f"{number:.{digits}g}" + ("" if unit == "1" else f" {shown}")
+
+
+class _Scale(NamedTuple):
+    """How a unit converts to the SI base unit of its dimension, exactly."""
+
+    factor: Fraction
+    offset: Fraction
+    dimension: tuple[tuple[str, Fraction], ...]
+
+
+def _parts(text: str | float, where: str) -> tuple[str, str]:
+    shown = text if isinstance(text, str) else repr(text)
+    match = _NUMBER.fullmatch(shown)
+    if match is None or isinstance(text, bool):
+        raise UnitError(f'{_at(where)}{text!r} is not a number with a unit; write for instance "32 mm"')
+    number, unit = match.groups()
+    comma = re.fullmatch(r",(\d+)\s*([^\d.,]*)", unit)
+    if comma and "." not in number:
+        mended = f"{number}.{comma[1]} {comma[2]}".strip()
+        raise UnitError(f'{_at(where)}{text!r} has a decimal comma; write "{mended}"')
+    if re.match(r"[\d.,+_'-]", unit) and not unit.startswith("1/"):
+        raise UnitError(f"{_at(where)}{text!r} is not one number with a unit; write digits without separators")
+    return number, unit
+
+
+def _conversion(unit_text: str, unit: str, where: str) -> tuple[Fraction, Fraction]:
+    (base, level), (target, target_level) = _split_level(unit_text), _split_level(unit)
+    source, goal = _parsed(base, where), _parsed(target, where)
+    if source.dimension != goal.dimension:
+        raise UnitError(f"{_at(where)}unit {unit_text!r} does not measure {unit!r}; {_remedy(source, goal, unit)}")
+    if target_level and not level:
+        raise UnitError(
+            f"{_at(where)}a pressure level in {unit_text!r} may be absolute or gauge; "
+            f'write "{base}(a)" or "{base}(g)" (gauge counts from {ATMOSPHERE:g} Pa)'
+        )
+    if level and not target_level:
+        raise UnitError(
+            f"{_at(where)}{unit_text!r}: (a) and (g) mark a pressure level, which is not meant here; write {base!r}"
+        )
+    shift = Fraction(ATMOSPHERE) * ((level == "g") - (target_level == "g"))
+    return source.factor / goal.factor, (source.offset - goal.offset + shift) / goal.factor
+
+
+def _scaled(number: str, factor: Fraction, offset: Fraction) -> float:
+    return float(number) if "inf" in number else float(Fraction(number) * factor + offset)
+
+
+def _split_level(unit_text: str) -> tuple[str, str]:
+    match = _LEVEL.fullmatch(unit_text)
+    return (match[1], match[2]) if match else (unit_text, "")
+
+
+def _check_vacuum(value: float, level: str, text: str | float, where: str) -> None:
+    floor = {"a": 0.0, "g": -ATMOSPHERE}.get(level, -math.inf)
+    require(
+        value >= floor or value == -math.inf, f"{_at(where)}{text!r} lies below vacuum; check (a) and (g)", UnitError
+    )
+
+
+def _parsed(unit_text: str, where: str = "") -> _Scale:
+    _registry()
+    try:
+        return _scale(unit_text)
+    except Exception:  # whatever pint raises on a text, the text is not a unit
+        raise UnitError(f"{_at(where)}unknown unit {unit_text!r}; {_nearest(unit_text)}") from None
+
+
+@cache
+def _scale(unit_text: str) -> _Scale:
+    require(not re.search(r"\d{3}", unit_text), "a power this high would take for ever")
+    unit = _registry().parse_units(unit_text)
+    zero, one = (_registry().Quantity(Fraction(k), unit).to_base_units() for k in range(2))
+    # Base units, not the unit's dimensionality: an angle counts as a dimension here.
+    dimension = tuple(sorted((name, Fraction(power)) for name, power in one.unit_items()))
+    return _Scale(one.magnitude - zero.magnitude, zero.magnitude, dimension)
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    registry: Any = pint.UnitRegistry(None, non_int_type=Fraction, autoconvert_offset_to_baseunit=True)
+    registry.load_definitions(_DEFINITIONS.strip().splitlines())
+    return registry
+
+
+def _base_unit(unit_text: str) -> str:
+    powers = _parsed(unit_text).dimension
+    return "*".join(f"{name}**({power})" for name, power in powers) or "1"
+
+
+def _remedy(source: _Scale, goal: _Scale, unit: str) -> str:
+    rates = [_parsed(rate).dimension for rate in ("Hz", "rad/s", "1/s")]
+    if source.dimension in rates and goal.dimension in rates:
+        return f"write it in {unit} (1 Hz is 2 pi rad/s; pneuopt does not choose for you)"
+    return f'write for instance "{_example(unit)}"'
+
+
+def _example(unit: str) -> str:
+    return {"Pa(a)": "bar(a)", "Pa(g)": "bar(g)", "1": "%"}.get(unit, unit)
+
+
+def _nearest(unit_text: str) -> str:
+    known = {key.casefold(): unit for unit in _COMMON.split() for key in (unit, re.sub(r"[()]", "", unit))}
+    near = difflib.get_close_matches(unit_text.casefold(), known, n=1, cutoff=0.6)
+    return f"did you mean {known[near[0]]!r}?" if near else "write for instance mm, m/s, N, bar(g), V, ms or %"
+
+
+def _at(where: str) -> str:
+    return f"{where}: " if where else ""

@@ -1,0 +1,256 @@
+from collections.abc import Callable
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import frequency_response
+from pneuopt.control.pid import PID
+from pneuopt.errors import ConvergenceError, InputError, ModelError
+from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.system import System, define
+
+Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
+TUNED = {"pid.Kp": 0.225, "pid.Ki": 1.23, "pid.Kd": 0.01, "pid.Tf": 0.01}
+
+
+def test_the_loop_lists_its_signals_with_units(axis: System) -> None:
+    loop = ClosedLoop(axis, PID(sample_time=1e-3), Dither(), actuated="force")
+    assert [q.name for q in loop.inputs] == ["reference", "pressure"]
+    assert (loop.inputs[0].unit, loop.feedback.name, loop.outputs[-1].unit) == ("m/s", "speed", "N")
+    assert loop.parameters["pid.Kp"].unit == "N*s/m"
+    assert loop.parameters["dither.amplitude"].unit == "N"
+    text = repr(loop)
+    assert text.startswith("ClosedLoop")
+    assert all(f"{q.name} [{q.unit}]" in text for q in (*loop.states, *loop.inputs, *loop.outputs))
+
+
+def test_a_continuous_loop_follows_python_control(second_order: System, run: Run) -> None:
+    loop = ClosedLoop(second_order, PID())
+    t, _, y = run(loop, loop.parameters.with_values(TUNED), 1.0, 1e-3, 0.6)
+    plant = control.tf([1270.12], [1, 17.5, 86.34])
+    controller = 0.225 + control.tf([1.23], [1, 0]) + control.tf([0.01, 0], [0.01, 1])
+    expected = control.step_response(control.feedback(plant * controller, 1), t)
+    np.testing.assert_allclose(y[:, 0], expected.outputs, atol=2e-8)
+
+
+def test_set_point_weights_act_on_the_reference_alone(second_order: System, run: Run) -> None:
+    loop = ClosedLoop(second_order, PID())
+    t, _, y = run(loop, loop.parameters.with_values({**TUNED, "pid.b": 0.3, "pid.c": 0.0}), 1.0, 1e-3, 0.6)
+    plant = control.tf([1270.12], [1, 17.5, 86.34])
+    integral, derivative = control.tf([1.23], [1, 0]), control.tf([0.01, 0], [0.01, 1])
+    expected = (0.225 * 0.3 + integral) * control.feedback(plant, 0.225 + integral + derivative)
+    np.testing.assert_allclose(y[:, 0], control.step_response(expected, t).outputs, atol=2e-8)
+
+
+def sampled_by_hand(
+    p: dict[str, float], h: float, n: int, dither: Callable[[float], float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eq. 16 by its exact zero-order-hold step, the controller as `PID` documents it."""
+    A, B = np.array([[0.0, 1.0], [-86.34, -17.5]]), np.array([0.0, 1270.12])
+    block = expm(h * np.vstack([np.column_stack([A, B]), np.zeros(3)]))
+    x, integral, derivative, previous = np.zeros(2), 0.0, 0.0, 0.0
+    speed, sent = [], []
+    for k in range(n):
+        e = 1.0 - x[0]
+        derivative = (p["pid.Tf"] * derivative + p["pid.Kd"] * (e - previous)) / (p["pid.Tf"] + h)
+        previous = e
+        integral += p["pid.Ki"] * h * e
+        w = p["pid.Kp"] * e + integral + derivative + dither(k * h)
+        u = min(max(w, p["pid.lower"]), p["pid.upper"])
+        integral += h / p["pid.Tt"] * (u - w)
+        speed.append(x[0])
+        sent.append(u)
+        x = block[:2, :2] @ x + block[:2, 2] * u
+    return np.array(speed), np.array(sent)
+
+
+def test_a_sampled_loop_is_the_difference_equation_on_the_exact_plant(second_order: System, run: Run) -> None:
+    h, loop = 2e-3, ClosedLoop(second_order, PID(sample_time=2e-3), Dither(60.0))
+    values = {**TUNED, "pid.Kp": 0.9, "pid.Tt": 0.05, "pid.lower": -0.3, "pid.upper": 0.7}
+    values |= {"dither.amplitude": 0.05, "dither.offset": -0.02}
+    t, x, y = run(loop, loop.parameters.with_values(values), 1.0, h, 0.8)
+    speed, sent = sampled_by_hand(values, h, len(t), lambda s: -0.02 + 0.05 * np.sin(2 * np.pi * 60.0 * s))
+    assert sent.max() == 0.7
+    np.testing.assert_allclose(y[:, 0], speed, atol=1e-7)
+    np.testing.assert_allclose(y[:, 1], sent, atol=1e-7)
+    np.testing.assert_array_equal(x[:, -1], y[:, 1])
+
+
+def test_sampling_faster_approaches_the_continuous_loop(second_order: System, run: Run) -> None:
+    continuous = ClosedLoop(second_order, PID())
+    _, _, y = run(continuous, continuous.parameters.with_values(TUNED), 1.0, 1e-3, 0.4)
+    errors = []
+    for m in (1, 4):
+        loop = ClosedLoop(second_order, PID(sample_time=1e-3 / m))
+        _, _, sampled = run(loop, loop.parameters.with_values(TUNED), 1.0, 1e-3 / m, 0.4)
+        errors.append(np.abs(sampled[::m, 0] - y[:, 0]).max())
+    assert errors[0] < 0.02
+    assert errors[1] == pytest.approx(errors[0] / 4, rel=0.1)
+
+
+def test_analogue_dither_moves_between_samples(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID(sample_time=1e-2), Dither(100.0, analogue=True))
+    values = {"pid.upper": 0.5, "dither.amplitude": 0.3, "dither.offset": 0.4}
+    p = loop.numbers(loop.parameters.with_values(values))
+    x = np.array(loop.update(0.0, loop.initial(loop.parameters), [0.0], p)).ravel()
+    assert x[-1] == pytest.approx(0.4)
+    sent = [float(loop.held().ode(t, x, [0.0], p)[1][-1]) for t in (0.0, 0.0025, 0.0075)]
+    assert sent == pytest.approx([0.4, 0.5, 0.1])
+
+
+def test_anti_windup_spares_the_overshoot(second_order: System, run: Run) -> None:
+    peaks = {}
+    for Tt in (0.02, 1e6):
+        loop = ClosedLoop(second_order, PID(sample_time=1e-3))
+        values = {"pid.Kp": 0.2, "pid.Ki": 4.0, "pid.upper": 0.08, "pid.lower": -0.08, "pid.Tt": Tt}
+        _, _, y = run(loop, loop.parameters.with_values(values), 1.0, 1e-3, 2.0)
+        assert np.abs(y[:, -1]).max() == 0.08
+        peaks[Tt] = y[:, 0].max()
+    assert peaks[1e6] > 1.15
+    assert peaks[0.02] - 1 < 0.3 * (peaks[1e6] - 1)
+
+
+def test_without_limits_nothing_is_clipped(second_order: System, run: Run) -> None:
+    loop = ClosedLoop(second_order, PID(limits=False))
+    _, _, y = run(loop, loop.parameters.with_values({"pid.Kp": 50.0}), 1.0, 1e-4, 0.01)
+    assert y[0, -1] == 50.0
+
+
+@pytest.mark.parametrize("pid", [PID(), PID(sample_time=5e-3)])
+def test_derivatives_agree_with_finite_differences(second_order: System, pid: PID) -> None:
+    loop = ClosedLoop(second_order, pid, Dither(60.0))
+    values = {**TUNED, "pid.lower": -9.0, "pid.upper": 9.0, "dither.amplitude": 0.2}
+    model, p = loop.discrete(2), loop.numbers(loop.parameters.with_values(values))
+    n = len(model.states)
+    z = ca.MX.sym("z", n + len(p))
+    after, y = model.sample(ca.MX(0.003), ca.MX(5e-3), z[:n], ca.MX(0.7), z[n:])
+    f = ca.Function("f", [z], [ca.vertcat(after, y)])
+    jacobian = ca.Function("J", [z], [ca.jacobian(f(z), z)])
+    point = np.concatenate([np.linspace(0.1, 0.4, n), p])
+    steps = np.diag(1e-6 * np.maximum(1.0, np.abs(point)))
+    columns = [(np.array(f(point + s)) - np.array(f(point - s))).ravel() / (2 * s.sum()) for s in steps]
+    np.testing.assert_allclose(np.array(jacobian(point)), np.column_stack(columns), rtol=2e-6, atol=1e-7)
+
+
+def test_rest_holds_the_load(axis: System) -> None:
+    for pid in (PID(), PID(sample_time=1e-3)):
+        loop = ClosedLoop(axis, pid, Dither(), actuated="force")
+        p = loop.parameters.with_values({"pid.Ki": 5.0, "dither.offset": 1.0})
+        x = dict(zip([q.name for q in loop.states], loop.initial(p), strict=True))
+        assert x["pid.integral"] == pytest.approx(3.0)
+        assert x["speed"] == pytest.approx(0.0, abs=1e-12)
+        assert x.get("pid.command", 3.0) == pytest.approx(3.0)
+
+
+def test_rest_at_another_reference_and_without_integral(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID())
+    x = loop.initial(loop.parameters, reference=0.5)
+    dc = 1270.12 / (1270.12 + 86.34)
+    np.testing.assert_allclose(x, [0.5 * dc, 0, 0, 0.5 * (1 - dc)], atol=1e-12)
+    rate = loop.system().ode(0, x, [0.5], loop.numbers(loop.parameters))[0]
+    np.testing.assert_allclose(np.array(rate).ravel(), 0.0, atol=1e-9)
+
+
+def test_a_rest_beyond_the_limits_is_refused(axis: System) -> None:
+    loop = ClosedLoop(axis, PID(), actuated="force")
+    with pytest.raises(InputError, match=r"needs a command of 3 N, the limits are -2 and 2"):
+        loop.initial(loop.parameters.with_values({"pid.Ki": 1.0, "pid.lower": -2.0, "pid.upper": 2.0}))
+
+
+@pytest.mark.parametrize("pid", [PID(), PID(sample_time=1e-3)])
+def test_a_given_state_is_taken_over_without_a_bump(axis: System, pid: PID) -> None:
+    loop = ClosedLoop(axis, pid, actuated="force")
+    p = loop.parameters.with_values({"pid.Kp": 7.0, "pid.Kd": 0.3, "pid.b": 0.6})
+    x = loop.initial(p, [0.1, 0.2], reference=0.2, command=5.0)
+    if pid.sample_time is not None:
+        x = np.array(loop.update(0.0, x, [0.2, 0.0], loop.numbers(p))).ravel()
+    model = loop.held() if pid.sample_time is not None else loop.system()
+    assert float(model.ode(0, x, [0.2, 0.0], loop.numbers(p))[1][-1]) == pytest.approx(5.0)
+
+
+def test_a_moving_position_has_no_rest(axis: System) -> None:
+    loop = ClosedLoop(axis, PID(), actuated="force")
+    with pytest.raises(ConvergenceError, match="position"):
+        loop.initial(loop.parameters.with_values({"pid.Ki": 1.0}), reference=0.2)
+    with pytest.raises(InputError, match=r"x_plant has shape \(3,\)"):
+        loop.initial(loop.parameters, [0.0, 0.0, 0.0])
+
+
+def test_the_open_loop_is_controller_times_plant(second_order: System) -> None:
+    w, h = np.geomspace(0.1, 400.0, 30), 2e-3
+    s = 1j * w
+    expected = 1270.12 / (s**2 + 17.5 * s + 86.34) * (0.225 + 1.23 / s + 0.01 * s / (0.01 * s + 1))
+    for pid, hold in ((PID(), 1.0), (PID(sample_time=h), (1 - s * h / 4) / (1 + s * h / 4))):
+        loop = ClosedLoop(second_order, pid, Dither(60.0))
+        L = loop.open_loop(loop.parameters.with_values(TUNED))
+        np.testing.assert_allclose(frequency_response(L, w), expected * hold, rtol=1e-10)
+    assert np.angle(hold) == pytest.approx(-w * h / 2, abs=0.006)
+
+
+def test_an_algebraic_loop_is_refused(axis: System) -> None:
+    with pytest.raises(ModelError, match="algebraic loop: output 'acceleration' depends on input 'force'"):
+        ClosedLoop(axis, PID(), actuated="force", measured="acceleration")
+    ClosedLoop(axis, PID(), actuated="force", measured="position")
+
+
+def test_ambiguous_and_unknown_names_are_refused(axis: System) -> None:
+    with pytest.raises(ModelError, match="inputs force, pressure; choose actuated="):
+        ClosedLoop(axis, PID())
+    with pytest.raises(InputError, match="unknown input 'forse'; did you mean 'force'"):
+        ClosedLoop(axis, PID(), actuated="forse")
+    with pytest.raises(InputError, match="unknown output 'sped'; did you mean 'speed'"):
+        ClosedLoop(axis, PID(), actuated="force", measured="sped")
+
+
+def test_a_plant_may_not_use_the_loops_names() -> None:
+    r, y = Quantity("reference", "V"), Quantity("y", "V")
+    plant = define([y], [r], [y], ParameterSet(), lambda _t, x, u, _p: ({"y": u["reference"]}, {"y": x["y"]}))
+    with pytest.raises(ModelError, match="signal 'reference' of its own"):
+        ClosedLoop(plant, PID())
+
+
+def test_dither_beyond_nyquist_is_refused(second_order: System) -> None:
+    with pytest.raises(InputError, match=r"160 Hz .* every 5 ms.* 100 Hz"):
+        ClosedLoop(second_order, PID(sample_time=5e-3), Dither(160.0))
+    sampled = ClosedLoop(second_order, PID(sample_time=5e-3), Dither(60.0))
+    other = ClosedLoop(second_order, PID(), Dither(160.0)).parameters
+    with pytest.raises(InputError, match=r"160 Hz .* 100 Hz"):
+        sampled.initial(sampled.parameters | other)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"pid.lower": 2.0, "pid.upper": 1.0}, "pid.lower 2 is not below pid.upper 1 V"),
+        ({"pid.lower": -1.0, "pid.upper": 1.0, "pid.Tt": 0.001}, r"pid.Tt = 0.001 s.*one sample \(0.002 s\)"),
+    ],
+)
+def test_values_no_loop_can_run_with_are_refused(second_order: System, values: dict[str, float], message: str) -> None:
+    sampled = ClosedLoop(second_order, PID(sample_time=2e-3))
+    parameters = ClosedLoop(second_order, PID()).parameters.with_values(values)
+    with pytest.raises(InputError, match=message):
+        sampled.check(parameters)
+
+
+def test_a_continuous_derivative_needs_its_filter(second_order: System) -> None:
+    continuous, sampled = ClosedLoop(second_order, PID()), ClosedLoop(second_order, PID(sample_time=1e-3))
+    unfiltered = sampled.parameters.with_values({"pid.Tf": 0.0})
+    sampled.check(unfiltered)
+    with pytest.raises(InputError, match="needs a filter, Tf > 0"):
+        continuous.initial(unfiltered)
+    with pytest.raises(InputError, match=r"pid\.Tf = 0"):
+        sampled.open_loop(unfiltered)
+
+
+def test_sampled_and_continuous_loops_are_asked_the_right_thing(second_order: System) -> None:
+    with pytest.raises(ModelError, match=r"use discrete\(\), or held\(\)"):
+        ClosedLoop(second_order, PID(sample_time=1e-3)).system()
+    with pytest.raises(ModelError, match=r"use system\(\)"):
+        ClosedLoop(second_order, PID()).held()
+    with pytest.raises(ModelError, match=r"use system\(\)"):
+        _ = ClosedLoop(second_order, PID()).update

@@ -1,0 +1,133 @@
+import warnings
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import frequency_grid, frequency_response, margins, sensitivity_terms
+from pneuopt.control.pid import PID
+from pneuopt.errors import ModelError
+from pneuopt.system import Linearisation, System
+
+
+def linearised(numerator: list[float], denominator: list[float]) -> Linearisation:
+    s = control.tf2ss(control.tf(numerator, denominator))
+    states = tuple(f"x{k}" for k in range(s.nstates))
+    return Linearisation(s.A, s.B, s.C, s.D, states, ("u",), ("y",))
+
+
+def test_the_papers_loop(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID())
+    m = margins(loop.open_loop(loop.parameters))
+    assert m.phase_margin == pytest.approx(28.54, abs=0.005)
+    assert m.gain_crossover == pytest.approx(34.67, abs=0.005)
+    assert m.gain_margin == np.inf
+    assert np.isnan(m.phase_crossover)
+    assert m.stable
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator"),
+    [
+        ([1270.12], [1, 17.5, 86.34]),
+        ([2.0], [1, 3, 3, 1]),
+        ([9.0], [1, 3, 3, 1]),
+        ([5.0, 5.0], [1, 2, 10, 0, 0]),
+        ([-1.0, 4.0], [1, 5, 4]),
+        ([100.0, 20.0, 1.0], [1, 30, 100, 0, 0, 0]),
+        ([0.5], [1, 1]),
+        ([40.0, 4.0, 4000.0], [1, 0.02, 100, 0]),
+        ([3.0], [1, 0.004, 4, 0.001]),
+        ([1e-3, 1e-9], [1, 0.01, 0]),
+    ],
+)
+def test_agreement_with_python_control(numerator: list[float], denominator: list[float]) -> None:
+    m = margins(linearised(numerator, denominator))
+    gm, pm, sm, wpc, wgc, wms = control.stability_margins(control.tf(numerator, denominator))
+    expected = [gm, pm, wpc, wgc]
+    ours = [m.gain_margin, m.phase_margin, m.phase_crossover, m.gain_crossover]
+    np.testing.assert_allclose(ours, expected, rtol=1e-6)
+    if np.isfinite(m.max_sensitivity_frequency):
+        assert m.max_sensitivity == pytest.approx(1 / sm, rel=1e-6)
+        assert m.max_sensitivity_frequency == pytest.approx(wms, rel=1e-3)
+    closed = control.feedback(control.tf(numerator, denominator), 1)
+    assert m.stable == bool(np.all(np.real(closed.poles()) < 0))
+
+
+@settings(max_examples=40, deadline=None)
+@given(Kp=st.floats(0.02, 2.0), Ki=st.floats(0.01, 20.0), Kd=st.floats(0.0, 0.05), Tf=st.floats(1e-3, 0.1))
+def test_no_frequency_beats_the_maximum_sensitivity(Kp: float, Ki: float, Kd: float, Tf: float) -> None:
+    s = control.tf("s")
+    L = 1270.12 / (s**2 + 17.5 * s + 86.34) * (Kp + Ki / s + Kd * s / (Tf * s + 1))
+    m = margins(linearised(list(L.num[0][0]), list(L.den[0][0])))
+    w = np.geomspace(1e-3, 1e5, 5000)
+    assert m.max_sensitivity >= np.max(1 / np.abs(1 + L(1j * w))) * (1 - 1e-9)
+    assert m.max_sensitivity >= 1 / (2 * np.sin(np.radians(abs(m.phase_margin)) / 2)) * (1 - 1e-9)
+
+
+def test_a_loop_that_only_approaches_its_maximum() -> None:
+    m = margins(linearised([0.5], [1, 1]))
+    assert (m.max_sensitivity, m.max_sensitivity_frequency) == (1.0, np.inf)
+
+
+def test_an_unseen_position_does_not_make_a_speed_loop_unstable(axis: System) -> None:
+    loop = ClosedLoop(axis, PID(), actuated="force")
+    m = margins(loop.open_loop(loop.parameters.with_values({"pid.Ki": 2.0})))
+    assert m.stable
+    assert not margins(loop.open_loop(loop.parameters.with_values({"pid.Kp": -20.0, "pid.Ki": 2.0}))).stable
+
+
+def test_a_sampled_loop_has_less_phase(second_order: System) -> None:
+    reference = ClosedLoop(second_order, PID())
+    sampled = ClosedLoop(second_order, PID(sample_time=4e-3))
+    m = [margins(loop.open_loop(loop.parameters)) for loop in (reference, sampled)]
+    lost = np.degrees(m[0].gain_crossover * 4e-3 / 2)
+    assert m[0].phase_margin - m[1].phase_margin == pytest.approx(lost, abs=0.01)
+
+
+@pytest.mark.parametrize("sample_time", [None, 2e-3])
+def test_sensitivity_terms_are_the_loops_sensitivity(second_order: System, sample_time: float | None) -> None:
+    loop = ClosedLoop(second_order, PID(sample_time=sample_time))
+    w = np.geomspace(0.1, 1e3, 50)
+    terms = sensitivity_terms(loop, w, loop.parameters)
+    tuned = loop.parameters.with_values({"pid.Kp": 0.2, "pid.Ki": 1.1, "pid.Kd": 0.009, "pid.Tf": 0.02})
+    L = frequency_response(loop.open_loop(tuned), w)
+    np.testing.assert_allclose(np.array(terms(loop.numbers(tuned))).ravel(), np.abs(1 + L) ** 2, rtol=1e-10)
+
+
+def test_sensitivity_terms_have_exact_derivatives(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID())
+    f = sensitivity_terms(loop, [1.0, 30.0, 300.0], loop.parameters)
+    p = loop.numbers(loop.parameters.with_values({"pid.Kp": 0.2, "pid.Ki": 1.1, "pid.Kd": 0.009, "pid.Tf": 0.02}))
+    z = ca.SX.sym("p", len(p))
+    jacobian = np.array(ca.Function("J", [z], [ca.jacobian(f(z), z)])(p))
+    steps = 1e-5 * np.diag(np.where(np.isinf(p), 0.0, p))
+    for k, name in enumerate(loop.parameters):
+        if name not in ("pid.Kp", "pid.Ki", "pid.Kd", "pid.Tf"):
+            np.testing.assert_array_equal(jacobian[:, k], 0.0)
+            continue
+        difference = (np.array(f(p + steps[k])) - np.array(f(p - steps[k]))).ravel() / (2 * steps[k, k])
+        np.testing.assert_allclose(jacobian[:, k], difference, rtol=1e-6, atol=1e-9)
+
+
+def test_a_free_plant_parameter_is_refused(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID())
+    with pytest.raises(ModelError, match=r"plant\.k: free, but the sensitivity takes the plant as fixed"):
+        sensitivity_terms(loop, [1.0], loop.parameters.freed("plant.k"))
+
+
+def test_the_grid_sees_a_sharp_resonance() -> None:
+    grid = frequency_grid(linearised([3.0], [1, 1e-5, 4, 0.001]), 20)
+    assert np.min(np.abs(grid - 2.0)) < 1e-5
+
+
+def test_one_input_and_positive_frequencies() -> None:
+    wide = Linearisation(-np.eye(1), np.ones((1, 2)), np.eye(1), np.zeros((1, 2)), ("x",), ("u", "w"), ("y",))
+    with pytest.raises(ModelError, match=r"shape \(1, 2\)"):
+        frequency_response(wide, [1.0])
+    with warnings.catch_warnings(), pytest.raises(ValueError, match="must be positive"):
+        frequency_response(linearised([1.0], [1, 1]), [0.0])

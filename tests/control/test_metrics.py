@@ -1,0 +1,164 @@
+from collections.abc import Callable
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.metrics import About, step_metrics
+from pneuopt.control.pid import PID
+from pneuopt.errors import InputError
+from pneuopt.parameters import ParameterSet
+from pneuopt.system import System
+
+Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
+T = np.linspace(0.0, 12.0, 2401)
+
+
+def response(damping: float = 0.4, gain: float = 0.9) -> np.ndarray:
+    """Unit step of a second-order lag, 2 rad/s."""
+    wd = 2.0 * np.sqrt(1 - damping**2)
+    decay = np.exp(-2.0 * damping * T)
+    ring: np.ndarray = gain * (1 - decay * (np.cos(wd * T) + 2.0 * damping / wd * np.sin(wd * T)))
+    return ring
+
+
+PAPER_1 = {"pid.Kp": 0.225, "pid.Ki": 1.23, "pid.Kd": 0.01, "pid.Tf": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("gain", "values", "band", "expected"),
+    [
+        (1.0, {}, 0.05, {"SettlingTime": 0.2947, "SteadyStateValue": 0.936349, "Peak": 1.370598, "Overshoot": 37.06}),
+        (1.0, {}, 0.02, {"SettlingTime": 0.4494, "SteadyStateError": 6.3651}),
+        (1.0, {}, 0.01, {"SettlingTime": 0.4716}),
+        (1.0, {}, 0.001, {"SettlingTime": 0.7350}),
+        (0.5, {}, 0.02, {"SettlingTime": 0.4148, "SteadyStateValue": 0.880316, "Peak": 1.178517}),
+        (0.5, PAPER_1, 0.02, {"SettlingTime": 0.348, "Overshoot": 0.0}),
+        (1.0, PAPER_1, 0.02, {"SettlingTime": 0.1575, "Overshoot": 1.31}),
+    ],
+)
+def test_golden_numbers_of_the_papers_loop(
+    second_order: System, run: Run, gain: float, values: dict[str, float], band: float, expected: dict[str, float]
+) -> None:
+    loop = ClosedLoop(second_order, PID())
+    parameters = loop.parameters.with_values({**values, "plant.k": gain * 1270.12})
+    t, _, y = run(loop, parameters, 1.0, 2e-4, 4.0)
+    measured = step_metrics(t, y[:, 0], 1.0, 0.0, band=band, control=y[:, 1])
+    digits = {
+        "SettlingTime": 1.0e-4 if gain == 1.0 or not values else 5e-4,
+        "Overshoot": 6e-3,
+        "SteadyStateError": 5e-4,
+    }
+    for key, value in expected.items():
+        assert measured[key] == pytest.approx(value, abs=digits.get(key, 2e-6)), key
+
+
+def test_agreement_with_python_control_where_definitions_coincide() -> None:
+    y = response()
+    ours = step_metrics(T, y, 1.0, 0.0, final=0.9)
+    theirs = control.step_info(y, T, final_output=0.9)
+    step = T[1]
+    for key in ("SettlingMin", "SettlingMax", "Peak", "PeakTime", "SteadyStateValue", "Undershoot"):
+        assert ours[key] == pytest.approx(theirs[key], abs=1e-12), key
+    assert ours["OvershootFinal"] == pytest.approx(theirs["Overshoot"], abs=1e-9)
+    for key in ("RiseTime", "SettlingTime"):
+        assert ours[key] == pytest.approx(theirs[key], abs=step), key
+    assert ours["Overshoot"] == pytest.approx(100 * max(0.0, y.max() - 1.0))
+
+
+@settings(deadline=None)
+@given(
+    shift=st.floats(-10, 10),
+    size=st.floats(0.01, 100).flatmap(lambda s: st.sampled_from([s, -s])),
+    delay=st.floats(-5, 5),
+    damping=st.floats(0.2, 0.9),
+)
+def test_shift_scale_and_sign_do_not_matter(shift: float, size: float, delay: float, damping: float) -> None:
+    y = response(damping)
+    plain = step_metrics(T, y, 1.0, 0.0, control=y)
+    moved = step_metrics(T + delay, shift + size * y, shift + size, shift, start=delay, control=size * y)
+    near = 1e-7 * max(1.0, 1.0 / abs(size))
+    for key in (
+        "RiseTime",
+        "SettlingTime",
+        "PeakTime",
+        "Overshoot",
+        "OvershootFinal",
+        "Undershoot",
+        "SteadyStateError",
+    ):
+        assert moved[key] == pytest.approx(plain[key], rel=1e-7, abs=near), key
+    for key in ("Peak", "SteadyStateValue"):
+        assert moved[key] == pytest.approx(shift + size * plain[key], rel=1e-9, abs=1e-9), key
+    assert moved["Ripple"] == pytest.approx(abs(size) * plain["Ripple"], rel=1e-6, abs=1e-9)
+    assert moved["PeakControl"] == pytest.approx(abs(size) * plain["PeakControl"])
+
+
+@given(stride=st.integers(2, 20))
+def test_settling_does_not_hang_on_the_grid(stride: int) -> None:
+    y = response()
+    fine, coarse = (step_metrics(T[::k], y[::k], 0.9, 0.0, final=0.9) for k in (1, stride))
+    assert coarse["SettlingTime"] == pytest.approx(fine["SettlingTime"], abs=0.02 * stride * T[1])
+
+
+def test_the_band_lies_where_it_was_asked_for() -> None:
+    y = 0.97 * (1 - np.exp(-T))
+    about = {a: step_metrics(T, y, 1.0, 0.0, band=0.05, about=a, final=0.97)["SettlingTime"] for a in About}
+    assert about[About.FINAL] == pytest.approx(np.log(20), abs=1e-4)
+    assert about[About.REFERENCE] == pytest.approx(-np.log(0.02 / 0.97), abs=1e-4)
+    assert np.isnan(step_metrics(T, y, 1.0, 0.0, band=0.02, about=About.REFERENCE)["SettlingTime"])
+
+
+def test_a_loop_that_hunts_or_creeps_never_settles() -> None:
+    hunting = response() + 0.05 * np.sin(3.0 * T)
+    creeping = 0.01 * T
+    for y in (hunting, creeping):
+        assert np.isnan(step_metrics(T, y, 1.0, 0.0)["SettlingTime"])
+    assert np.isnan(step_metrics(T, creeping, 1.0, 0.0, final=1.0)["RiseTime"])
+    assert step_metrics(T, creeping, 1.0, 0.0, about=About.REFERENCE)["SteadyStateError"] == pytest.approx(88.0)
+    backwards = step_metrics(T, -response(), 1.0, 0.0)
+    assert np.isnan(backwards["OvershootFinal"])
+    assert backwards["Undershoot"] > 90
+
+
+def test_dither_is_averaged_without_phase_shift() -> None:
+    period = 0.1
+    t = np.linspace(0.0, 12.0, 12001)
+    y = np.interp(t, T, response())
+    dithered = step_metrics(t, y + 0.2 * np.sin(2 * np.pi * t / period), 1.0, 0.0, dither_period=period)
+    plain = step_metrics(t, y, 1.0, 0.0, final=0.9)
+    assert dithered["Ripple"] == pytest.approx(0.4, abs=0.001)
+    for key, tolerance in {"SettlingTime": 0.01, "PeakTime": 0.011, "Peak": 1e-3, "SteadyStateValue": 1e-4}.items():
+        assert dithered[key] == pytest.approx(plain[key], abs=tolerance), key
+
+
+def test_averaging_is_exact_on_an_uneven_grid() -> None:
+    rng = np.random.default_rng(5)
+    t = np.unique(np.concatenate([[0.0, 8.0], rng.uniform(0.0, 8.0, 4000)]))
+    period = 0.25
+    y = 1.0 + 0.3 * np.sin(2 * np.pi * t / period)
+    m = step_metrics(t, y, 1.0, 0.0, dither_period=period)
+    assert m["SteadyStateValue"] == pytest.approx(1.0, abs=1e-4)
+    assert m["Overshoot"] < 0.1 + 100 * 0.3 / np.pi
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"y": np.where(T > 3, np.nan, 1.0)}, "NaN"),
+        ({"y": T[:-1]}, "differ in shape"),
+        ({"t": T[::-1]}, "increase strictly"),
+        ({"initial": 1.0}, "no step"),
+        ({"band": 2.0}, "2 % is 0.02"),
+        ({"start": 12.0}, "fewer than three samples"),
+        ({"dither_period": 11.0}, "too short to average over 11 s"),
+        ({"control": T[:-1]}, "t and control differ"),
+    ],
+)
+def test_records_that_cannot_be_measured_are_refused(change: dict[str, object], message: str) -> None:
+    fields: dict[str, object] = {"t": T, "y": response(), "reference_final": 1.0, "initial": 0.0} | change
+    with pytest.raises(InputError, match=message):
+        step_metrics(**fields)  # type: ignore[arg-type]

@@ -1,0 +1,145 @@
+from math import inf
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pneuopt.control.pid import PID, ParallelForm, StandardForm, ratio, to_parallel, to_standard
+from pneuopt.errors import InputError, UnitError
+from pneuopt.parameters import Quantity
+
+MEASURED, COMMAND = Quantity("speed", "m/s"), Quantity("valve_voltage", "V")
+GAINS = {"Kp": 2.0, "Ki": 9.0, "Kd": 0.05, "Tf": 0.004, "b": 0.7, "c": 0.4, "Tt": 0.06, "lower": -1.0, "upper": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "expected"),
+    [
+        ("V", "m/s", "V*s/m"),
+        ("V*s", "m/s", "V*s^2/m"),
+        ("N", "m", "N/m"),
+        ("V", "Pa(g)", "V/Pa"),
+        ("1", "m^2/s^2", "s^2/m^2"),
+        ("kg/(m*s)", "Pa", "kg/(m*s*Pa)"),
+        ("m", "m", "1"),
+    ],
+)
+def test_units_of_gains_are_simplified(above: str, below: str, expected: str) -> None:
+    assert ratio(above, below) == expected
+
+
+def test_an_unreadable_unit_is_refused() -> None:
+    with pytest.raises(UnitError, match=r"cannot read the unit 'm\*\*2'"):
+        ratio("V", "m**2")
+
+
+@pytest.mark.parametrize("sample_time", [0.0, -1e-3, inf])
+def test_sample_time_must_be_positive(sample_time: float) -> None:
+    with pytest.raises(InputError, match="sample_time must be positive"):
+        PID(sample_time=sample_time)
+
+
+def test_without_limits_there_is_nothing_to_saturate() -> None:
+    assert tuple(PID(limits=False).parameters("m", "N")) == ("Kp", "Ki", "Kd", "Tf", "b", "c")
+
+
+@given(
+    Kp=st.floats(0.01, 100),
+    Ki=st.floats(0.01, 1000),
+    Kd=st.floats(1e-4, 10),
+    Tf=st.floats(1e-5, 1.0),
+)
+def test_parallel_to_standard_and_back(Kp: float, Ki: float, Kd: float, Tf: float) -> None:
+    back = to_parallel(to_standard(ParallelForm(Kp, Ki, Kd, Tf)))
+    np.testing.assert_allclose([back.Kp, back.Ki, back.Kd, back.Tf], [Kp, Ki, Kd, Tf], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("parallel", "standard"),
+    [
+        (ParallelForm(2.0), StandardForm(2.0, inf, 0.0, inf)),
+        (ParallelForm(2.0, 4.0), StandardForm(2.0, 0.5, 0.0, inf)),
+        (ParallelForm(2.0, 0.0, 0.5), StandardForm(2.0, inf, 0.25, inf)),
+    ],
+)
+def test_missing_actions_convert_both_ways(parallel: ParallelForm, standard: StandardForm) -> None:
+    assert to_standard(parallel) == standard
+    assert to_parallel(standard) == parallel
+
+
+def test_what_the_standard_form_cannot_say_is_refused() -> None:
+    with pytest.raises(InputError, match="needs Kp != 0"):
+        to_standard(ParallelForm(0.0, 1.0))
+    with pytest.raises(InputError, match="Ti = inf"):
+        to_parallel(StandardForm(1.0, 0.0))
+    with pytest.raises(InputError, match="N = 0"):
+        to_parallel(StandardForm(1.0, 1.0, 0.1, 0.0))
+
+
+def run_sampled(r: np.ndarray, y: np.ndarray, h: float) -> np.ndarray:
+    """The law of `PID`'s docstring in plain Python, for comparison."""
+    g = GAINS
+    integral = derivative = previous = 0.0
+    sent = []
+    for rk, yk in zip(r, y, strict=True):
+        error = g["c"] * rk - yk
+        derivative = g["Tf"] / (g["Tf"] + h) * derivative + g["Kd"] / (g["Tf"] + h) * (error - previous)
+        previous = error
+        integral += g["Ki"] * h * (rk - yk)
+        w = g["Kp"] * (g["b"] * rk - yk) + integral + derivative
+        u = min(max(w, g["lower"]), g["upper"])
+        integral += h / g["Tt"] * (u - w)
+        sent.append(u)
+    return np.array(sent)
+
+
+def sampled_function(pid: PID) -> ca.Function:
+    x = {q.name: ca.SX.sym(q.name) for q in pid.states(MEASURED, COMMAND)}
+    p = {n: ca.SX.sym(n) for n in GAINS}
+    r, y, d = ca.SX.sym("r"), ca.SX.sym("y"), ca.SX.sym("d")
+    after = pid.update(x, r, y, d, p)
+    assert list(after) == list(x)
+    return ca.Function(
+        "pid", [ca.vertcat(*x.values()), r, y, d, ca.vertcat(*p.values())], [ca.vertcat(*after.values())]
+    )
+
+
+def test_sampled_law_is_the_documented_difference_equation() -> None:
+    h, rng = 2e-3, np.random.default_rng(3)
+    r, y = np.repeat(rng.normal(size=20), 25), np.cumsum(rng.normal(size=500)) * 0.05
+    law = sampled_function(PID(sample_time=h))
+    x, sent = np.zeros(4), []
+    for rk, yk in zip(r, y, strict=True):
+        x = np.array(law(x, rk, yk, 0.0, list(GAINS.values()))).ravel()
+        sent.append(x[3])
+    expected = run_sampled(r, y, h)
+    assert expected.max() == GAINS["upper"]
+    assert expected.min() == GAINS["lower"]
+    np.testing.assert_allclose(sent, expected, atol=1e-12)
+
+
+def test_anti_windup_sees_command_plus_dither() -> None:
+    pid = PID(sample_time=1e-3)
+    law = sampled_function(pid)
+    p = list({**GAINS, "Kp": 0.0, "Ki": 0.0, "Kd": 0.0}.values())
+    free = np.array(law([1.0, 0, 0, 0], 0.0, 0.0, 0.4, p)).ravel()
+    stopped = np.array(law([1.0, 0, 0, 0], 0.0, 0.0, 0.8, p)).ravel()
+    assert free[[0, 3]] == pytest.approx([1.0, 1.4])
+    assert stopped[[0, 3]] == pytest.approx([1.0 - 1e-3 / 0.06 * 0.3, 1.5])
+
+
+def test_derivatives_agree_with_finite_differences() -> None:
+    pid, p = PID(), {n: ca.SX.sym(n) for n in GAINS}
+    x = {q.name: ca.SX.sym(q.name) for q in pid.states(MEASURED, COMMAND)}
+    r, y, d = ca.SX.sym("r"), ca.SX.sym("y"), ca.SX.sym("d")
+    rates, u = pid.rates(x, r, y, d, p)
+    z = ca.vertcat(*x.values(), r, y, d, *p.values())
+    f = ca.Function("f", [z], [ca.vertcat(*rates.values(), u)])
+    jacobian = ca.Function("J", [z], [ca.jacobian(f(z), z)])
+    for level in (0.2, 5.0):
+        point = np.array([0.1, 0.02, level, 0.05, 0.03, *GAINS.values()])
+        step = 1e-6
+        columns = [(np.array(f(point + e)) - np.array(f(point - e))).ravel() / 2e-6 for e in step * np.eye(len(point))]
+        np.testing.assert_allclose(np.array(jacobian(point)), np.column_stack(columns), rtol=1e-5, atol=1e-6)

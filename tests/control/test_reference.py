@@ -1,0 +1,45 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+
+
+@given(size=st.floats(-5, 5).filter(lambda s: abs(s) > 1e-6), first=st.integers(0, 90), initial=st.floats(-5, 5))
+def test_the_step_comes_at_its_sample(size: float, first: int, initial: float) -> None:
+    h = 0.01
+    step = Step(size, at=first * h, initial=initial)
+    run = step.trajectory(h)
+    assert len(run) == 101
+    np.testing.assert_array_equal(run["reference"], np.where(np.arange(101) >= first, initial + size, initial))
+    assert step.final == initial + size
+
+
+def test_the_grid_reaches_the_horizon() -> None:
+    assert Step(1.0, horizon=1.0).trajectory(0.3).t[-1] == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"size": 0.0}, "size must not be zero"),
+        ({"size": math.nan}, "size must be a finite number"),
+        ({"size": 1.0, "at": -0.1}, "at must not be negative"),
+        ({"size": 1.0, "at": 2.0}, "horizon 1 s must lie after the step at 2 s"),
+        ({"size": 1.0, "horizon": math.inf}, "horizon must be a finite"),
+    ],
+)
+def test_impossible_steps_are_refused(fields: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Step(**fields)
+
+
+def test_a_step_between_samples_is_refused_with_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"between two samples of 0\.01 s; use 0\.1 s"):
+        Step(1.0, at=0.1049).trajectory(0.01)
+    with pytest.raises(InputError, match="spacing 2 s"):
+        Step(1.0).trajectory(2.0)

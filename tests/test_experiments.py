@@ -1,0 +1,365 @@
+import hashlib
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pneuopt.errors import InputError, LogError, UnitError, UnknownNameError
+from pneuopt.experiments import CHANNELS, Experiment, differentiate, read_log, resample, split
+from pneuopt.trajectories import Trajectory
+from pneuopt.units import ATMOSPHERE, scale_of
+
+HEADER = "time [s],position [mm]\n"
+BODY = "\n".join(f"{k / 10},{k}" for k in range(12)) + "\n"
+SIDECAR = """
+[columns]
+time = "t [ms]"
+valve_voltage = { column = "U valve", unit = "V", centre = "5 V" }
+force = { column = "U valve", unit = "V", centre = "5000 mV", scale = "-35.15065 N/V" }
+[noise]
+force = "2 N"
+[conditions]
+"supply.pressure" = "6.3 bar(g)"
+"load.mass" = "5 kg"
+"""
+RENAMED = "t [ms],U valve,note\n" + "".join(f"{k},{k},free text\n" for k in range(12))
+
+
+def written(folder: Path, text: str | bytes, sidecar: str = "") -> Path:
+    path = folder / "run_01.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    if sidecar:
+        path.with_suffix(".toml").write_text(sidecar, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["time [s],position [mm]", "time_s,position_mm", "Time (s),Position (mm)", '"time [ s ]", "position[mm]"'],
+)
+def test_the_header_may_name_channels_and_units(tmp_path: Path, header: str) -> None:
+    path = written(tmp_path, f"{header}\n{BODY}")
+    run = read_log(path)
+    np.testing.assert_allclose(run.trajectory["position"], 1e-3 * np.arange(12), rtol=1e-15)
+    np.testing.assert_allclose(run.trajectory.t, 0.1 * np.arange(12), rtol=1e-15)
+    assert (run.name, run.sha256) == ("run_01", hashlib.sha256(path.read_bytes()).hexdigest())
+    assert (run.noise, run.conditions) == ({}, {})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        (HEADER + BODY).replace(",", ";").replace(".", ","),
+        (HEADER + BODY).replace(",", "\t").replace(".", ","),
+        (HEADER + BODY).replace(",", ";"),
+        (HEADER + BODY).replace(",", " , "),
+        (HEADER + BODY).replace("\n", ",\n"),  # trailing delimiter everywhere
+        HEADER + BODY.replace("\n", ",\n"),  # in the rows only
+        HEADER.replace("\n", ",\n") + BODY,  # in the header only
+        "\ufeff" + HEADER + BODY + "\n\n",
+        (HEADER + BODY).replace("\n", "\r\n"),
+        HEADER + "".join(f'"{k // 10},{k % 10}","{k},0"\n' for k in range(12)),
+    ],
+    ids=["semicolon", "tab", "point", "spaces", "trail", "trail-rows", "trail-header", "bom", "crlf", "quoted"],
+)
+def test_dialects_agree(tmp_path: Path, text: str) -> None:
+    run = read_log(written(tmp_path, text))
+    np.testing.assert_allclose(run.trajectory["position"], 1e-3 * np.arange(12), rtol=1e-15)
+    np.testing.assert_allclose(run.trajectory.t, 0.1 * np.arange(12), rtol=1e-15)
+
+
+def test_an_older_windows_file(tmp_path: Path) -> None:
+    text = "time [s]\tposition [µm]\n" + "".join(f"{k},5\t{k}\n" for k in range(12))
+    assert read_log(written(tmp_path, text.encode("cp1252"))).trajectory["position"][3] == pytest.approx(3e-6)
+
+
+def test_pressures_become_absolute(tmp_path: Path) -> None:
+    run = read_log(written(tmp_path, "time_ms,pressure_a_bar(g),pressure_b [kPa(a)]\n" + BODY.replace("\n", ",100\n")))
+    np.testing.assert_allclose(run.trajectory["pressure_a"], 1e5 * np.arange(12) + ATMOSPHERE, rtol=1e-15)
+    assert run.trajectory["pressure_b"][0] == 1e5
+    assert run.trajectory.t[1] == pytest.approx(1e-4)
+
+
+def test_a_sidecar_is_found_and_says_it_all(tmp_path: Path) -> None:
+    run = read_log(written(tmp_path, RENAMED, SIDECAR))
+    assert run.trajectory.names == ("valve_voltage", "force")
+    np.testing.assert_allclose(run.trajectory["valve_voltage"], np.arange(12) - 5.0)
+    np.testing.assert_allclose(run.trajectory["force"], -35.15065 * (np.arange(12) - 5.0))
+    assert run.noise == {"force": 2.0}
+    assert run.conditions == {"supply.pressure": 6.3e5 + ATMOSPHERE, "load.mass": 5.0}
+
+
+def test_columns_in_place_of_the_sidecars(tmp_path: Path) -> None:
+    path = written(tmp_path, RENAMED)
+    sensor = {"column": "U valve", "unit": "V", "centre": "1 V", "scale": "2 bar(g)/V"}
+    run = read_log(path, columns={"time": "t [ms]", "pressure_a": sensor})
+    np.testing.assert_allclose(run.trajectory["pressure_a"], 2e5 * (np.arange(12) - 1.0) + ATMOSPHERE)
+    counts = {"column": "U valve", "unit": "count", "scale": "0.5 um"}
+    run = read_log(path, columns={"time": "t [ms]", "position": counts})
+    assert run.trajectory["position"][2] == pytest.approx(1e-6)
+
+
+def test_an_explicit_sidecar(tmp_path: Path) -> None:
+    side = tmp_path / "rig.toml"
+    side.write_text('[noise]\nposition = "20 um"\n')
+    assert read_log(written(tmp_path, HEADER + BODY), sidecar=side).noise == {"position": 2e-5}
+
+
+def test_other_columns_are_left_alone(tmp_path: Path) -> None:
+    rows = "".join(f"{k};{k};12.03.2024 10:00;;ok\n" for k in range(12))
+    run = read_log(written(tmp_path, "time [s];position [mm];date;;remark\n" + rows))
+    assert run.trajectory.names == ("position",)
+
+
+def test_missing_samples_and_any_start_time(tmp_path: Path) -> None:
+    rows = "".join(f"{1.7e9 + k},{'' if k in {3, 4} else k}\n" for k in range(12))
+    run = read_log(written(tmp_path, HEADER + rows))
+    assert np.flatnonzero(np.isnan(run.trajectory["position"])).tolist() == [3, 4]
+    assert run.trajectory.t[0] == 1.7e9
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (HEADER + BODY + "1.2,abc\n", "row 14, column 'position [mm]': 'abc' is not a number"),
+        (HEADER + BODY + "1.2,NaN\n", "'NaN' is not a number (decimal mark '.'); leave the cell empty"),
+        (HEADER + BODY + "1.2,inf\n", "'inf' is not a number"),
+        (HEADER + BODY + "1.2,1_0\n", "'1_0' is not a number"),
+        (HEADER + BODY + ",3\n", "row 14, column 'time [s]': the time is missing; delete the row"),
+        (HEADER + BODY + "1.1,3\n", "row 14: time repeats (1.1 s, then 1.1 s); delete the row"),
+        (HEADER + BODY + "0.5,3\n", "row 14: time runs backwards (1.1 s, then 0.5 s)"),
+        (HEADER + BODY + "1.2\n", "row 14 has 1 field, the header 2; mend or delete the row"),
+        (HEADER + BODY + "1.2;3\n", "row 14 has 1 field"),
+        (HEADER + BODY + "\n1.3,4\n", "row 14 has 1 field"),
+        (HEADER + BODY.replace(".", ","), "row 2 has 3 fields, the header 2; is ',' the decimal mark, too?"),
+        (HEADER.replace(",", ";") + "0.5;1,5\n" * 12, "row 2, column 'time [s]': '0.5' is not a number"),
+        (HEADER.replace(",", ";") + "0;1.234,5\n" * 12, "'1.234,5' is not a number"),
+        (HEADER + "0,1\n1,2\n", "2 samples are too few; at least 10"),
+        (HEADER + "".join(f"{k},\n" for k in range(12)), "column 'position [mm]' is empty; leave it out"),
+        ("", "row 1 is empty"),
+        (HEADER, "a header, but no samples"),
+        (BODY, "row 1 holds the number '0.0', not a column's name"),
+        ("time [s] position [mm]\n" + BODY.replace(",", " "), "one column only; put ',', ';' or a tab"),
+        ("time [s],position [mm],position [mm]\n" + BODY, "two columns are named 'position [mm]'; rename one"),
+        ("time [s],position [mm],position_mm\n" + BODY.replace("\n", ",1\n"), "'position' has another column"),
+        ("a,b\n" + BODY, 'no time; name a column "time [s]"'),
+        ("time [s],b\n" + BODY, "no channel but time; known: time, valve_voltage"),
+        ("time [s],presure_a_bar(g)\n" + BODY, "'presure_a_bar(g)' looks like the channel 'pressure_a'"),
+        ("time [s],Pressure_c [bar(g)]\n" + BODY, "looks like the channel 'pressure_"),
+        ("time [s],velocity [m/s]\n" + BODY, "looks like the channel 'speed'"),
+        ("t [s],position [mm]\n" + BODY, "looks like the channel 'time'"),
+        (b"PK\x03\x04\0\0", "not a text file"),
+        ((HEADER + BODY).encode("utf-16"), "export the log as CSV in UTF-8"),
+    ],
+)
+def test_refuses_a_log_and_says_where(tmp_path: Path, text: str | bytes, said: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(LogError) as error:
+        read_log(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("time [s],position", 'no unit; write "position [m]", or unit = "..."'),
+        ("time [s],position [kg]", "unit 'kg' does not measure 'm'"),
+        ("time [s],position_raw", "unknown unit 'raw'"),
+        ("time [s],pressure_a [bar]", 'write "bar(a)" or "bar(g)"'),
+        ("time [s],speed [bar(g)]", "does not measure 'm/s'"),
+    ],
+)
+def test_refuses_a_columns_unit(tmp_path: Path, header: str, said: str) -> None:
+    with pytest.raises(UnitError) as error:
+        read_log(written(tmp_path, f"{header}\n{BODY}"))
+    assert f"column {header.split(',')[1]!r}" in str(error.value)
+    assert said in str(error.value)
+    assert "list the columns to use in a sidecar" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("valve_voltage", "valve_volts", "columns: unknown channel 'valve_volts'; did you mean 'valve_voltage'?"),
+        ('"t [ms]"', '"tt [ms]"', "columns.time: unknown column 'tt [ms]'; did you mean 't [ms]'?"),
+        ("centre = ", "center = ", "unknown key 'center'; did you mean 'centre'?"),
+        ('column = "U valve", unit = "V", centre = "5 V"', 'unit = "V"', "columns.valve_voltage: say which column"),
+        ("[noise]", "[noises]", "unknown key 'noises'; did you mean 'noise'?"),
+        ("[noise]\nforce", "[noise]\nposition", "noise: unknown channel 'position'; known: force, valve_voltage"),
+        ('"2 N"', '"2 mm"', "noise.force: unit 'mm' does not measure 'N'"),
+        ('"2 N"', '"-2 N"', "run_01: noise of 'force' must be positive, got -2"),
+        ('"2 N"', "2", 'noise.force: 2 has no unit; write "2 N"'),
+        ("N/V", "N/m", "columns.force.scale: unit 'N/m' does not measure"),
+        ('"5 V"', '"5 N"', "columns.valve_voltage.centre: unit 'N' does not measure 'V'"),
+        ('unit = "V", centre = "5 V"', 'centre = "5 V"', "columns.valve_voltage: no unit"),
+        ("6.3 bar(g)", "6.3 bar", "conditions.supply.pressure: a pressure level in 'bar'"),
+        ("[noise]", "[noise", "not valid TOML: "),
+        ("[columns]", "noise = 3\n[columns]", "noise must be a section, [noise]"),
+        (
+            "force = { column",
+            "pressure_a = { column",
+            "columns.pressure_a.scale: '-35.15065 N/V' does not say from where",
+        ),
+    ],
+)
+def test_refuses_a_sidecar_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    text = SIDECAR.replace('[noise]\nforce = "2 N"\n', "") if new.startswith("noise =") else SIDECAR
+    assert old in text
+    path = written(tmp_path, RENAMED, text.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        read_log(path)
+    assert said in str(error.value)
+    assert "run_01" in str(error.value)
+
+
+def test_refuses_what_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"none\.csv: cannot be read \(No such file"):
+        read_log(tmp_path / "none.csv")
+    with pytest.raises(LogError, match=r"none\.toml: cannot be read"):
+        read_log(written(tmp_path, HEADER + BODY), sidecar=tmp_path / "none.toml")
+    with pytest.raises(LogError, match="cannot be read"):
+        read_log(tmp_path)
+
+
+def test_reads_a_long_log_fast(tmp_path: Path) -> None:
+    read_log(written(tmp_path, HEADER + BODY))  # imports
+    values = np.random.default_rng(0).normal(size=(25_000, 5))
+    rows = "\n".join(f"{k};" + ";".join(f"{v:.9g}" for v in row) for k, row in enumerate(values)).replace(".", ",")
+    header = "time [ms];position [mm];force [N];pressure_a [bar(g)];pressure_b [bar(g)];valve_voltage [V]\n"
+    path = written(tmp_path, header + rows)
+    began = time.perf_counter()
+    run = read_log(path)
+    assert time.perf_counter() - began < 0.3
+    assert len(run.trajectory) == 25_000
+
+
+NUMBERS = st.lists(st.one_of(st.none(), st.floats(-1e9, 1e9)), min_size=10, max_size=20)
+
+
+@settings(max_examples=40)
+@given(
+    NUMBERS,
+    st.sampled_from([";", "\t"]),
+    st.sampled_from([".", ","]),
+    st.sampled_from([("position", "mm"), ("force", "kN"), ("pressure_a", "bar(g)"), ("speed", "m/s")]),
+)
+def test_a_written_log_reads_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    raw: list[float | None],
+    delimiter: str,
+    decimal: str,
+    column: tuple[str, str],
+) -> None:
+    channel, unit = column
+    raw[0] = raw[0] or 1.0
+    rows = [f"{k / 8!r}{delimiter}{'' if v is None else repr(v)}".replace(".", decimal) for k, v in enumerate(raw)]
+    text = f"time [s]{delimiter}{channel} [{unit}]\n" + "\n".join(rows) + "\n"
+    run = read_log(written(tmp_path_factory.mktemp("log"), text))
+    factor, offset = scale_of(unit, CHANNELS[channel])
+    expected = [np.nan if v is None else factor * v + offset for v in raw]
+    np.testing.assert_allclose(run.trajectory[channel], expected, rtol=1e-14, equal_nan=True)
+
+
+def ramp(n: int = 1001, step: float = 1e-3) -> Experiment:
+    t = 5.0 + step * np.arange(n)
+    return Experiment(
+        Trajectory(t, {"position": t - 5.0, "valve_voltage": np.arange(n)}), {"position": 1e-5}, name="run"
+    )
+
+
+def test_split_cuts_equal_windows_that_do_not_overlap() -> None:
+    run = ramp()
+    windows = split(run, 0.25)
+    assert [len(w.trajectory) for w in windows] == [250] * 4
+    assert [w.name for w in windows] == ["run@0", "run@1", "run@2", "run@3"]
+    np.testing.assert_array_equal(np.concatenate([w.trajectory.t for w in windows]), run.trajectory.t[:1000])
+    assert windows[3].noise == run.noise
+
+
+@pytest.mark.parametrize("duration", [1e-3, 2.0, 0.0, -1.0])
+def test_split_refuses_windows_that_do_not_fit(duration: float) -> None:
+    with pytest.raises(InputError, match=r"samples of run, which has 1001.*choose between 0.002 and 1.001 s"):
+        split(ramp(), duration)
+
+
+def test_resample_interpolates_measurements_and_holds_commands() -> None:
+    run = resample(ramp(), 2.5e-3)
+    np.testing.assert_allclose(run.trajectory.t, 5.0 + 2.5e-3 * np.arange(401))
+    np.testing.assert_allclose(run.trajectory["position"], run.trajectory.t - 5.0, atol=1e-12)
+    np.testing.assert_array_equal(run.trajectory["valve_voltage"], np.floor(2.5 * np.arange(401)))
+
+
+def test_resample_onto_its_own_grid_changes_nothing() -> None:
+    run = ramp()
+    again = resample(run, 1e-3)
+    np.testing.assert_allclose(again.trajectory["position"], run.trajectory["position"], atol=1e-12)
+    np.testing.assert_array_equal(again.trajectory["valve_voltage"], run.trajectory["valve_voltage"])
+
+
+def test_resample_leaves_a_hole_open() -> None:
+    t = 0.1 * np.arange(12)
+    run = resample(Experiment(Trajectory(t, {"position": np.where(t > 0.55, t, np.nan)})), 0.05)
+    missing = np.isnan(run.trajectory["position"])
+    assert missing[run.trajectory.t < 0.55].all()
+    assert not missing[run.trajectory.t > 0.65].any()
+
+
+@pytest.mark.parametrize("step", [0.0, -1e-3, 2.0])
+def test_resample_refuses_a_step(step: float) -> None:
+    with pytest.raises(InputError, match="does not fit a log of 1 s"):
+        resample(ramp(), step)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(-1, 1), st.floats(-2, 2))
+def test_the_slope_of_a_parabola_is_exact_on_any_grid(seed: int, speed: float, acceleration: float) -> None:
+    t = 1e3 + np.cumsum(np.random.default_rng(seed).uniform(0.5e-3, 1.5e-3, 200))
+    s = t - t[0]
+    run = Experiment(Trajectory(t, {"position": 0.1 + speed * s + acceleration * s**2}))
+    got = differentiate(run, window=0.01).trajectory["speed"]
+    np.testing.assert_allclose(got, speed + 2 * acceleration * s, atol=1e-9)
+
+
+def test_differentiate_agrees_with_savgol_and_is_fast() -> None:
+    from scipy.signal import savgol_filter
+
+    t = 1e-3 * np.arange(10_000)
+    x = np.sin(7 * t) + 1e-5 * np.random.default_rng(1).normal(size=t.size)
+    began = time.perf_counter()
+    got = differentiate(Experiment(Trajectory(t, {"position": x})), window=0.03).trajectory["speed"]
+    assert time.perf_counter() - began < 0.5
+    expected = savgol_filter(x, 31, 2, deriv=1, delta=1e-3)
+    np.testing.assert_allclose(got[15:-15], expected[15:-15], atol=1e-9)
+
+
+def test_differentiate_leaves_holes_and_refuses_the_impossible() -> None:
+    t = 1e-3 * np.arange(100)
+    holed = np.where((t > 0.0195) & (t < 0.0305), np.nan, t**2)
+    got = differentiate(Experiment(Trajectory(t, {"position": holed})), window=0.01).trajectory["speed"]
+    np.testing.assert_array_equal(np.isnan(got), np.isnan(holed))
+    np.testing.assert_allclose(got[~np.isnan(got)], 2 * t[~np.isnan(got)], atol=1e-9)
+    with pytest.raises(InputError, match=r"a window of 0\.001 s holds fewer than 3 samples; take 0\.004 s or more"):
+        differentiate(ramp(), window=1e-3)
+    with pytest.raises(InputError, match="has a speed already"):
+        differentiate(differentiate(ramp(), window=0.01), window=0.01)
+    with pytest.raises(UnknownNameError, match="unknown channel 'positon'; did you mean 'position'"):
+        differentiate(ramp(), window=0.01, position="positon")
+
+
+def test_an_experiment_is_checked_and_edited_by_copy() -> None:
+    run = ramp()
+    edited = run.with_noise({"valve_voltage": 0.02}).with_conditions({"load.mass": 4.0})
+    assert (run.noise, run.conditions) == ({"position": 1e-5}, {})
+    assert (edited.noise, edited.conditions) == ({"position": 1e-5, "valve_voltage": 0.02}, {"load.mass": 4.0})
+    kept = edited.select(["valve_voltage"])
+    assert (kept.trajectory.names, kept.noise) == (("valve_voltage",), {"valve_voltage": 0.02})
+    with pytest.raises(UnknownNameError, match="run: noise: unknown channel 'positon'; did you mean 'position'"):
+        run.with_noise({"positon": 1e-5})
+    with pytest.raises(InputError, match="noise of 'position' must be positive, got 0"):
+        run.with_noise({"position": 0.0})
+    with pytest.raises(InputError, match=r"condition 'load\.mass' must be finite"):
+        run.with_conditions({"load.mass": float("nan")})

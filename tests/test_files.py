@@ -1,0 +1,272 @@
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pneuopt.errors import InputError, UnitError, UnknownNameError
+from pneuopt.files import read_drive, read_status, read_toml, write_fit, write_records, write_text
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
+from pneuopt.models.load import Load
+from pneuopt.nlp.status import Code, Status
+from pneuopt.parameters import ParameterSet
+
+AXIS = """# my axis, 2024
+[drive]
+kind = "force"   # pushed by a motor
+
+[load]
+mass = { value = "95 kg", lower = "50 kg", upper = "150 kg", free = true }   # weighed
+force = "-3 N"
+
+[friction]
+model = "stribeck"   # viscous|coulomb|stribeck|lugre
+asymmetric = true
+coulomb = "20 N"  # guess
+smoothing = { value = "1 mm/s", source = "EMPS paper" }
+"""
+
+
+@dataclass(frozen=True)
+class Fit:
+    parameters: ParameterSet
+    estimates: pd.DataFrame = field(default_factory=pd.DataFrame)
+    status: Status = field(default_factory=lambda: Status(Code.CONVERGED, "gaps 1e-9"))
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+
+def written(folder: Path, text: str, name: str = "drive.toml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_reads_a_force_drive(tmp_path: Path) -> None:
+    drive, rig = read_drive(written(tmp_path, AXIS))
+    assert drive == ForceDrive(Asymmetric(Stribeck()))
+    assert tuple(rig) == tuple(drive.system().parameters)
+    mass = rig["load.mass"]
+    assert (mass.value, mass.lower, mass.upper, mass.free) == (95.0, 50.0, 150.0, True)
+    assert (rig.value("load.force"), rig.value("friction.coulomb")) == (-3.0, 20.0)
+    assert (rig["friction.smoothing"].value, rig["friction.smoothing"].source) == (1e-3, "EMPS paper")
+    assert rig["friction.static"] == drive.system().parameters["friction.static"]
+    assert rig.free_names == ("load.mass",)
+
+
+@pytest.mark.parametrize(
+    ("text", "drive"),
+    [
+        ('[drive]\nkind = "force"\n[friction]\nmodel = "viscous"\n', ForceDrive(Viscous())),
+        ('[drive]\nkind="force"\n[load]\nspring=true\n[friction]\nmodel="lugre"\n', ForceDrive(LuGre(), Load(True))),
+        (
+            '[drive]\nkind = "motion"\n[friction]\nmodel = "coulomb"\npressure_dependent = true\n',
+            MotionDrive(PressureDependent(Coulomb())),
+        ),
+        (
+            '[drive]\nkind = "motion"\n[rig]\nchamber = true\narea = "491 mm^2"\n[ambient]\npressure = "1 bar(a)"\n'
+            '[friction]\nmodel = "coulomb"\nasymmetric = true\npressure_dependent = ["pressure_a"]\n'
+            'coulomb_pressure_a = "10 N/bar"\n',
+            MotionDrive(PressureDependent(Asymmetric(Coulomb()), ("pressure_a",))),
+        ),
+        (
+            '[drive]\nkind = "motion"\n[rig]\nchamber = false\n[friction]\nmodel = "viscous"\n',
+            MotionDrive(Viscous(), chamber=False),
+        ),
+        ('[drive]\nkind = "linear"\n[plant]\nmodel = "first_order"\ngain = "0.1 m/(s*V)"\n', FirstOrder()),
+        (
+            '[drive]\nkind = "linear"\n[plant]\nmodel = "second_order"\ndamping = 0.3\ndead_time = "9 ms"\n',
+            SecondOrder(pade_order=3),
+        ),
+        ('[drive]\nkind = "linear"\n[plant]\nmodel = "second_order"\npade_order = 2\n', SecondOrder(pade_order=2)),
+    ],
+)
+def test_builds_the_drive_that_the_file_says(tmp_path: Path, text: str, drive: object) -> None:
+    built, rig = read_drive(written(tmp_path, text))
+    assert built == drive
+    assert tuple(rig) == tuple(built.system().parameters)
+
+
+def test_a_linear_plant_between_other_signals(tmp_path: Path) -> None:
+    text = '[drive]\nkind = "linear"\n[plant]\nmodel = "integrator"\noutput = "position"\ngain = "50 mm/(V*s)"\n'
+    plant, rig = read_drive(written(tmp_path, text))
+    assert isinstance(plant, Integrator)
+    assert [q.name for q in (*plant.system().inputs, *plant.system().outputs)] == ["valve_voltage", "position"]
+    assert rig.value("plant.gain") == 0.05
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('kind = "force"', "", '[drive] says no kind; write kind = "...", one of: force, motion, linear'),
+        ('kind = "force"', 'kind = "forse"', "[drive]: unknown kind 'forse'; did you mean 'force'?"),
+        ('kind = "force"', "kind = 3", "[drive] kind must be text, got 3"),
+        ("[friction]", "[fricton]", ": unknown section 'fricton'; did you mean 'friction'?"),
+        ("[load]", "[rig]", "kind 'force': unknown section 'rig'; did you mean 'drive'?"),
+        ('model = "stribeck"', 'model = "stribek"', "[friction]: unknown model 'stribek'; did you mean 'stribeck'?"),
+        ('model = "stribeck"', "", "[friction] says no model"),
+        ("asymmetric = true", 'asymmetric = "yes"', "[friction] asymmetric must be true or false, got 'yes'"),
+        ("asymmetric = true", 'pressure_dependent = ["pressure_c"]', "unknown chamber 'pressure_c'; did you mean"),
+        ("coulomb = ", "coulom = ", "[friction]: unknown key 'coulom'; did you mean 'coulomb'?"),
+        ('"20 N"', '"20"', "[friction] coulomb: '20' has no unit; write \"20 N\""),
+        ('"20 N"', "20", '[friction] coulomb: 20 has no unit; write "20 N"'),
+        ('"20 N"', '"20 mm"', "[friction] coulomb: unit 'mm' does not measure 'N'"),
+        ('"20 N"', '"20,5 N"', 'write "20.5 N"'),
+        ('"20 N"', '["20 N"]', "[friction] coulomb: ['20 N'] is not a number with a unit"),
+        ('"20 N"', '"-20 N"', "[friction] coulomb: value -20 N lies outside its bounds [0, 100000]; move the value"),
+        ('"95 kg"', '"195 kg"', "[load] mass: value 195 kg lies outside its bounds [50, 150]"),
+        ('"50 kg"', '"160 kg"', "[load] mass: lower bound 160 lies above upper bound 150 kg"),
+        ("upper =", "uper =", "[load] mass: unknown key 'uper'; did you mean 'upper'?"),
+        ("free = true", "free = 1", "[load] mass: free must be true or false"),
+        ("[load]", "[load", "not valid TOML"),
+        ("[load]", "load = 3\n[rig]", "load must be a section, [load]"),
+    ],
+)
+def test_refuses_a_drive_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    text = f"load = 3\n{AXIS}".replace("[load]", "[rig]") if new.startswith("load =") else AXIS.replace(old, new, 1)
+    path = written(tmp_path, text)
+    with pytest.raises(InputError) as error:
+        read_drive(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert said in str(error.value)
+
+
+def test_errors_are_of_their_kind(tmp_path: Path) -> None:
+    with pytest.raises(UnitError):
+        read_drive(written(tmp_path, AXIS.replace('"20 N"', '"20"')))
+    with pytest.raises(UnknownNameError):
+        read_drive(written(tmp_path, AXIS.replace("coulomb", "coulom")))
+
+
+def test_a_syntax_error_names_file_and_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"drive\.toml: not valid TOML: .* at line 3 "):
+        read_toml(written(tmp_path, "a = 1\nb = 2\nc = = 3\n"))
+    with pytest.raises(InputError, match=r"drive\.toml: not valid TOML: .*already exists"):
+        read_toml(written(tmp_path, "a = 1\na = 2\n"))
+    with pytest.raises(InputError, match=r"none\.toml: cannot be read"):
+        read_toml(tmp_path / "none.toml")
+    (tmp_path / "latin.toml").write_bytes("a = 'µ'".encode("latin-1"))
+    with pytest.raises(InputError, match="UTF-8"):
+        read_toml(tmp_path / "latin.toml")
+
+
+def test_a_fit_keeps_the_users_text_and_adds_the_results(tmp_path: Path) -> None:
+    source = written(tmp_path, AXIS)
+    drive, rig = read_drive(source)
+    found = rig.freed("friction.viscous").with_values(
+        {"load.mass": 95.1089, "friction.coulomb": 20.25, "friction.viscous": 203.5}
+    )
+    estimates = pd.DataFrame(
+        {"value": [95.1089, 203.5], "stderr": [0.1, math.nan], "upper": [150.0, math.inf], "at_bound": [False, True]},
+        index=["load.mass", "friction.viscous"],
+    ).assign(unit=["kg", "N*s/m"])
+    provenance = {"versions": {"pneuopt": "0.1"}, "sha256": {"run_01": "ab"}, "seconds": np.float64(1.5), "none": None}
+    write_fit(tmp_path / "fit.toml", source, Fit(found, estimates, provenance=provenance))
+    text = (tmp_path / "fit.toml").read_text(encoding="utf-8")
+    for kept in (
+        "# my axis, 2024",
+        "# pushed by a motor",
+        "# weighed",
+        '"20.25 N"  # guess',
+        'lower = "50 kg"',
+        '"1 mm/s"',
+    ):
+        assert kept in text
+    again, values = read_drive(tmp_path / "fit.toml")
+    assert again == drive
+    assert values == found
+    said = read_toml(tmp_path / "fit.toml").unwrap()
+    row = {"value": 95.1089, "stderr": 0.1, "upper": 150.0, "at_bound": False, "unit": "kg"}
+    assert said["estimates"]["load.mass"] == row
+    assert math.isnan(said["estimates"]["friction.viscous"]["stderr"])
+    assert said["provenance"] == {"versions": {"pneuopt": "0.1"}, "sha256": {"run_01": "ab"}, "seconds": 1.5}
+
+
+def test_a_fit_adds_what_the_file_left_out(tmp_path: Path) -> None:
+    source = written(tmp_path, AXIS.partition("[load]")[0] + '[friction]\nmodel = "coulomb"\n\n# the end\n')
+    found = read_drive(source)[1].freed("load.mass").with_values({"load.mass": 7.0, "friction.coulomb": 12.0})
+    write_fit(tmp_path / "fit.toml", source, Fit(found, provenance={"logs": ["a", None, np.int64(2)]}))
+    assert read_drive(tmp_path / "fit.toml")[1] == found
+    assert read_toml(tmp_path / "fit.toml").unwrap()["provenance"] == {"logs": ["a", 2]}
+
+
+def test_a_fit_of_a_fit_replaces_the_results(tmp_path: Path) -> None:
+    source = written(tmp_path, AXIS)
+    rig = read_drive(source)[1]
+    bad = Status(Code.ITERATION_LIMIT, "gap of position 3e-3; raise max_iterations")
+    write_fit(tmp_path / "fit.toml", source, Fit(rig.with_values({"load.mass": 90.0}), status=bad))
+    assert read_status(tmp_path / "fit.toml") == bad
+    assert read_drive(tmp_path / "fit.toml")[1].value("load.mass") == 90.0
+    better = rig.with_values({"load.mass": 91.0}).fixed("load.mass")
+    write_fit(tmp_path / "fit.toml", tmp_path / "fit.toml", Fit(better))
+    assert read_status(tmp_path / "fit.toml") == Status(Code.CONVERGED, "gaps 1e-9")
+    assert read_drive(tmp_path / "fit.toml")[1] == better
+    assert read_status(source) is None
+
+
+def test_an_unknown_status_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"\[status\] code: unknown status 'convergd'; did you mean 'converged'"):
+        read_status(written(tmp_path, '[status]\ncode = "convergd"\n'))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.floats(50.0, 150.0),
+    st.floats(-1e5, 1e5),
+    st.floats(1e-6, 1.0),
+    st.sampled_from(["", "identified from run_01"]),
+    st.booleans(),
+)
+def test_any_fit_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, mass: float, force: float, smoothing: float, source: str, free: bool
+) -> None:
+    folder = tmp_path_factory.mktemp("fit")
+    rig = read_drive(written(folder, AXIS))[1]
+    values = {"load.mass": mass, "load.force": force, "friction.smoothing": smoothing, "friction.static": abs(force)}
+    found = rig.with_values(values)
+    found = found.freed("friction.*") if free else found
+    write_fit(folder / "fit.toml", folder / "drive.toml", Fit(found))
+    again = read_drive(folder / "fit.toml")[1]
+    assert again.free_names == found.free_names
+    for name, parameter in found.items():
+        assert again.value(name) == pytest.approx(parameter.value, rel=1e-8)
+        assert (again[name].lower, again[name].upper) == (parameter.lower, parameter.upper)
+
+
+def test_a_value_at_its_bound_reads_back(tmp_path: Path) -> None:
+    source = written(tmp_path, AXIS.replace("50 kg", "53.333333333333336 kg"))
+    found = read_drive(source)[1].with_values({"load.mass": 53.333333333333336})
+    write_fit(tmp_path / "fit.toml", source, Fit(found))
+    assert read_drive(tmp_path / "fit.toml")[1] == found
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = written(tmp_path, "before", "out.toml")
+    write_text(path, "after\n")
+    assert path.read_bytes() == b"after\n"
+    with pytest.raises(UnicodeEncodeError):
+        write_text(path, "half of it \ud800")
+    assert path.read_bytes() == b"after\n"
+    assert [p.name for p in tmp_path.iterdir()] == ["out.toml"]
+    with pytest.raises(InputError, match="the folder does not exist; make it first"):
+        write_text(tmp_path / "none" / "out.toml", "")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_text(tmp_path, "")
+
+
+def test_records_are_plain_json(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"value": [1.5, math.nan, math.inf], "holds": [True, False, True], "unit": ["%", "s", "µm"]})
+    write_records(tmp_path / "claims.json", frame)
+    records = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
+    assert records[0] == {"value": 1.5, "holds": True, "unit": "%"}
+    assert [r["value"] for r in records] == [1.5, None, None]
+    write_records(tmp_path / "estimates.json", frame.set_axis(["a", "b", "c"], axis=0))
+    assert [r["name"] for r in json.loads((tmp_path / "estimates.json").read_text(encoding="utf-8"))] == ["a", "b", "c"]

@@ -1,0 +1,150 @@
+import math
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pneuopt.errors import UnitError
+from pneuopt.units import ATMOSPHERE, read_si, read_value, scale_of, write_value
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("32 mm", "m", 0.032),
+        ("20 um", "m", 2e-5),
+        ("20 µm", "m", 2e-5),  # micro sign
+        ("20 μm", "m", 2e-5),  # Greek mu
+        ("32mm", "m", 0.032),
+        ("-.5e-3 m", "m", -5e-4),
+        ("2 V*s/m", "V*s/m", 2.0),
+        ("2 V/(m/s)", "V*s/m", 2.0),
+        ("2 V s/m", "V*s/m", 2.0),
+        ("80 Ns/m", "N*s/m", 80.0),
+        ("80 N·s/m", "N*s/m", 80.0),
+        ("80 N/(m/s)", "N*s/m", 80.0),
+        ("80 kg/s", "N*s/m", 80.0),
+        ("2e-8 m^3/(s*Pa)", "m^3/(s*Pa)", 2e-8),
+        ("2e-8 m³/(s·Pa)", "m^3/(s*Pa)", 2e-8),
+        ("1.2 l/(s*bar)", "m^3/(s*Pa)", 1.2e-8),
+        ("10 N/bar", "N/Pa", 1e-4),
+        ("80 Hz", "Hz", 80.0),
+        ("1.5 kHz", "Hz", 1500.0),
+        ("3 rad/s", "rad/s", 3.0),
+        ("30 rpm", "rad/s", math.pi),
+        ("180 deg", "rad", math.pi),
+        ("2 1/s", "1/s", 2.0),
+        ("30 %", "1", 0.3),
+        ("0.3", "1", 0.3),
+        (0.3, "1", 0.3),
+        (2, "1", 2.0),
+        ("20 degC", "K", 293.15),
+        ("6 bar", "Pa", 6e5),
+        ("6 bar(g)", "Pa(a)", 6e5 + ATMOSPHERE),
+        ("6 bar(a)", "Pa(a)", 6e5),
+        ("6 bar(a)", "Pa(g)", 6e5 - ATMOSPHERE),
+        ("0.6 MPa(g)", "Pa(g)", 6e5),
+        ("100 kPa(a)", "Pa(a)", 1e5),
+        ("14.5 psi (a)", "Pa(a)", 14.5 * 6894.757293168361),
+        ("inf N", "N", math.inf),
+    ],
+)
+def test_reads(text: str | float, unit: str, value: float) -> None:
+    assert read_value(text, unit) == pytest.approx(value, rel=1e-15)
+
+
+def test_reads_a_decimal_number_exactly() -> None:
+    assert [read_value(f"{k} um", "m") for k in range(1, 1000)] == [float(f"{k}e-6") for k in range(1, 1000)]
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "said"),
+    [
+        ("40", "N", "d.toml: '40' has no unit; write \"40 N\""),
+        (40, "N", 'd.toml: 40 has no unit; write "40 N"'),
+        ("6", "Pa(a)", 'write "6 bar(a)"'),
+        ("0,5 mm", "m", 'has a decimal comma; write "0.5 mm"'),
+        ("0,5", "1", 'write "0.5"'),
+        ("1.234,5 mm", "m", "digits without separators"),
+        ("1 000 mm", "m", "digits without separators"),
+        ("1_000 mm", "m", "digits without separators"),
+        ("1e9999 m", "m", "not one number"),
+        ("6 bar", "Pa(a)", 'may be absolute or gauge; write "bar(a)" or "bar(g)"'),
+        ("6e5 Pa", "Pa(g)", 'write "Pa(a)" or "Pa(g)"'),
+        ("6 bar(g)", "Pa", "mark a pressure level, which is not meant here; write 'bar'"),
+        ("6 mm(g)", "m", "write 'mm'"),
+        ("6 mm", "Pa(a)", 'write for instance "bar(a)"'),
+        ("-2 bar(g)", "Pa(a)", "below vacuum"),
+        ("-2 bar(g)", "Pa(g)", "below vacuum"),
+        ("6 barg", "Pa(a)", "did you mean 'bar(g)'?"),
+        ("6 psia", "Pa(a)", "did you mean 'psi(a)'?"),
+        ("6 KPA", "Pa", "did you mean 'kPa'?"),
+        ("3 MM", "m", "did you mean 'mm'?"),
+        ("3 m3", "m^3", "did you mean 'm^3'?"),
+        ("3 Newton", "N", "did you mean 'newton'?"),
+        ("3 furlong", "m", "unknown unit 'furlong'; write for instance mm"),
+        ("3 dB", "1", "unknown unit 'dB'"),
+        ("3 m/", "m", "unknown unit 'm/'"),
+        ("3 m**1000000000", "m", "unknown unit"),
+        ("5 V", "N", "unit 'V' does not measure 'N'"),
+        ("80 Hz", "rad/s", "1 Hz is 2 pi rad/s"),
+        ("80 Hz", "1/s", "write it in 1/s"),
+        ("80 rad/s", "Hz", "write it in Hz"),
+        ("80 1/s", "Hz", "write it in Hz"),
+        ("3 deg", "1", "does not measure '1'"),
+        ("five mm", "m", "is not a number with a unit"),
+        ("nan m", "m", "is not a number with a unit"),
+        ("", "m", "is not a number with a unit"),
+        (True, "1", "is not a number with a unit"),
+    ],
+)
+def test_refuses_with_the_remedy(text: str | float, unit: str, said: str) -> None:
+    with pytest.raises(UnitError) as error:
+        read_value(text, unit, where="d.toml")
+    assert str(error.value).startswith("d.toml: ")
+    assert said in str(error.value)
+
+
+def test_own_dimension() -> None:
+    texts = ("5000 g", "6.3 bar(g)", "1 bar(a)", "30 %", "80 Hz", "10 N/bar", "25 degC")
+    assert [read_si(t) for t in texts] == [5.0, 6.3e5 + ATMOSPHERE, 1e5, 0.3, 80.0, 1e-4, 298.15]
+    with pytest.raises(UnitError, match=r'run.toml: .*write "bar\(a\)" or "bar\(g\)"'):
+        read_si("6 bar", where="run.toml")
+
+
+def test_scale_of_a_column() -> None:
+    assert scale_of("mm", "m") == (1e-3, 0.0)
+    assert scale_of("kPa(g)", "Pa(a)") == (1e3, ATMOSPHERE)
+    assert scale_of("degC", "K") == (1.0, 273.15)
+    with pytest.raises(UnitError, match=r"log\.csv: unknown unit 'mmm'"):
+        scale_of("mmm", "m", where="log.csv")
+
+
+UNITS = ["m", "s", "kg", "N", "N*s/m", "V*s/m", "m^3/(s*Pa)", "N/Pa", "1", "1/s", "Hz", "rad/s", "m/s", "Pa", "V"]
+
+
+@given(st.floats(-1e12, 1e12), st.sampled_from(UNITS), st.integers(3, 17))
+def test_what_is_written_reads_back(value: float, unit: str, digits: int) -> None:
+    tiny = 1e-300  # below, floats lose digits of their own
+    text = write_value(value, unit, digits)
+    assert read_value(text, unit) == pytest.approx(value, rel=10.0 ** (1 - digits), abs=tiny)
+
+
+@given(st.floats(0.0, 1e9), st.sampled_from(["Pa(a)", "Pa(g)"]))
+def test_a_pressure_level_reads_back(value: float, unit: str) -> None:
+    assert read_value(write_value(value, unit, 17), unit) == pytest.approx(value, rel=1e-15, abs=1e-300)
+
+
+def test_writes_what_reads_well() -> None:
+    pairs = ((0.032, "m"), (2e-5, "m"), (1.5, "m"), (0.0, "m"), (1e-3, "s"), (7e5, "Pa(a)"), (-2e4, "Pa(g)"))
+    assert [write_value(*p) for p in pairs] == ["32 mm", "20 um", "1.5 m", "0 m", "1 ms", "7 bar(a)", "-0.2 bar(g)"]
+    assert write_value(math.inf, "N") == "inf N"
+    with pytest.raises(ValueError, match="NaN"):
+        write_value(math.nan, "N")
+
+
+def test_pint_stays_out_of_import_time() -> None:
+    code = "import sys, pneuopt.units, pneuopt.experiments; assert not {'pint', 'pandas', 'casadi'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
