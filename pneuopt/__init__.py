@@ -1,1 +1,69 @@
-"""Placeholder."""
+"""Identify and optimally tune pneumatic drives, and any servo axis with friction.
+
+The concept map, in the order in which data flow:
+
+    read_log(path)                    -> Experiment: a measured Trajectory, its noise and conditions
+    read_drive(path)                  -> a drive and its ParameterSet; or build one: ForceDrive(Stribeck())
+    identify(system, logs, freed)     -> IdentificationResult: estimates with confidence intervals
+    validate(system, logs, fitted)    -> how well a held-out log is predicted
+    ClosedLoop(system, PID, Dither)   -> the loop to be tuned, continuous or sampled
+    tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
+    evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser
+
+Names are loaded when first used; importing the package costs nothing.
+"""
+
+import importlib
+import sys
+from types import ModuleType
+from typing import Any
+
+_HOME = {
+    "pneuopt.errors": ("ConvergenceError", "InputError", "PneuoptError"),
+    "pneuopt.parameters": ("Parameter", "ParameterSet", "Quantity"),
+    "pneuopt.trajectories": ("Trajectory",),
+    "pneuopt.system": ("DiscreteSystem", "System", "define", "discretise"),
+    "pneuopt.models.friction": ("Asymmetric", "Coulomb", "LuGre", "PressureDependent", "Stribeck", "Viscous"),
+    "pneuopt.models.load": ("Load",),
+    "pneuopt.models.drive": ("ForceDrive", "MotionDrive"),
+    "pneuopt.models.linear": ("FirstOrder", "Integrator", "SecondOrder"),
+    "pneuopt.control.pid": ("PID",),
+    "pneuopt.control.dither": ("Dither",),
+    "pneuopt.control.reference": ("Step",),
+    "pneuopt.control.loop": ("ClosedLoop",),
+    "pneuopt.control.margins": ("margins",),
+    "pneuopt.control.metrics": ("step_metrics",),
+    "pneuopt.nlp.least_squares": ("LeastSquares",),
+    "pneuopt.nlp.full_space": ("FullSpace",),
+    "pneuopt.experiments": ("Experiment", "differentiate", "read_log", "resample", "split"),
+    "pneuopt.simulate": ("simulate",),
+    "pneuopt.identify": ("IdentificationResult", "identify", "validate"),
+    "pneuopt.requirements": ("MaxSensitivity", "Overshoot", "PeakControl", "SettlingTime", "SteadyStateError"),
+    "pneuopt.tune": ("TuningResult", "evaluate", "tune"),
+    "pneuopt.files": ("read_drive", "write_fit"),
+}
+_MODULE = {name: module for module, names in _HOME.items() for name in names}
+__version__ = "0.1.0"
+__all__ = sorted(_MODULE)  # noqa: PLE0605 - the stub beside this file spells it out
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE:
+        raise AttributeError(f"module 'pneuopt' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULE[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULE})
+
+
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: Any) -> None:
+        # the import of a submodule, `pneuopt.identify` say, must not hide the verb of that name
+        if not (name in _MODULE and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

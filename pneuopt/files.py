@@ -3,17 +3,11 @@
 A value is "32 mm", or a table where it may be free: { value = "40 N", lower = "5 N", upper = "90 N", free = true }.
 """
 
-import json
-import math
-import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import tomlkit
-from tomlkit.exceptions import TOMLKitError
-from tomlkit.items import InlineTable, Table
 
 from pneuopt.errors import InputError, UnknownNameError, check_known, require
 from pneuopt.experiments import CHANNELS
@@ -22,9 +16,10 @@ from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, P
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
 from pneuopt.nlp.status import Code, Status
+from pneuopt.output import plain, write_text
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import System
-from pneuopt.units import read_value, write_value
+from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,8 +51,6 @@ _TYPES: Mapping[str, tuple[type, ...]] = {
     "true, false or a list": (bool, list),
     "a whole number": (int,),
 }
-_FLAGS = ("free", "log", "per_log")
-_FIELDS = ("value", "lower", "upper", *_FLAGS, "source")
 
 
 class Drive(Protocol):
@@ -90,77 +83,6 @@ class Fitted(Protocol):
     def provenance(self) -> Mapping[str, Any]:
         """Versions, options, the data's sha256."""
         ...
-
-
-def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
-    """Read a TOML file with its comments.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    TOMLDocument
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is not TOML; the message names the line.
-    """
-    try:
-        return tomlkit.parse(Path(path).read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file in UTF-8; save it so") from None
-    except TOMLKitError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-
-
-def write_text(path: str | Path, text: str) -> None:
-    """Write a file whole or not at all: into a neighbour first, which then takes its place.
-
-    Parameters
-    ----------
-    path : str or Path
-    text : str
-        Lines end with a newline character on every system.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist, or cannot be written to.
-    """
-    path = Path(path)
-    require(path.parent.is_dir(), f"{path}: the folder does not exist; make it first")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder") from None
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
-    """Write a table as JSON: a list of records, one a row; what is not finite becomes null.
-
-    Parameters
-    ----------
-    path : str or Path
-    frame : DataFrame
-        An index that is more than a count goes into each record, as "name" if it has no name of its own.
-    """
-    import pandas as pd
-
-    numbered = isinstance(frame.index, pd.RangeIndex)
-    table = frame if numbered else frame.reset_index(names=str(frame.index.name or "name"))
-    records = [{str(k): _plain(v) for k, v in record.items()} for record in table.to_dict(orient="records")]
-    finite = [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in records]
-    write_text(path, json.dumps(finite, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
@@ -238,11 +160,11 @@ def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
     document, given = read_toml(source), read_drive(source)[1]
     for name, found in result.parameters.items():
         if name in given and found != given[name]:
-            _fill(document, name, found, given[name])
+            write_parameter(document, name, found, given[name])
     rows = result.estimates.to_dict(orient="index")
-    document["estimates"] = _section({str(name): _inline(row) for name, row in rows.items()})
-    document["status"] = _section({"code": result.status.code.value, "message": result.status.message})
-    document["provenance"] = _section(_plain(result.provenance))
+    document["estimates"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
+    document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
+    document["provenance"] = toml_table(plain(result.provenance))
     write_text(path, tomlkit.dumps(document))
 
 
@@ -314,70 +236,5 @@ def _filled(defaults: ParameterSet, sections: Sections, path: str | Path) -> Par
         check_known("key", entries, [*structure, *keys], f"{path}: [{section}]")
         for key in (k for k in entries if k not in structure):
             name = f"{section}.{key}"
-            edits[name] = _parameter(entries[key], defaults[name], f"{path}: [{section}] {key}")
+            edits[name] = read_parameter(entries[key], defaults[name], f"{path}: [{section}] {key}")
     return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
-
-
-def _parameter(entry: Any, default: Parameter, where: str) -> Parameter:
-    fields = entry if isinstance(entry, dict) else {"value": entry}
-    check_known("key", fields, _FIELDS, where)
-    numbers: dict[str, Any] = {f: read_value(fields[f], default.unit, where=where) for f in _FIELDS[:3] if f in fields}
-    for flag in _FLAGS:
-        require(isinstance(fields.get(flag, False), bool), f"{where}: {flag} must be true or false")
-    others = {f: fields[f] for f in (*_FLAGS, "source") if f in fields}
-    if "value" in fields:
-        others.setdefault("source", "")
-    try:
-        return replace(default, **numbers, **others)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-
-
-def _fill(document: tomlkit.TOMLDocument, name: str, found: Parameter, given: Parameter) -> None:
-    """Put a value in its place; the table form only where more than the value differs, or the user chose it."""
-    section, _, key = name.partition(".")
-    if section not in document:
-        document[section] = tomlkit.table()
-    entries: Any = document[section]
-    fields: dict[str, Any] = {f: _written(getattr(found, f), found) for f in _FIELDS[:3] if _differ(f, found, given)}
-    fields |= {f: getattr(found, f) for f in (*_FLAGS, "source") if _differ(f, found, given)}
-    entry = entries.get(key)
-    if isinstance(entry, InlineTable | Table):
-        entry.update(fields)
-    elif fields.keys() == {"value"}:
-        entries[key] = fields["value"]
-    else:
-        entries[key] = _inline({"value": entry or _written(found.value, found)} | fields)
-
-
-def _differ(field: str, found: Parameter, given: Parameter) -> bool:
-    return bool(getattr(found, field) != getattr(given, field))
-
-
-def _written(value: float, parameter: Parameter) -> str:
-    """Nine digits, or all of them where rounding would cross a bound."""
-    text = write_value(value, parameter.unit, 9)
-    inside = parameter.lower <= read_value(text, parameter.unit) <= parameter.upper
-    return text if inside else write_value(value, parameter.unit, 17)
-
-
-def _section(entries: Mapping[str, Any]) -> Table:
-    table = tomlkit.table()
-    table.update(entries)
-    return table
-
-
-def _inline(entries: Mapping[Any, Any]) -> InlineTable:
-    table = tomlkit.inline_table()
-    table.update(_plain(entries))
-    return table
-
-
-def _plain(value: Any) -> Any:
-    """What TOML and JSON can hold: NumPy's scalars as Python's, nothing for None, text for what is neither."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items() if v is not None}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value if v is not None]
-    value = value.item() if hasattr(value, "item") else value
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

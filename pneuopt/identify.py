@@ -19,7 +19,7 @@ from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.provenance import provenance
 from pneuopt.simulate import simulate
-from pneuopt.statistics import agreement, confidence_interval, noise_level
+from pneuopt.statistics import agreement, confidence_interval, correlation_time, noise_level
 from pneuopt.system import Log, Start, System, discretise, names
 from pneuopt.trajectories import Trajectory
 
@@ -42,7 +42,7 @@ class IdentificationResult:
         A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
         at_bound, unit, source. No interval at a bound or where the data do not determine the parameter.
     covariance : DataFrame
-        Of the estimates, scaled by the residuals' own level.
+        Of the estimates, scaled by the residuals' own level and correlation.
     fit : DataFrame
         A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit.
     trajectories : mapping of str to Trajectory
@@ -122,16 +122,37 @@ def validate(system: System, experiments: Sequence[Experiment], parameters: Para
     import pandas as pd
 
     fixed = parameters.fixed(*parameters.free_names)
-    whole = LeastSquares(segment_time=math.inf)
     rows = []
     for experiment in _checked(system, experiments, fixed):
-        problem = _Problem(system, (experiment,), fixed, whole)
-        start = problem.candidates()[0]
-        initial = solve_least_squares(problem.transcription(start), whole).solution.trajectories[0]
-        state = {s.name: float(initial[s.name][0]) for s in system.states}
-        run = simulate(system, experiment.trajectory, _conditioned(fixed, experiment), initial=state)
-        rows += _agreements(system, experiment, run)
+        rows += _agreements(system, experiment, _predicted(system, experiment, fixed))
     return pd.DataFrame(rows).set_index(["log", "channel"])
+
+
+def predict(system: System, experiment: Experiment, parameters: ParameterSet) -> Trajectory:
+    """The free run that `validate` compares with a log.
+
+    Parameters
+    ----------
+    system : System
+    experiment : Experiment
+    parameters : ParameterSet
+
+    Returns
+    -------
+    Trajectory
+        States and outputs on the log's grid.
+    """
+    fixed = parameters.fixed(*parameters.free_names)
+    return _predicted(system, _checked(system, [experiment], fixed)[0], fixed)
+
+
+def _predicted(system: System, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
+    whole = LeastSquares(segment_time=math.inf)
+    problem = _Problem(system, (experiment,), fixed, whole)
+    start = problem.candidates()[0]
+    initial = solve_least_squares(problem.transcription(start), whole).solution.trajectories[0]
+    state = {s.name: float(initial[s.name][0]) for s in system.states}
+    return simulate(system, experiment.trajectory, _conditioned(fixed, experiment), initial=state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,11 +212,12 @@ class _Problem:
         """Read the solver's answer back into parameters and tables."""
         solution = fit.solution
         free = solution.parameters.free_names
-        variance = fit.chi_square / max(1, fit.count - len(free))
-        covariance = None if fit.covariance is None else fit.covariance * variance
         shared = [n for n in free if n in self.parameters]
         values = {n: solution.parameters.value(n) for n in shared}
         runs = {e.name: t for e, t in zip(self.experiments, solution.trajectories, strict=True)}
+        variance = fit.chi_square / max(1, fit.count - len(free))
+        correlated = _correlated(self.system, self.experiments, runs)
+        covariance = None if fit.covariance is None else fit.covariance * variance * correlated
         return IdentificationResult(
             self.parameters.with_values(values),
             _estimates(solution.parameters.select(free), covariance, fit.at_bound, solution.status),
@@ -203,7 +225,7 @@ class _Problem:
             _fit_table(self.system, self.experiments, runs),
             runs,
             solution.status,
-            {**solution.stats, "chi_square_ratio": variance},
+            {**solution.stats, "chi_square_ratio": variance, "correlation_time": correlated},
             {**provenance(self.method), "start": label, **{f"sha256[{e.name}]": e.sha256 for e in self.experiments}},
         )
 
@@ -303,6 +325,16 @@ def _agreements(system: System, experiment: Experiment, run: Trajectory) -> list
         noise = experiment.noise[channel]
         rows.append({"log": experiment.name, "channel": channel, **figures, "noise": noise, "unit": units[channel]})
     return rows
+
+
+def _correlated(system: System, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> float:
+    """By how much correlated residuals (model error, not noise) widen a variance: the mean over logs and channels."""
+    times = [
+        correlation_time(e.trajectory[channel] - runs[e.name][channel])
+        for e in experiments
+        for channel in _measured_outputs(system, e)
+    ]
+    return float(np.mean(times))
 
 
 def _estimates(

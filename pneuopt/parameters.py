@@ -149,6 +149,10 @@ class ParameterSet(Mapping[str, Parameter]):
         """Mark the matching parameters as fixed, by copy."""
         return self._edited({n: replace(self[n], free=False) for n in self.matching(*patterns)})
 
+    def per_log(self, *patterns: str) -> "ParameterSet":
+        """Give each experiment its own value of the matching parameters, by copy."""
+        return self._edited({n: replace(self[n], per_log=True) for n in self.matching(*patterns)})
+
     def with_values(self, values: Mapping[str, float]) -> "ParameterSet":
         """Give the named parameters new values, by copy; one outside its bounds is an error that names it."""
         return self._edited({n: self._replaced(n, value=float(v)) for n, v in values.items()})

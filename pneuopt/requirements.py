@@ -4,12 +4,19 @@ Values are fractions of the step's size, seconds, or the command's unit: `Oversh
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 from pneuopt.errors import require
 
 PERCENT = ("Overshoot", "SteadyStateError")
+SHARE = {
+    "SettlingTime": 0.0,
+    "Overshoot": 1.0,
+    "SteadyStateError": 1.0,
+    "PeakControl": 1 / 300,
+    "MaxSensitivity": 1 / 300,
+}
 
 
 @dataclass(frozen=True)
@@ -126,6 +133,18 @@ class Specification:
     def concerns(self, kind: type) -> bool:
         """Whether this kind of requirement is a term or a limit."""
         return self.weight(kind) > 0 or self.limit(kind) < inf
+
+    def tightened(self, margin: float) -> "Specification":
+        """Bands and fractions smaller by `margin`, a share; peak and sensitivity by a 300th of it.
+
+        An optimum lies on its limits: found on tightened ones, it keeps those asked for when simulated and printed.
+        """
+        limits = tuple(replace(q, max=(q.max or 0.0) * (1 - margin * SHARE[name(q)])) for q in self.limits)
+        return replace(self, limits=limits, band=self.band * (1 - margin))
+
+    def with_band(self, band: float) -> "Specification":
+        """Another settling band, by copy."""
+        return replace(self, band=band)
 
     def objective(self, values: Mapping[str, float]) -> float:
         """The weighted sum, of values by kind as `read` gives them."""

@@ -69,6 +69,39 @@ def noise_level(column: ArrayLike) -> float:
     return max(random, resolution)
 
 
+def correlation_time(residuals: ArrayLike) -> float:
+    """Samples that count as one where residuals are correlated: 1 + 2 (rho_1 + rho_2 + ...), up to the first rho <= 0.
+
+    Parameters
+    ----------
+    residuals : array_like, shape (n,)
+        NaN where a sample is missing.
+
+    Returns
+    -------
+    float
+        1 for white residuals: if rho_1 is below 3 / sqrt(n), nothing is summed. The variance of an estimate from n
+        correlated samples is this much larger (Geyer, Statistical Science 7(4), 1992, for the truncation).
+
+    Examples
+    --------
+    >>> correlation_time(np.random.default_rng(1).standard_normal(1000))
+    1.0
+    """
+    e = np.asarray(residuals, dtype=float)
+    e = e[np.isfinite(e)]
+    n = e.size
+    if n < 10 or not np.any(e - e.mean()):
+        return 1.0
+    spectrum = np.abs(np.fft.rfft(e - e.mean(), 2 * n)) ** 2
+    rho = np.fft.irfft(spectrum)[1 : n // 2]
+    rho = rho / (spectrum[0] + 2 * spectrum[1:-1].sum() + spectrum[-1]) * (2 * n)
+    if rho[0] < 3 / math.sqrt(n):
+        return 1.0
+    negative = np.flatnonzero(rho <= 0)
+    return float(1 + 2 * rho[: negative[0] if negative.size else rho.size].sum())
+
+
 def confidence_interval(value: float, stderr: float, *, log: bool, level: float = 0.95) -> tuple[float, float]:
     """Normal confidence interval; symmetric in the logarithm where the parameter was searched so.
 

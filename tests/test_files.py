@@ -1,4 +1,3 @@
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.errors import InputError, UnitError, UnknownNameError
-from pneuopt.files import read_drive, read_status, read_toml, write_fit, write_records, write_text
+from pneuopt.files import read_drive, read_status, write_fit
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
+from pneuopt.tomlfile import read_toml
 
 AXIS = """# my axis, 2024
 [drive]
@@ -146,18 +146,6 @@ def test_errors_are_of_their_kind(tmp_path: Path) -> None:
         read_drive(written(tmp_path, AXIS.replace("coulomb", "coulom")))
 
 
-def test_a_syntax_error_names_file_and_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"drive\.toml: not valid TOML: .* at line 3 "):
-        read_toml(written(tmp_path, "a = 1\nb = 2\nc = = 3\n"))
-    with pytest.raises(InputError, match=r"drive\.toml: not valid TOML: .*already exists"):
-        read_toml(written(tmp_path, "a = 1\na = 2\n"))
-    with pytest.raises(InputError, match=r"none\.toml: cannot be read"):
-        read_toml(tmp_path / "none.toml")
-    (tmp_path / "latin.toml").write_bytes("a = 'µ'".encode("latin-1"))
-    with pytest.raises(InputError, match="UTF-8"):
-        read_toml(tmp_path / "latin.toml")
-
-
 def test_a_fit_keeps_the_users_text_and_adds_the_results(tmp_path: Path) -> None:
     source = written(tmp_path, AXIS)
     drive, rig = read_drive(source)
@@ -246,27 +234,3 @@ def test_a_value_at_its_bound_reads_back(tmp_path: Path) -> None:
     found = read_drive(source)[1].with_values({"load.mass": 53.333333333333336})
     write_fit(tmp_path / "fit.toml", source, Fit(found))
     assert read_drive(tmp_path / "fit.toml")[1] == found
-
-
-def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = written(tmp_path, "before", "out.toml")
-    write_text(path, "after\n")
-    assert path.read_bytes() == b"after\n"
-    with pytest.raises(UnicodeEncodeError):
-        write_text(path, "half of it \ud800")
-    assert path.read_bytes() == b"after\n"
-    assert [p.name for p in tmp_path.iterdir()] == ["out.toml"]
-    with pytest.raises(InputError, match="the folder does not exist; make it first"):
-        write_text(tmp_path / "none" / "out.toml", "")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_text(tmp_path, "")
-
-
-def test_records_are_plain_json(tmp_path: Path) -> None:
-    frame = pd.DataFrame({"value": [1.5, math.nan, math.inf], "holds": [True, False, True], "unit": ["%", "s", "µm"]})
-    write_records(tmp_path / "claims.json", frame)
-    records = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
-    assert records[0] == {"value": 1.5, "holds": True, "unit": "%"}
-    assert [r["value"] for r in records] == [1.5, None, None]
-    write_records(tmp_path / "estimates.json", frame.set_axis(["a", "b", "c"], axis=0))
-    assert [r["name"] for r in json.loads((tmp_path / "estimates.json").read_text(encoding="utf-8"))] == ["a", "b", "c"]

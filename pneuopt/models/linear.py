@@ -18,8 +18,8 @@ from pneuopt.models.linear_starts import LinearStarts, Shape
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import DiscreteSystem, Symbols, System, define, names
 
-VALVE_VOLTAGE = Quantity("valve_voltage", "V")
-SPEED = Quantity("speed", "m/s")
+VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
+SPEED = Quantity("speed", "m/s", nominal=0.5)
 HIGHEST_PADE_ORDER = 5
 Dynamics = Callable[[ca.SX, Symbols, Symbols], dict[str, ca.SX]]
 
@@ -216,7 +216,7 @@ def delayed(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) 
     if system.update is not None:
         now = ca.substitute(late, x, shifted)
         shifted[:n] = system.update(t, x[:n], now, p)
-    update = ca.Function("update", [t, x, u, p], [shifted], ["t", "x", "u", "p"], ["x"])
+    update = ca.Function("update", [t, x, u, p], [shifted], ["t", "x", "u", "p"], ["x_after"])
     return replace(system, states=system.states + registers, step=step, update=update)
 
 
@@ -243,7 +243,7 @@ def _plant(
 def _delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:
     valid = isinstance(order, int) and 0 <= order <= HIGHEST_PADE_ORDER
     require(valid, f"pade_order must be 0 to {HIGHEST_PADE_ORDER}, got {order}", ModelError)
-    return tuple(Quantity(f"{source.name}_delay_{k}", source.unit, source.nominal) for k in range(1, order + 1))
+    return tuple(Quantity(f"{source.name}_delay_{k}", source.unit, 2 * source.nominal) for k in range(1, order + 1))
 
 
 def _pade(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX]]:

@@ -25,6 +25,10 @@ class Equations:
         The data's own Gram matrix of each segment, in its states and sensitivity columns.
     selection : ndarray, shape (m, c, k)
         d(column)/d(searched parameter).
+    ends : ndarray, shape (m, n, n + c)
+        Sensitivity of each segment's end, in nominal sizes.
+    gaps : ndarray, shape (m, n)
+        Gap behind each segment in nominal sizes; zero where nothing follows.
     chain : ndarray, shape (k,)
         d(parameter)/d(searched parameter).
     chi_square, cost, largest_gap : float
@@ -36,6 +40,8 @@ class Equations:
     arrow: Arrow
     grams: Array
     selection: Array
+    ends: Array
+    gaps: Array
     chain: Array
     chi_square: float
     cost: float
@@ -101,26 +107,65 @@ def normal_equations(
         np.einsum("mak,ma->k", selection, gradient[:, n:]),
     )
     chi_square = float(np.sum(residual**2))
-    gaps = _add_gaps(arrow, segments, nodes, run.x_end, run.dx_end * scale, selection, sigma)
-    cost = 0.5 * (chi_square + float(np.sum((gaps / sigma) ** 2)))
+    ends = run.dx_end * scale / segments.nominal[:, None]
+    gaps = gaps_of(segments, nodes, run.x_end)
+    off = np.where(np.isfinite(segments.fixed_start), nodes - segments.fixed_start, 0.0) / segments.nominal
+    _add_gaps(arrow, segments, gaps, off, ends, selection, sigma)
+    cost = 0.5 * (chi_square + float(np.sum((gaps / sigma) ** 2)) + float(np.sum((off / sigma) ** 2)))
     largest = float(np.max(np.abs(gaps), initial=0.0))
     finite = math.isfinite(cost) and bool(np.isfinite(grams).all())
-    return Equations(
-        arrow, grams, selection, chain, chi_square, cost if finite else math.inf, largest, int(known.sum())
-    )
+    cost = cost if finite else math.inf
+    return Equations(arrow, grams, selection, ends, gaps, chain, chi_square, cost, largest, int(known.sum()))
+
+
+def gaps_of(segments: Segments, nodes: Array, x_end: Array) -> Array:
+    """Gap behind each segment in nominal sizes, shape (m, n); zero where nothing follows."""
+    gaps = np.zeros_like(nodes)
+    here = np.flatnonzero(segments.linked)
+    gaps[here] = (x_end[here] - nodes[here + 1]) / segments.nominal
+    return gaps
+
+
+def reconnected(
+    segments: Segments, equations: Equations, step: Array, moved: Array, nodes: Array, x_end: Array
+) -> Array:
+    """Second-order correction of a step: shift the nodes so that the gaps become what the linear model promised.
+
+    Parameters
+    ----------
+    segments : Segments
+    equations : Equations
+        Where the step (nodes `step`, shape (m, n) in nominal sizes; parameters `moved`, shape (k,)) was computed.
+    nodes, x_end : ndarray, shape (m, n)
+        The nodes after the step, and where their segments end.
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+    """
+    n = nodes.shape[1]
+    here = np.flatnonzero(segments.linked)
+    own = equations.ends[:, :, :n]
+    promised = equations.gaps + np.einsum("mij,mj->mi", own, step)
+    promised += np.einsum("mic,mck,k->mi", equations.ends[:, :, n:], equations.selection, moved, optimize=True)
+    promised[here] -= step[here + 1]
+    excess = gaps_of(segments, nodes, x_end) - promised
+    shift = np.zeros_like(nodes)
+    for i in here.tolist():
+        shift[i + 1] = own[i] @ shift[i] + excess[i]
+    return np.asarray(nodes + shift * segments.nominal)
 
 
 def _add_gaps(
-    arrow: Arrow, segments: Segments, nodes: Array, x_end: Array, dx_end: Array, selection: Array, sigma: Array
-) -> Array:
-    """Add the gaps between linked segments, and known starts, as residuals; returns the gaps in nominal sizes."""
-    n = nodes.shape[1]
+    arrow: Arrow, segments: Segments, gaps: Array, off: Array, ends: Array, selection: Array, sigma: Array
+) -> None:
+    """Add the gaps between linked segments, and the distance from known starts, as residuals."""
+    n = gaps.shape[1]
     weight = 1 / sigma
     here = np.flatnonzero(segments.linked)
-    gap = (x_end[here] - nodes[here + 1]) / segments.nominal
-    e = gap * weight
-    own = dx_end[here, :, :n] / segments.nominal[:, None] * weight[:, None]
-    ours = dx_end[here, :, n:] / segments.nominal[:, None] * weight[:, None] @ selection[here]
+    e = gaps[here] * weight
+    own = ends[here, :, :n] * weight[:, None]
+    ours = ends[here, :, n:] * weight[:, None] @ selection[here]
     own_t = np.swapaxes(own, 1, 2)
     arrow.diagonal[here] += own_t @ own
     arrow.diagonal[here + 1] += np.diag(weight**2)
@@ -131,8 +176,5 @@ def _add_gaps(
     arrow.node_gradient[here] += (own_t @ e[..., None])[..., 0]
     arrow.node_gradient[here + 1] -= weight * e
     arrow.gradient[:] += np.einsum("mak,ma->k", ours, e)
-    given = np.isfinite(segments.fixed_start)
-    off = np.where(given, nodes - segments.fixed_start, 0.0) / segments.nominal
-    arrow.diagonal[:, range(n), range(n)] += given * weight**2
+    arrow.diagonal[:, range(n), range(n)] += np.isfinite(segments.fixed_start) * weight**2
     arrow.node_gradient[:] += off * weight**2
-    return np.concatenate([gap, off[given.any(axis=1)]])

@@ -22,6 +22,7 @@ from pneuopt.system import names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
+EXPANDED = 200_000  # scalar operations up to which flattening the whole graph to scalars pays
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class FullSpace:
         IPOPT's `tol`, on the scaled problem.
     max_seconds : float
         Wall time after which the solver gives up [s].
+    first_barrier : float
+        IPOPT's `mu_init`: how far from the limits the first iterates keep.
     verbose : bool
         Print IPOPT's own table.
     """
@@ -42,11 +45,13 @@ class FullSpace:
     max_iterations: int = 500
     tolerance: float = 1e-8
     max_seconds: float = 3600.0
+    first_barrier: float = 0.1
     verbose: bool = False
 
     def __post_init__(self) -> None:
         require(self.max_iterations >= 1, f"max_iterations must be at least 1, got {self.max_iterations}")
         require(0 < self.tolerance < 1, f"tolerance must lie between 0 and 1, got {self.tolerance}")
+        require(self.first_barrier > 0, f"first_barrier must be positive, got {self.first_barrier}")
         require(self.max_seconds > 0, f"max_seconds must be positive, got {self.max_seconds}")
 
 
@@ -84,11 +89,17 @@ def prepare(transcription: Transcription, method: FullSpace | None = None) -> Pr
         "sb": "yes",
         "max_iter": method.max_iterations,
         "tol": method.tolerance,
+        "mu_init": method.first_barrier,
         "acceptable_iter": 0,
         "max_wall_time": method.max_seconds,
     }
     nlp: Any = {"x": graph.w, "p": graph.q, "f": ca.sum1(graph.parts), "g": graph.g}
-    options: Any = {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
+    options: Any = {
+        "print_time": False,
+        "show_eval_warnings": False,
+        "expand": _operations(transcription) <= EXPANDED,
+        "ipopt": ipopt,
+    }
     return Problem(graph, ca.nlpsol("full_space", "ipopt", nlp, options))
 
 
@@ -130,6 +141,12 @@ def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | 
     }
     status = _status(problem, str(stats["return_status"]), found, q, figures)
     return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up))
+
+
+def _operations(transcription: Transcription) -> int:
+    """About how many scalar operations one evaluation takes."""
+    samples = sum(phase.n for phase in transcription.phases)
+    return int(samples * transcription.system.substeps * transcription.system.step.n_instructions())
 
 
 # What the solver found, in words.

@@ -6,13 +6,14 @@ record's length. The gaps are tightened in stages, so that a bad start is never 
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.nlp.equations import Equations, normal_equations
+from pneuopt.nlp.arrow import Step
+from pneuopt.nlp.equations import Equations, normal_equations, reconnected
 from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for, tightness
 from pneuopt.nlp.status import Code, Solution, Status
 from pneuopt.nlp.transcription import Transcription
@@ -20,6 +21,7 @@ from pneuopt.nlp.transcription import Transcription
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
+UNFELT = 1e-6  # squared residuals that an e-fold change of a log parameter has to move, or it stays where it is
 
 
 @dataclass(frozen=True)
@@ -184,12 +186,22 @@ class _Search:
         for _ in range(10):
             solved = current.equations.arrow.solve(damping, keep)
             if solved is not None and np.max(np.abs(solved.parameters[self.log]), initial=0.0) <= 2:
-                z = np.clip(current.z + solved.parameters, self.lower, self.upper)
-                trial = self._evaluate(current.nodes + solved.nodes * self.segments.nominal, z, stage)
-                if trial.cost < current.cost:
-                    return trial, damping * 0.1 if damping > 1e-9 else 0.0
+                for trial in self._trials(current, solved, stage):
+                    if trial.cost < current.cost:
+                        return trial, damping * 0.1 if damping > 1e-9 else 0.0
             damping = max(damping * 10, 1e-9)
         return None, damping
+
+    def _trials(self, current: _Iterate, step: Step, stage: Stage) -> Iterator[_Iterate]:
+        """The step with its gaps corrected to second order (curved valleys of tight gaps), then the step as it is."""
+        z = np.clip(current.z + step.parameters, self.lower, self.upper)
+        nodes = current.nodes + step.nodes * self.segments.nominal
+        if self.segments.linked.any():
+            end = self.segments.run(nodes, self._values(z), self.substeps * stage.refine, sensitivities=False).x_end
+            shifted = reconnected(self.segments, current.equations, step.nodes, z - current.z, nodes, end)
+            if np.isfinite(shifted).all():
+                yield self._evaluate(shifted, z, stage)
+        yield self._evaluate(nodes, z, stage)
 
     def _evaluate(self, nodes: Array, z: Array, stage: Stage) -> _Iterate:
         sigma = stage.gap * self.tightness
@@ -198,9 +210,11 @@ class _Search:
         return _Iterate(nodes, z, equations)
 
     def _movable(self, current: _Iterate) -> Mask:
-        """Parameters that are not pressed against a bound."""
-        gradient = current.equations.arrow.gradient
-        return ~(((current.z <= self.lower) & (gradient > 0)) | ((current.z >= self.upper) & (gradient < 0)))
+        """Parameters that are neither pressed against a bound nor without any effect on the residuals here."""
+        gradient, felt = current.equations.arrow.gradient, np.diag(current.equations.arrow.corner)
+        return (felt > np.where(self.log, UNFELT, 0.0)) & ~(
+            ((current.z <= self.lower) & (gradient > 0)) | ((current.z >= self.upper) & (gradient < 0))
+        )
 
     def _judge(self, current: _Iterate) -> Status:
         """Converged means that a full undamped step would move nothing that the data can tell apart."""

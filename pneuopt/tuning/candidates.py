@@ -15,13 +15,16 @@ from pneuopt.control.metrics import About, step_metrics
 from pneuopt.control.reference import Step
 from pneuopt.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import Specification, name, read
+from pneuopt.requirements import MaxSensitivity, Specification, read
 from pneuopt.system import names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 STABLE = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
 MOST_SUBSTEPS = 100
+MOST_NEIGHBOURS = 1000
+RUNAWAY = 1e12
+LOST = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity", "Ripple", "Excess")
 POINTS = 1000  # samples of a response where the loop has no sample time
 
 
@@ -85,6 +88,7 @@ class Space:
         >>> Space(gains, ("pid.Kp",)).printed(np.array([0.39661]), 4, 1).ravel().tolist()
         [0.3965, 0.3966, 0.3967]
         """
+        around = around if (2 * around + 1) ** len(point) <= MOST_NEIGHBOURS else 0
         choices = []
         for value, (low, up) in zip(point, self.bounds, strict=True):
             place = 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1) if value else 1.0
@@ -217,47 +221,45 @@ class Simulator:
         ----------
         points : ndarray, shape (m, n)
         spec : Specification
-            Its band counts; "Excess" is the distance from it near the end, for what never settles.
+            Its band counts, and whether the sensitivity does; "Excess" is the mean error near the end, for what never
+            settles.
         """
-        sets = [self._space.filled(point) for point in points]
-        worst: list[dict[str, float]] = [{} for _ in sets]
-        for k, reference in enumerate(self._references):
-            for values, found in zip(worst, self._respond(k, reference, sets, spec), strict=True):
-                values.update({n: float(np.maximum(v, values.get(n, v))) for n, v in found.items()})
-        return worst
+        robust = spec.concerns(MaxSensitivity)
+        found = [self._respond(k, points, spec.band, robust) for k in range(len(self._references))]
+        return [worst([{**read(m), "Excess": m["Excess"]} for m in metrics]) for metrics in zip(*found, strict=True)]
 
-    def _respond(
-        self, k: int, reference: Step, sets: Sequence[ParameterSet], spec: Specification
-    ) -> list[dict[str, float]]:
+    def table(self, point: Array, spec: Specification) -> list[dict[str, float]]:
+        """The metrics of one candidate, a row a reference."""
+        return [self._respond(k, point[None], spec.band, True)[0] for k in range(len(self._references))]
+
+    def _respond(self, k: int, points: Array, band: float, robust: bool) -> list[dict[str, float]]:
+        reference, m = self._references[k], len(points)
+        sets = [self._space.filled(point) for point in points]
         h = spacing(self._loop, reference)
-        run, m = inputs(self._loop, reference, h), len(sets)
-        u, n = run.matrix(names(self._loop.inputs)), len(run)
-        rests = self._starts(k, reference, sets)
-        p = np.array([self._loop.numbers(s) for s in sets])
-        t, steps = np.tile(run.t, (m, 1)), np.full((m, n), h)
+        run = inputs(self._loop, reference, h)
+        u = np.tile(run.matrix(names(self._loop.inputs)), (m, 1, 1))
+        p, t = np.array([self._loop.numbers(s) for s in sets]), np.tile(run.t, (m, 1))
+        starts, steps = self._starts(k, reference, sets), np.full((m, len(run)), h)
         with np.errstate(all="ignore"):
-            found = self._rollout.run(rests, np.tile(u, (m, 1, 1)), p, t, steps, substeps=self._substeps[k])
+            found = self._rollout.run(starts, u, p, t, steps, substeps=self._substeps[k])
         outputs = names(self._loop.outputs)
         responses = [Trajectory(run.t, dict(zip(outputs, y.T, strict=True))) for y in found.y]
-        return [
-            self._read(s, reference, response, x, spec)
-            for s, response, x in zip(sets, responses, found.x_end, strict=True)
-        ]
+        ends = zip(sets, responses, found.x_end, strict=True)
+        return [self._read(s, reference, response, x, band, robust) for s, response, x in ends]
 
     def _read(
-        self, parameters: ParameterSet, reference: Step, response: Trajectory, x_end: Array, spec: Specification
+        self, parameters: ParameterSet, reference: Step, response: Trajectory, x_end: Array, band: float, robust: bool
     ) -> dict[str, float]:
-        finite = all(bool(np.all(np.isfinite(c) & (np.abs(c) < 1e12))) for c in response.values.values())
+        finite = all(bool(np.all(np.isfinite(c) & (np.abs(c) < RUNAWAY))) for c in response.values.values())
         if not finite or not bool(np.all(np.isfinite(x_end))):
-            return dict.fromkeys([*(name(q) for q in (*spec.weights, *spec.limits)), "Excess"], np.inf)
-        values = read(measure(self._loop, parameters, reference, response, spec.band))
+            return dict.fromkeys(LOST, np.inf)
+        metrics = measure(self._loop, parameters, reference, response, band)
         late = response.t >= 0.8 * reference.horizon + 0.2 * reference.at
         error = np.abs(response[self._loop.feedback.name][late] - reference.final)
-        values["Excess"] = max(0.0, float(np.mean(error)) / abs(reference.size))
-        if any(name(q) == "MaxSensitivity" for q in (*spec.weights, *spec.limits)):
-            command = response["control"][-1]
-            values["MaxSensitivity"] = _sensitivity(self._loop, parameters, x_end, float(command))
-        return values
+        metrics["Excess"] = float(np.mean(error)) / abs(reference.size)
+        if robust:
+            metrics["MaxSensitivity"] = _sensitivity(self._loop, parameters, x_end, float(response["control"][-1]))
+        return metrics
 
     def _starts(self, k: int, reference: Step, sets: Sequence[ParameterSet]) -> Array:
         rest = self._rest[k]
@@ -278,6 +280,11 @@ class Simulator:
             [] if found is None else [x for x in found[0][:: max(1, len(run) // 10)] if bool(np.all(np.isfinite(x)))]
         )
         return [start, *states]
+
+
+def worst(found: Sequence[dict[str, float]]) -> dict[str, float]:
+    """The largest of each value over the references; NaN wins."""
+    return {n: float(np.max([values[n] for values in found])) for n in found[0]}
 
 
 def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array | None:

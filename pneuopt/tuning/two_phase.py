@@ -8,7 +8,7 @@ a step at the command.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_grid, sensitivity_terms
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError, require
+from pneuopt.errors import require
 from pneuopt.nlp.full_space import FullSpace, prepare, solve_from
 from pneuopt.nlp.status import Solution
 from pneuopt.nlp.transcription import Cost, Limit, Phase, Transcription, Where, every
@@ -49,7 +49,7 @@ class TwoPhase:
     nodes : tuple of int
         Shooting nodes of the transient and of the settled phase.
     margin : float
-        How much tighter the problem's band is than the one asked for; an optimum without it grazes the band.
+        How much tighter the problem's limits are than those asked for; an optimum without it grazes the band.
     starts : int
         The given gains, then random ones within the bounds.
     seed : int
@@ -58,12 +58,12 @@ class TwoPhase:
     solver : FullSpace
     """
 
-    nodes: tuple[int, int] = (60, 80)
+    nodes: tuple[int, int] = (40, 50)
     margin: float = 0.03
-    starts: int = 6
+    starts: int = 4
     seed: int = 0
     digits: int | None = 4
-    solver: FullSpace = FullSpace(max_iterations=400, first_barrier=1e-2)
+    solver: FullSpace = field(default_factory=lambda: FullSpace(max_iterations=400, first_barrier=1e-2))
 
     def __post_init__(self) -> None:
         require(min(self.nodes) >= 4, f"TwoPhase: each phase needs at least 4 nodes, got {self.nodes}")
@@ -82,17 +82,14 @@ class Optima:
     agreeing: int
 
 
-def is_linear(loop: ClosedLoop, space: Space) -> bool:
-    """Whether the loop, its clip aside, is a linear ODE: its Jacobian is the same in states far apart."""
+def is_linear(loop: ClosedLoop) -> bool:
+    """Whether the loop, its clip aside, is a linear ODE: no state and no input is in its Jacobian."""
     if loop.pid.sample_time is not None:
         return False
-    system = unlimited(loop).system()
-    rng, scale = np.random.default_rng(0), np.array([q.nominal for q in system.states])
-    parameters = space.parameters
-    first, *others = (system.linearise(scale * x, {}, parameters) for x in rng.normal(0, 3, (4, len(scale))))
-    return all(
-        bool(np.allclose(getattr(first, k), getattr(o, k), rtol=1e-9, atol=1e-12)) for o in others for k in "ABCD"
-    )
+    ode = unlimited(loop).system().ode
+    t, x, u, p = (ca.SX.sym(k, ode.size1_in(i)) for i, k in enumerate("txup"))
+    signals = ca.vertcat(x, u)
+    return not ca.depends_on(ca.jacobian(ca.vertcat(*ode(t, x, u, p)), signals), signals)
 
 
 def unlimited(loop: ClosedLoop) -> ClosedLoop:
@@ -101,7 +98,7 @@ def unlimited(loop: ClosedLoop) -> ClosedLoop:
 
 
 def solve_two_phase(
-    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase, margin: float
+    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
 ) -> Optima:
     """Solve from every start.
 
@@ -110,7 +107,7 @@ def solve_two_phase(
     InputError
         If the loop's rest depends on the gains, or a mode is too fast for the grid.
     """
-    problem = prepare(transcribe(loop, references, space, spec, method, margin), method.solver)
+    problem = prepare(transcribe(loop, references, space, spec, method), method.solver)
     parameters = problem.graph.transcription.parameters
     rng = np.random.default_rng(method.seed)
     found = []
@@ -127,7 +124,7 @@ def solve_two_phase(
 
 
 def transcribe(
-    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase, margin: float
+    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
 ) -> Transcription:
     """Write the two-phase problem; the references share one settling time, the worst of them."""
     free_loop = unlimited(loop)
@@ -136,12 +133,12 @@ def transcribe(
         averaged = averaged.with_values({"dither.amplitude": 0.0}).fixed("dither.amplitude")
     extra = _extra(references, spec)
     system = _extended(free_loop, extra, space, references, method)
-    parameters = ParameterSet({n: averaged.get(n, extra.get(n)) for n in system.parameters})
+    parameters = (averaged | extra).select(system.parameters)
     phases = [p for i, r in enumerate(references) for p in _phases(loop, space, i, r, method)]
     parameters = parameters | _durations(references)
     limits = [
-        *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r, margin)),
-        *_sensitivity_limit(free_loop, averaged, space, spec, parameters, margin),
+        *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)),
+        *_sensitivity_limit(free_loop, averaged, space, spec, parameters),
     ]
     return Transcription(system, parameters, tuple(phases), (), _costs(spec, parameters), tuple(limits))
 
@@ -155,7 +152,11 @@ def _extra(references: Sequence[Step], spec: Specification) -> ParameterSet:
     horizon = min(r.horizon - r.at for r in references)
     most = min(spec.limit(SettlingTime), horizon)
     free = spec.weight(SettlingTime) > 0
-    given = {SETTLING: Parameter(0.5 * most if free or not spec.concerns(SettlingTime) else most, "s", 1e-3 * most, most, free=free)}
+    given = {
+        SETTLING: Parameter(
+            0.5 * most if free or not spec.concerns(SettlingTime) else most, "s", 1e-3 * most, most, free=free
+        )
+    }
     for kind in KINDS:
         if spec.weight(kind) > 0:
             least = 1.0 if kind is MaxSensitivity else 0.0
@@ -177,11 +178,15 @@ def _extended(
     system = loop.system()
     t, x, u, p = (ca.SX.sym(k, system.ode.size1_in(i)) for i, k in enumerate("txup"))
     more = ca.SX.sym("more", len(extra))
-    ode = ca.Function("ode", [t, x, u, ca.vertcat(p, more)], [*system.ode(t, x, u, p)], ["t", "x", "u", "p"], ["xdot", "y"])
+    ode = ca.Function(
+        "ode", [t, x, u, ca.vertcat(p, more)], [*system.ode(t, x, u, p)], ["t", "x", "u", "p"], ["xdot", "y"]
+    )
     longest = max(max(extra[SETTLING].upper / method.nodes[0], r.horizon / method.nodes[1]) for r in references)
     own = Space(space.parameters.select(loop.parameters), space.names)
     steps = substeps(fastest(loop, own, [np.zeros(len(loop.states))]), longest, loop)
-    return discretise(System(system.states, system.inputs, system.outputs, system.parameters | extra, ode), max(2, steps))
+    return discretise(
+        System(system.states, system.inputs, system.outputs, system.parameters | extra, ode), max(2, steps)
+    )
 
 
 def _phases(loop: ClosedLoop, space: Space, i: int, reference: Step, method: TwoPhase) -> list[Phase]:
@@ -206,14 +211,14 @@ def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array:
         scale = np.array([q.nominal for q in loop.states])
         require(
             bool(np.all(np.abs(first - other) <= 1e-9 * scale)),
-            f"before the step the loop rests in a state that depends on its gains (reference {reference.initial:g}, or a "
-            "load): the two-phase problem needs one that does not; step from zero, or use method=Screening()",
+            f"before the step the loop rests in a state that depends on its gains (reference {reference.initial:g}, or "
+            "a load): the two-phase problem needs one that does not; step from zero, or use method=Screening()",
         )
     return first
 
 
 def _path_limits(
-    loop: ClosedLoop, space: Space, spec: Specification, system: DiscreteSystem, i: int, reference: Step, margin: float
+    loop: ClosedLoop, space: Space, spec: Specification, system: DiscreteSystem, i: int, reference: Step
 ) -> list[Limit]:
     t, x, u, p = (ca.SX.sym(k, system.step.size1_in(j)) for k, j in zip("txup", (0, 2, 3, 4), strict=True))
     y = system.step(t, 0, x, u, p)[1]
@@ -223,25 +228,23 @@ def _path_limits(
     count = 3 if reference.at > 0 else 2
     transient, settled = count * i + count - 2, count * i + count - 1
     both = (transient, settled)
-    tight = 1 - margin
 
     def limit(name: str, value: ca.SX, lower: float, upper: float, where: Where, phases: tuple[int, ...]) -> Limit:
         return Limit(name, ca.Function("limit", [t, x, u, p], [value]), lower, upper, where, phases)
 
-    def below(kind: type, value: ca.SX, where: Where, phases: tuple[int, ...], share: float) -> list[Limit]:
+    def below(kind: type, value: ca.SX, where: Where, phases: tuple[int, ...]) -> list[Limit]:
         """Value and, where it has a sign, its negative, at most the limit or the unknown."""
         if spec.weight(kind) > 0:
-            return [limit(kind.__name__, value - share * p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
+            return [limit(kind.__name__, value - p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
         most = spec.limit(kind)
-        return [limit(kind.__name__, value, -math.inf, share * most, where, phases)] if most < math.inf else []
+        return [limit(kind.__name__, value, -math.inf, most, where, phases)] if most < math.inf else []
 
     found = []
     if spec.concerns(SettlingTime):
-        band = tight * spec.band
-        found += [limit("settling band", error, -band, band, w, (settled,)) for w in (Where.NODES, Where.END)]
-    found += below(Overshoot, error, Where.NODES, both, tight)
-    found += below(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,), tight)
-    found += below(PeakControl, ca.vertcat(control, -control), Where.NODES, both, 1 - margin / 300)
+        found += [limit("settling band", error, -spec.band, spec.band, w, (settled,)) for w in (Where.NODES, Where.END)]
+    found += below(Overshoot, error, Where.NODES, both)
+    found += below(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,))
+    found += below(PeakControl, ca.vertcat(control, -control), Where.NODES, both)
     if loop.pid.limits:
         ends = [space.parameters.value(f"pid.{n}") for n in ("lower", "upper")]
         if np.isfinite(ends).any():
@@ -250,15 +253,17 @@ def _path_limits(
 
 
 def _sensitivity_limit(
-    loop: ClosedLoop, averaged: ParameterSet, space: Space, spec: Specification, parameters: ParameterSet, margin: float
+    loop: ClosedLoop, averaged: ParameterSet, space: Space, spec: Specification, parameters: ParameterSet
 ) -> list[Limit]:
     if not spec.concerns(MaxSensitivity):
         return []
-    grid = np.unique(np.concatenate([_grid(loop, averaged, space.draw(np.full(len(space.names), k)), space) for k in (0.2, 0.8)]))
+    grid = np.unique(
+        np.concatenate([_grid(loop, averaged, space.draw(np.full(len(space.names), k)), space) for k in (0.2, 0.8)])
+    )
     terms = sensitivity_terms(loop, grid, averaged)
     q = ca.SX.sym("q", len(parameters))
     Ms = q[list(parameters).index("MaxSensitivity")] if spec.weight(MaxSensitivity) > 0 else spec.limit(MaxSensitivity)
-    value = terms(q[: len(loop.parameters)]) * (Ms * (1 - margin / 300)) ** 2
+    value = terms(q[: len(loop.parameters)]) * Ms**2
     return [Limit("MaxSensitivity", ca.Function("limit", [q], [value]), 1.0, math.inf, Where.PARAMETERS)]
 
 
@@ -266,8 +271,7 @@ def _grid(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) 
     """Frequencies around those of the loop's modes, where the sensitivity peaks."""
     own = Space(averaged, space.names).filled(point)
     full = frequency_grid(loop.open_loop(own), 40)
-    inner = full[(full > 30 * full[0]) & (full < full[-1] / 30)]
-    return inner
+    return np.asarray(full[(full > 30 * full[0]) & (full < full[-1] / 30)], dtype=float)
 
 
 def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:

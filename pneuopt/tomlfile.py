@@ -1,0 +1,132 @@
+"""What every TOML file of ours has: a value, or a table where it may be free; comments kept.
+
+A value is "32 mm", or { value = "40 N", lower = "5 N", upper = "90 N", free = true }.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import InlineTable, Table
+
+from pneuopt.errors import InputError, check_known, require
+from pneuopt.output import plain
+from pneuopt.parameters import Parameter
+from pneuopt.units import read_value, write_value
+
+_FLAGS = ("free", "log", "per_log")
+_FIELDS = ("value", "lower", "upper", *_FLAGS, "source")
+
+
+def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
+    """Read a TOML file with its comments.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    TOMLDocument
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is not TOML; the message names the line.
+    """
+    try:
+        return tomlkit.parse(Path(path).read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file in UTF-8; save it so") from None
+    except TOMLKitError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+
+
+def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
+    """Read a value, or a table with bounds and flags; what it leaves out is as in `default`.
+
+    Parameters
+    ----------
+    entry : str, float or mapping
+    default : Parameter
+        Its unit counts.
+    where : str
+        What the message of an error begins with: file, section, key.
+
+    Returns
+    -------
+    Parameter
+
+    Raises
+    ------
+    InputError
+        If a value cannot be read, a key is unknown, or the value lies outside its bounds.
+    """
+    fields = entry if isinstance(entry, dict) else {"value": entry}
+    check_known("key", fields, _FIELDS, where)
+    numbers: dict[str, Any] = {f: read_value(fields[f], default.unit, where=where) for f in _FIELDS[:3] if f in fields}
+    for flag in _FLAGS:
+        require(isinstance(fields.get(flag, False), bool), f"{where}: {flag} must be true or false")
+    others = {f: fields[f] for f in (*_FLAGS, "source") if f in fields}
+    if "value" in fields:
+        others.setdefault("source", "")
+    try:
+        return replace(default, **numbers, **others)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter, given: Parameter) -> None:
+    """Put what differs from `given` in its place; a table only where the user chose one or more than a value differs.
+
+    Parameters
+    ----------
+    document : TOMLDocument
+        Changed in place.
+    name : str
+        "section.key".
+    found, given : Parameter
+    """
+    section, _, key = name.partition(".")
+    if section not in document:
+        document[section] = tomlkit.table()
+    entries: Any = document[section]
+    fields: dict[str, Any] = {f: _written(getattr(found, f), found) for f in _FIELDS[:3] if _differ(f, found, given)}
+    fields |= {f: getattr(found, f) for f in (*_FLAGS, "source") if _differ(f, found, given)}
+    entry = entries.get(key)
+    if isinstance(entry, InlineTable | Table):
+        entry.update(fields)
+    elif fields.keys() == {"value"}:
+        entries[key] = fields["value"]
+    else:
+        entries[key] = inline_table({"value": entry or _written(found.value, found)} | fields)
+
+
+def toml_table(entries: Mapping[str, Any]) -> Table:
+    """A section."""
+    table = tomlkit.table()
+    table.update(entries)
+    return table
+
+
+def inline_table(entries: Mapping[Any, Any]) -> InlineTable:
+    """A table in one line, of plain values."""
+    table = tomlkit.inline_table()
+    table.update(plain(entries))
+    return table
+
+
+def _differ(field: str, found: Parameter, given: Parameter) -> bool:
+    return bool(getattr(found, field) != getattr(given, field))
+
+
+def _written(value: float, parameter: Parameter) -> str:
+    """Nine digits, or all of them where rounding would cross a bound."""
+    text = write_value(value, parameter.unit, 9)
+    inside = parameter.lower <= read_value(text, parameter.unit) <= parameter.upper
+    return text if inside else write_value(value, parameter.unit, 17)

@@ -1,0 +1,352 @@
+"""`tune`: PID gains and dither found together, and proven by a simulation that shares nothing with the search.
+
+A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or sampling, by compiled screening
+(`Screening`). Gains are handed out as printed: rounded first, then certified.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import margins
+from pneuopt.control.reference import Step
+from pneuopt.errors import ConvergenceError, require
+from pneuopt.nlp.status import Code, Status
+from pneuopt.parameters import ParameterSet
+from pneuopt.provenance import provenance
+from pneuopt.requirements import Requirement, Specification, name, read, specify
+from pneuopt.simulate import simulate
+from pneuopt.tuning.candidates import Simulator, Space, inputs, measure, spacing, span, worst
+from pneuopt.tuning.screening import Screening, screen
+from pneuopt.tuning.two_phase import TwoPhase, is_linear, solve_two_phase
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Method = TwoPhase | Screening
+ATTEMPTS = 3  # margins tried, each twice the one before
+TRIED = 5  # printed gains certified at each margin, at most
+GRAZING = 0.01  # relative excess of the certified over the claimed settling time
+FINE = 4  # points of the certifying record a sample of the search's
+UNFELT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # by a linear loop's average
+SHOWN = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity")
+
+
+@dataclass(frozen=True, eq=False)
+class TuningResult:
+    """What `tune` found.
+
+    Attributes
+    ----------
+    parameters : ParameterSet
+        The given ones with the tuned values, as printed; the given ones unchanged where the status is not "converged".
+    claimed, certified : DataFrame
+        A row a metric, a column a reference: SettlingTime [s], Overshoot and SteadyStateError [% of the step],
+        PeakControl [the command's unit], MaxSensitivity, with dither Ripple [the measured signal's unit]; by the
+        search's own simulation, and by the independent one.
+    active : tuple of str
+        Requirements and bounds that hold the objective back.
+    status : Status
+    stats : mapping of str to float
+        "seconds", "deviation.SettlingTime" and so on (the largest |claimed - certified|), and the search's own:
+        "starts", "starts_converged", "starts_agreeing", "optimum" (before rounding), "simulations"; where nothing is
+        certified "rejected.pid.Kp" and so on.
+    provenance : mapping of str to str
+    """
+
+    parameters: ParameterSet
+    claimed: "pd.DataFrame"
+    certified: "pd.DataFrame"
+    active: tuple[str, ...]
+    status: Status
+    stats: Mapping[str, float]
+    provenance: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        free = self.parameters.select(self.parameters.free_names)
+        return f"TuningResult {self.status}\n{free!r}\n{self.certified.to_string()}"
+
+
+def tune(
+    loop: ClosedLoop,
+    references: Step | Sequence[Step],
+    parameters: ParameterSet,
+    *,
+    minimise: Requirement | Mapping[Requirement, float],
+    subject_to: Sequence[Requirement] = (),
+    method: Method | None = None,
+    throw: bool = True,
+) -> TuningResult:
+    """Find the free gains, and dither, that do best on the references within the limits.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : Step or sequence of Step
+        Each from rest; the worst counts.
+    parameters : ParameterSet
+        Of plant, controller and dither. The free ones ("pid.*", "dither.*") are tuned and need two finite bounds each.
+    minimise : Requirement, or mapping of Requirement to weight
+    subject_to : sequence of Requirement
+        Each with its `max`.
+    method : TwoPhase or Screening, optional
+        By default the first for a linear loop with a continuous controller, the second for any other.
+    throw : bool
+        Raise if nothing could be certified; otherwise the result says so in its status.
+
+    Returns
+    -------
+    TuningResult
+
+    Raises
+    ------
+    InputError
+        If parameters, bounds and requirements do not fit together; the message names the one.
+    ConvergenceError
+        If the limits cannot be kept, or the independent simulation does not confirm them; the error's `solution` is
+        the result, with the given gains unchanged.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> from pneuopt.requirements import Overshoot, PeakControl, SettlingTime
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    >>> given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
+    >>> limits = [Overshoot(0.05), PeakControl(4.0)]
+    >>> best = tune(loop, Step(1.0), given, minimise=SettlingTime(), subject_to=limits)
+    >>> best.status.converged, bool(best.certified.loc["PeakControl", "0 to 1"] <= 4.0)
+    (True, True)
+    """
+    begun = time.perf_counter()
+    spec, steps = specify(minimise, subject_to), [references] if isinstance(references, Step) else list(references)
+    require(len(steps) > 0, "no reference to tune for; give a Step")
+    space = span(loop, parameters)
+    linear = is_linear(loop)
+    method = method or (TwoPhase() if linear else Screening())
+    require(
+        linear or isinstance(method, Screening),
+        "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()",
+    )
+    unfelt = tuple(n for n in space.names if n in UNFELT) if isinstance(method, TwoPhase) else ()
+    felt = Space(space.parameters, tuple(n for n in space.names if n not in unfelt))
+    require(len(felt.names) > 0, f"{', '.join(unfelt)}: without effect on a linear loop; free a gain as well")
+    search = _Search(loop, tuple(steps), felt, spec, method)
+    result = search.run()
+    note = f"; {', '.join(unfelt)} left as given: without effect on a linear loop's average" if unfelt else ""
+    result = replace(
+        result,
+        parameters=parameters | result.parameters.select(felt.names if result.status.converged else ()),
+        status=replace(result.status, message=result.status.message + note),
+        stats={**result.stats, "seconds": time.perf_counter() - begun},
+    )
+    if throw and not result.status.converged:
+        raise ConvergenceError(f"tuning {result.status}; the given gains stand", result)
+    return result
+
+
+def evaluate(
+    loop: ClosedLoop, references: Step | Sequence[Step], parameters: ParameterSet, *, band: float = 0.02
+) -> "pd.DataFrame":
+    """Certified metrics: by the tight independent simulation, at the given parameters.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : Step or sequence of Step
+        Each from rest.
+    parameters : ParameterSet
+    band : float
+        Half width of the settling band around the reference, a fraction of the step.
+
+    Returns
+    -------
+    DataFrame
+        A row a metric, a column a reference ("0 to 0.25"): those of `step_metrics`, then MaxSensitivity, GainMargin
+        and PhaseMargin [deg] about the state in which the response ends.
+
+    Raises
+    ------
+    ConvergenceError
+        If the simulation stops.
+    """
+    import pandas as pd
+
+    steps = [references] if isinstance(references, Step) else list(references)
+    return pd.DataFrame({_label(r): _certified(loop, r, parameters, band) for r in steps})
+
+
+def _label(reference: Step) -> str:
+    return f"{reference.initial:g} to {reference.final:g}"
+
+
+def _certified(loop: ClosedLoop, reference: Step, parameters: ParameterSet, band: float) -> dict[str, float]:
+    h = spacing(loop, reference)
+    run = inputs(loop, reference, h)
+    fine = np.linspace(run.t[0], run.t[-1], FINE * (len(run) - 1) + 1)
+    start = loop.initial(parameters, reference=reference.initial)
+    response = simulate(loop, run, parameters, initial=start, t_out=fine)
+    metrics = measure(loop, parameters, reference, response, band)
+    x = np.array([response[q.name][-1] for q in loop.plant.states])
+    robust = margins(loop.open_loop(parameters, x, {loop.command.name: float(response["control"][-1])}))
+    return metrics | {
+        "MaxSensitivity": robust.max_sensitivity if robust.stable else np.inf,
+        "GainMargin": robust.gain_margin,
+        "PhaseMargin": robust.phase_margin,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What a search hands over: a point before rounding, the objective there, what is active, figures."""
+
+    point: Array
+    status: Status
+    active: tuple[str, ...]
+    stats: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """One tuning: search, print, certify, and again with a wider margin where the certificate fails."""
+
+    loop: ClosedLoop
+    references: tuple[Step, ...]
+    space: Space
+    spec: Specification
+    method: Method
+
+    def run(self) -> TuningResult:
+        simulator = Simulator(self.loop, self.references, self.space)
+        result, start = None, self.space.start
+        for attempt in range(ATTEMPTS):
+            margin = min(self.method.margin * 2**attempt, 0.5)
+            found = self._search(simulator, attempt, margin, start)
+            if not found.status.converged:
+                return result or self._result(simulator, found, found.point)
+            for point in self._printed(simulator, found.point, margin):
+                result = self._result(simulator, found, point)
+                if result.status.converged:
+                    return result
+            start = found.point
+        assert result is not None
+        return result
+
+    def _search(self, simulator: Simulator, attempt: int, margin: float, start: Array) -> _Found:
+        if isinstance(self.method, TwoPhase):
+            return self._two_phase(attempt, margin, start)
+        return self._screen(simulator, margin, start)
+
+    def _two_phase(self, attempt: int, margin: float, start: Array) -> _Found:
+        assert isinstance(self.method, TwoPhase)
+        method = self.method if attempt == 0 else replace(self.method, starts=1)
+        space = Space(self.space.filled(start), self.space.names)
+        optima = solve_two_phase(self.loop, self.references, space, self.spec.tightened(margin), method)
+        best, values = optima.best, optima.best.parameters
+        stats = {
+            "starts": float(optima.starts),
+            "starts_converged": float(optima.converged),
+            "starts_agreeing": float(optima.agreeing),
+            "optimum": best.stats.get("cost", np.nan),
+            "iterations": best.stats.get("iterations", 0.0),
+        }
+        point = np.array([values.value(n) for n in self.space.names])
+        return _Found(point, best.status, tuple(best.multipliers), stats)
+
+    def _screen(self, simulator: Simulator, margin: float, start: Array) -> _Found:
+        assert isinstance(self.method, Screening)
+        spec = self.spec.tightened(margin)
+        point, count = screen(simulator, self.references, self.space, spec, self.method, start)
+        values = simulator.values(point[None], spec)[0]
+        stats = {"simulations": float(count), "optimum": spec.objective(values)}
+        return _Found(point, _screened(spec, values), _active(self.space, spec, point, values), stats)
+
+    def _printed(self, simulator: Simulator, point: Array, margin: float) -> list[Array]:
+        """Near the point, of the gains as printed, those that keep the limits, the best first."""
+        if self.method.digits is None:
+            return [point]
+        spec = self.spec.tightened(margin / 2)
+        points = self.space.printed(point, self.method.digits, 1)
+        found = simulator.values(points, spec)
+        good = [(spec.objective(v), k) for k, v in enumerate(found) if not spec.violated(v)]
+        ranked = [points[k] for merit, k in sorted(good) if np.isfinite(merit)]
+        return ranked[:TRIED] or [self.space.printed(point, self.method.digits)[0]]
+
+    def _result(self, simulator: Simulator, found: _Found, point: Array) -> TuningResult:
+        import pandas as pd
+
+        parameters = self.space.filled(point)
+        shown = [*SHOWN, "Ripple"] if self.loop.dither_period(parameters) else list(SHOWN)
+        rows = zip(self.references, simulator.table(point, self.spec), strict=True)
+        claimed = pd.DataFrame({_label(r): metrics for r, metrics in rows}).loc[shown]
+        try:
+            certified = evaluate(self.loop, self.references, parameters, band=self.spec.band).loc[shown]
+            status = self._verdict(found, claimed, certified)
+        except ConvergenceError as error:
+            certified = claimed * np.nan
+            status = Status(Code.NOT_CERTIFIED, str(error))
+        deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
+        values = dict(zip(self.space.names, point.tolist(), strict=True))
+        rejected = {} if status.converged else {f"rejected.{n}": v for n, v in values.items()}
+        return TuningResult(
+            self.space.parameters.with_values(values) if status.converged else self.space.parameters,
+            claimed,
+            certified,
+            found.active,
+            status,
+            {**found.stats, **deviation, **rejected},
+            provenance(self.method, *self.spec.weights, *self.spec.limits, *self.references),
+        )
+
+    def _verdict(self, found: _Found, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
+        """Whether the independent simulation confirms the search."""
+        if not found.status.converged:
+            return found.status
+        claim, proof = (worst([read(dict(f[r])) for r in f]) for f in (claimed, certified))
+        for q in self.spec.violated(proof):
+            n, limit = name(q), q.max or 0.0
+            return Status(
+                Code.NOT_CERTIFIED,
+                f"{n} is {proof[n]:.6g}, allowed {limit:.6g}, claimed {claim[n]:.6g}; give {n} more room",
+            )
+        ours, theirs = self.spec.objective(proof), min(self.spec.objective(claim), found.stats["optimum"])
+        if not ours <= theirs * (1 + GRAZING):
+            return Status(
+                Code.NOT_CERTIFIED,
+                f"the objective is {ours:.6g}, claimed {theirs:.6g}: the optimum grazes the band, or does not survive "
+                "rounding; ask for more digits or a wider band",
+            )
+        agreeing = (
+            f", {found.stats['starts_agreeing']:.0f} of {found.stats['starts']:.0f} starts agree"
+            if "starts" in found.stats
+            else ""
+        )
+        return Status(
+            Code.CONVERGED, f"certified objective {ours:.6g}, claimed {self.spec.objective(claim):.6g}{agreeing}"
+        )
+
+
+def _screened(spec: Specification, values: Mapping[str, float]) -> Status:
+    """What a screening achieved: it keeps the limits, or the closest it came."""
+    broken = [f"{name(q)} {values[name(q)]:.6g}, allowed {q.max:.6g}" for q in spec.violated(values)]
+    if broken:
+        return Status(Code.INFEASIBLE, f"the closest found has {'; '.join(broken)}; relax a limit or widen the bounds")
+    if not np.isfinite(spec.objective(values)):
+        return Status(
+            Code.NOT_CONVERGED, "nothing found settles; widen the band or the bounds, or lengthen the horizon"
+        )
+    return Status(Code.CONVERGED)
+
+
+def _active(space: Space, spec: Specification, point: Array, values: Mapping[str, float]) -> tuple[str, ...]:
+    """Limits within 2 % of being reached, gains within 0.1 % of their range of a bound."""
+    limits = [name(q) for q in spec.limits if values[name(q)] >= 0.98 * (q.max or 0.0)]
+    low, up = space.bounds.T
+    near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
+    return (*limits, *(n for n, held in zip(space.names, near, strict=True) if held))

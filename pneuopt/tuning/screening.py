@@ -1,0 +1,158 @@
+"""Search by compiled simulation: differential evolution over ever narrower bands, then a local refinement.
+
+For any loop, friction, clip and sampling included. Directly at a narrow band a search stalls where nothing settles yet;
+what settles within 10 % leads to what settles within 2 %.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from pneuopt.control.reference import Step
+from pneuopt.errors import require
+from pneuopt.requirements import Specification, name
+from pneuopt.tuning.candidates import Simulator, Space
+
+Array = NDArray[np.float64]
+PENALTY = 20.0  # weight of a limit's relative violation, in units of the objective's scale
+LOST = 1e6
+
+
+@dataclass(frozen=True)
+class Screening:
+    """Differential evolution on compiled simulations, then Nelder-Mead from the best.
+
+    Parameters
+    ----------
+    members : int
+        Of the population.
+    generations : int
+        In each stage; there is one for each of `bands`, and two for the band asked for.
+    bands : tuple of float
+        Settling bands of the first stages, as far as they are wider than the one asked for.
+    refinements : int
+        Simulations of the local search.
+    margin : float
+        How much tighter the search's limits are than those asked for.
+    seed : int
+    digits : int, optional
+        Significant digits of the gains handed out; None: all.
+    """
+
+    members: int = 40
+    generations: int = 10
+    bands: tuple[float, ...] = (0.1, 0.05)
+    refinements: int = 300
+    margin: float = 0.015
+    seed: int = 0
+    digits: int | None = 4
+
+    def __post_init__(self) -> None:
+        require(self.members >= 5, f"Screening: members must be at least 5, got {self.members}")
+        require(self.generations >= 1, f"Screening: generations must be at least 1, got {self.generations}")
+        require(self.refinements >= 0, f"Screening: refinements must not be negative, got {self.refinements}")
+        require(0 <= self.margin < 1, f"Screening: margin is a fraction below 1, got {self.margin}")
+        require(self.digits is None or self.digits >= 2, f"Screening: digits must be at least 2, got {self.digits}")
+
+
+def screen(
+    simulator: Simulator,
+    references: Sequence[Step],
+    space: Space,
+    spec: Specification,
+    method: Screening,
+    start: Array,
+) -> tuple[Array, int]:
+    """The best point found, and how many candidates were simulated.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    spec : Specification
+        Already tightened.
+    start : ndarray, shape (n,)
+        A member of the first population.
+    """
+    judge = _Judge(simulator, space, spec, min(r.horizon - r.at for r in references))
+    rng = np.random.default_rng(method.seed)
+    population = _first_population(method.members, space.unit(start), rng)
+    for band in [*(b for b in method.bands if b > spec.band), spec.band, spec.band]:
+        judge.spec = spec.with_band(band)
+        merits = judge(population)
+        for _ in range(method.generations):
+            population, merits = _generation(population, merits, judge, rng)
+    best = population[np.argmin(merits)]
+    return space.draw(_refined(best, judge, method.refinements) if method.refinements else best), judge.count
+
+
+class _Judge:
+    """Merit of points of the unit cube, one a row; counts them."""
+
+    def __init__(self, simulator: Simulator, space: Space, spec: Specification, scale: float) -> None:
+        self._simulator, self._space, self._scale = simulator, space, scale
+        self.spec, self.count = spec, 0
+
+    def __call__(self, unit: Array) -> Array:
+        self.count += len(unit)
+        found = self._simulator.values(self._space.draw(np.clip(unit, 0.0, 1.0)), self.spec)
+        return np.array([merit(values, self.spec, self._scale) for values in found])
+
+
+def _generation(population: Array, merits: Array, judge: _Judge, rng: np.random.Generator) -> tuple[Array, Array]:
+    """One generation of differential evolution: half of the members search about themselves and the best."""
+    m, n = population.shape
+    a, b, c = (rng.permutation(m) for _ in range(3))
+    factor = rng.uniform(0.4, 0.9, (m, 1))
+    best = population[np.argmin(merits)]
+    towards = population + factor * (best - population) + factor * (population[a] - population[b])
+    away = population[c] + factor * (population[a] - population[b])
+    mutant = np.where(rng.random((m, 1)) < 0.5, towards, away)
+    mutant = np.where((mutant < 0) | (mutant > 1), rng.random((m, n)) * 0.5 + 0.5 * population, mutant)
+    kept = rng.random((m, n)) < 0.1
+    kept[np.arange(m), rng.integers(n, size=m)] = False
+    trial = np.where(kept, population, mutant)
+    found = judge(trial)
+    better = found <= merits
+    return np.where(better[:, None], trial, population), np.where(better, found, merits)
+
+
+def _refined(best: Array, judge: _Judge, most: int) -> Array:
+    """Nelder-Mead from a small simplex."""
+    steps = np.where(best < 0.5, 0.03, -0.03) * np.eye(len(best))
+    options = {"maxfev": most, "initial_simplex": np.vstack([best, best + steps]), "xatol": 1e-5, "fatol": 1e-7}
+    settings: Any = {"method": "Nelder-Mead", "bounds": [(0.0, 1.0)] * len(best), "options": options}
+
+    def cost(unit: Array) -> float:
+        return float(judge(unit[None])[0])
+
+    local = minimize(cost, best, **settings)
+    return np.asarray(local.x, dtype=float)
+
+
+def merit(values: dict[str, float], spec: Specification, scale: float) -> float:
+    """The objective and a penalty on what the limits forbid; graded where nothing settles, so that a search can start.
+
+    Parameters
+    ----------
+    values : dict
+        As `Simulator.values` gives them.
+    scale : float
+        The horizon, which stands for the settling time of what never settles [s].
+    """
+    filled = {k: v if np.isfinite(v) else LOST for k, v in values.items()}
+    if not np.isfinite(values.get("SettlingTime", 0.0)):
+        filled["SettlingTime"] = scale * (2 + min(values["Excess"], LOST))
+    excess = [max(0.0, filled[name(q)] / (q.max or 1.0) - 1) for q in spec.limits]
+    return min(spec.objective(filled) + PENALTY * scale * sum(excess), LOST)
+
+
+def _first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
+    """A Latin hypercube with the start in it."""
+    cells = np.array([rng.permutation(members) for _ in start]).T
+    found: Array = (cells + rng.random(cells.shape)) / members
+    found[0] = np.clip(start, 0.0, 1.0)
+    return found

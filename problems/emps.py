@@ -1,0 +1,99 @@
+"""Friction of a real servo axis from its log: the EMPS benchmark, beside the published values; then a speed loop on it.
+
+    python problems/emps.py PATH/emps_identification_1khz.csv [--json FILE] [--out DIR]
+
+Data and published values (IDIM-LS): A. Janot, M. Gautier, M. Brunot, "Data Set and Reference Models of EMPS", Workshop on
+Nonlinear System Identification Benchmarks, 2019. The position is fitted freely over windows of 250 ms that do not overlap,
+their start states estimated too; so RMSEs compare with those of the published parameters under the same rule.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from math import sqrt
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from claims import Claim, arguments, finish, frame
+
+import pneuopt as po
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WINDOW = 0.25  # [s]
+SMOOTHING = 1e-3  # [m/s] over which Coulomb friction turns round
+COLUMNS = {
+    "time": "time_s",
+    "position": "position_m",
+    "force": {"column": "drive_voltage_V", "unit": "V", "scale": "35.15065 N/V"},
+}
+SYMMETRIC = {"load.mass": 95.1089, "load.force": -3.1648, "friction.coulomb": 20.3935, "friction.viscous": 203.5034}
+RMSE_PUBLISHED = {"symmetric": 4.03e-5, "asymmetric": 2.18e-5}
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fit, its RMSE over all windows [m] and the seconds it took."""
+
+    result: po.IdentificationResult
+    rmse: float
+    seconds: float
+
+
+def main(path: Path) -> "pd.DataFrame":
+    windows = po.split(po.read_log(path, columns=COLUMNS), WINDOW)
+    claims = [
+        Claim("windows", len(windows)),
+        Claim("smoothing", SMOOTHING, "m/s", bound="<= 1e-3"),
+    ]
+    symmetric, asymmetric = po.ForceDrive(po.Coulomb()), po.ForceDrive(po.Asymmetric(po.Coulomb()))
+    fit = _fit(symmetric, windows, ("load.*", "friction.coulomb", "friction.viscous"))
+    claims += _beside_published("symmetric", fit, SYMMETRIC) + _quality("symmetric", fit, "<= 3.9e-5")
+    fit = _fit(asymmetric, windows, ("load.mass", "friction.coulomb", "friction.viscous", "friction.*_asymmetry"))
+    claims += _directions(fit) + _quality("asymmetric", fit, "<= 1.90e-5")
+    return frame(claims)
+
+
+def _fit(drive: po.ForceDrive, windows: tuple[po.Experiment, ...], free: tuple[str, ...]) -> Fitted:
+    parameters = drive.parameters.freed(*free)
+    began = time.perf_counter()
+    result = po.identify(drive.system(), windows, parameters, method=po.LeastSquares(segment_time=WINDOW))
+    seconds = time.perf_counter() - began
+    squares, samples = (result.fit["rmse"] ** 2 * result.fit["samples"]).sum(), result.fit["samples"].sum()
+    return Fitted(result, sqrt(squares / samples), seconds)
+
+
+def _beside_published(model: str, fit: Fitted, published: dict[str, float]) -> list[Claim]:
+    estimates = fit.result.estimates
+    rows = []
+    for name, value in published.items():
+        within = f"{value} +- {0.06 * abs(value):.6g}"
+        rows.append(Claim(f"{model}.{name}", estimates["value"][name], estimates["unit"][name], value, within))
+    return rows
+
+
+def _directions(fit: Fitted) -> list[Claim]:
+    """Forward and backward levels; published: Janot et al., asymmetric IDIM-LS."""
+    value = fit.result.parameters.value
+    rows = [Claim("asymmetric.load.mass", value("load.mass"), "kg", 95.1540)]
+    for level, unit, published in (("viscous", "N*s/m", (166.7061, 240.4236)), ("coulomb", "N", (20.1440, 20.6277))):
+        for side, sign, reference in (("forward", 1, published[0]), ("backward", -1, published[1])):
+            found = value(f"friction.{level}") * (1 + sign * value(f"friction.{level}_asymmetry"))
+            rows.append(Claim(f"asymmetric.{level}.{side}", found, unit, reference))
+    return rows
+
+
+def _quality(model: str, fit: Fitted, bound: str) -> list[Claim]:
+    return [
+        Claim(f"{model}.rmse", fit.rmse, "m", RMSE_PUBLISHED[model], bound),
+        Claim(f"{model}.iterations", fit.result.stats["iterations"]),
+        Claim(f"{model}.seconds", fit.seconds, "s"),
+    ]
+
+
+if __name__ == "__main__":
+    parser = arguments(__doc__)
+    parser.add_argument("path", type=Path, help="emps_identification_1khz.csv")
+    options = parser.parse_args()
+    sys.exit(finish(main(options.path), options))

@@ -1,0 +1,70 @@
+"""Coulomb friction of cylinder seals against pressure, from measured logs: one joint fit over four pressures.
+
+    python problems/seal_friction.py DIR/zillen_seal_friction [--json FILE] [--out DIR]
+
+Data: E. Zillen, "3D-printed-pneumatic-actuator", TU Delft thesis data, 2021, CC0-1.0. A piston of 25 mm is moved to and
+fro at 5-15 mm/s with a constant pressure behind it. The published half-ranges of the O-ring's friction (author's method:
+force less pressure x area) stand beside ours, which share one level and one slope against pressure, with a sensor offset a
+log. Speeds are so few that viscous and Stribeck terms cannot be told; they are left out.
+"""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from claims import Claim, arguments, finish, frame
+
+import pneuopt as po
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PUBLISHED = {"oring_1bar": 3.92, "oring_3bar": 5.44, "oring_5bar": 6.92, "oring_7bar": 7.81}  # [N]
+COLUMNS = {
+    "time": "time_s",
+    "position": "position_m",
+    "pressure_a": {"column": "pressure_gauge_Pa", "unit": "Pa(g)"},
+    "force": "force_N",
+}
+FILTER_TIME = 0.5  # [s] the speed is a smoothed derivative of the position
+
+
+def main(folder: Path) -> "pd.DataFrame":
+    logs = [read(folder / f"{name}.csv") for name in PUBLISHED]
+    result = fit(logs)
+    value = result.estimates["value"]
+    claims = []
+    for log in logs:
+        gauge = float(log.trajectory["pressure_a"].mean()) - result.parameters.value("ambient.pressure")
+        level = value["friction.coulomb"] + value["friction.coulomb_pressure_a"] * gauge
+        published = PUBLISHED[log.name]
+        claims.append(Claim(f"{log.name}.half_range", level, "N", published, f"{published} +- {0.1 * published:.4g}"))
+        claims.append(Claim(f"{log.name}.offset", value[f"rig.force_offset[{log.name}]"], "N"))
+    claims += _slope(result)
+    return frame(claims)
+
+
+def read(path: Path) -> po.Experiment:
+    """A log with the speed that the rig imposed."""
+    log = po.differentiate(po.read_log(path, columns=COLUMNS), window=FILTER_TIME)
+    return log.select(["speed", "pressure_a", "force"])
+
+
+def fit(logs: list[po.Experiment]) -> po.IdentificationResult:
+    """One level and slope for all logs, an offset for each."""
+    rig = po.MotionDrive(po.PressureDependent(po.Coulomb(), chambers=("pressure_a",)))
+    p = rig.parameters.with_values({"friction.viscous": 0.0, "friction.smoothing": 1e-3})
+    p = p.freed("friction.coulomb", "friction.coulomb_pressure_a", "rig.force_offset")
+    return po.identify(rig.system(), logs, p.per_log("rig.force_offset"))
+
+
+def _slope(result: po.IdentificationResult) -> list[Claim]:
+    row = result.estimates.loc["friction.coulomb_pressure_a"]
+    return [Claim(f"slope.{name}", float(row[name]) * 1e5, "N/bar") for name in ("value", "ci_low", "ci_high")]
+
+
+if __name__ == "__main__":
+    parser = arguments(__doc__)
+    parser.add_argument("folder", type=Path, help="the folder zillen_seal_friction")
+    options = parser.parse_args()
+    sys.exit(finish(main(options.folder), options))

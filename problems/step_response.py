@@ -1,0 +1,78 @@
+"""A measured voltage-to-speed step without pressures: fit the plant, predict a held-out step, tune the loop.
+
+    python problems/step_response.py [PATH ...] [--json FILE] [--out DIR]
+
+Fitted are gain, natural frequency, damping and dead time, and Coulomb friction where the log shows it: kept if it lowers
+the Bayesian information criterion. The last path is held out and only predicted. Without a path: the generated steps of
+data/step_rig, whose generating values stand in data/generate.py (exact dead time, noise 1 mm/s, quantised to 0.5 mm/s).
+"""
+
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from claims import Claim, arguments, finish, frame
+
+import pneuopt as po
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+DATA = Path(__file__).parents[1] / "data" / "step_rig"
+GENERATED = [DATA / f"{name}.csv" for name in ("step_up_and_back", "step_through_zero", "step_held_out")]
+TRUTH = {  # of data/generate.py
+    "plant.gain": 0.12,
+    "plant.natural_frequency": 22.0,
+    "plant.damping": 0.6,
+    "plant.dead_time": 0.012,
+    "friction.coulomb": 0.35,
+}
+SMOOTHING = 2e-3  # [m/s]
+PADE_ORDER = 3
+
+
+def main(paths: list[Path]) -> "pd.DataFrame":
+    truth = TRUTH if paths == GENERATED else {}
+    *fitted, held_out = (po.read_log(path) for path in paths)
+    plant, result, better = choose(fitted)
+    claims = [Claim("friction.bic_gain", better), Claim("fit.iterations", result.stats["iterations"])]
+    for name, row in result.estimates.iterrows():
+        claims += _beside_truth(str(name), row, truth.get(str(name)))
+    held = po.validate(plant, [held_out], result.parameters).iloc[0]
+    claims.append(Claim("held_out.nrmse", held["nrmse"], "1", None, "<= 0.02"))
+    return frame(claims)
+
+
+def choose(logs: list[po.Experiment]) -> tuple[po.System, po.IdentificationResult, float]:
+    """The plant with or without Coulomb friction, its fit, and by how much friction lowers the BIC."""
+    plain = po.SecondOrder(pade_order=PADE_ORDER).system()
+    rubbing = po.SecondOrder(pade_order=PADE_ORDER, friction=po.Coulomb()).system()
+    without = po.identify(plain, logs, plain.parameters.freed("plant.*"))
+    start = rubbing.parameters.with_values({"friction.smoothing": SMOOTHING})
+    with_friction = po.identify(rubbing, logs, start.freed("plant.*", "friction.coulomb"))
+    better = information(without) - information(with_friction)
+    return (rubbing, with_friction, better) if better > 0 else (plain, without, better)
+
+
+def information(result: po.IdentificationResult) -> float:
+    """Bayesian information criterion, n log(mean square) + k log(n), of a fit to one channel (Schwarz, 1978)."""
+    n = result.fit["samples"].sum()
+    square = (result.fit["rmse"] ** 2 * result.fit["samples"]).sum() / n
+    return float(n * math.log(square) + len(result.estimates) * math.log(n))
+
+
+def _beside_truth(name: str, row: "pd.Series[float]", truth: float | None) -> list[Claim]:
+    """The estimate, and how far the generating value is off in half widths of the 95 % interval."""
+    rows = [Claim(name, row["value"], str(row["unit"]), truth)]
+    if truth is not None:
+        off = abs(truth - row["value"]) / ((row["ci_high"] - row["ci_low"]) / 2)
+        rows.append(Claim(f"{name}.off", off, "1", None, "<= 1"))
+    return rows
+
+
+if __name__ == "__main__":
+    parser = arguments(__doc__)
+    parser.add_argument("paths", type=Path, nargs="*", default=GENERATED, help="logs; the last is held out")
+    options = parser.parse_args()
+    sys.exit(finish(main(options.paths), options))

@@ -1,0 +1,40 @@
+import json
+from pathlib import Path
+
+import pytest
+from claims import Claim, arguments, finish, frame, table
+from matplotlib.figure import Figure
+
+GOOD = Claim("design.settling", 0.203, "s", 0.503, "<= 0.21")
+SHOWN = Claim("design.Kp", 0.3972, "V/V")
+BAD = Claim("design.overshoot", float("nan"), "%", None, "<= 0.02")
+
+
+def test_rows_print_within_80_columns() -> None:
+    text = table(
+        frame([GOOD, SHOWN, BAD, Claim("gain_from_table1.worst_residual", -1.2345e-6, "rad/s", 2e-6, "6.3 +- 0.1")])
+    )
+    assert max(map(len, text.splitlines())) <= 80
+    assert "1 of 3 claims hold; 1 figures shown only" in text
+    assert [line.split()[-1] for line in text.splitlines()[1:4:2]] == ["ok", "FAIL"]
+
+
+def test_nan_keeps_no_bound_and_the_exit_status_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = arguments("").parse_args(["--json", str(tmp_path / "deep" / "rows.json")])
+    assert finish(frame([GOOD, SHOWN]), options) == 0
+    assert finish(frame([GOOD, BAD]), options) == 1
+    written = json.loads((tmp_path / "deep" / "rows.json").read_text())
+    assert list(written[0]) == ["name", "value", "unit", "reference", "bound", "holds"]
+    assert (written[0]["holds"], written[1]["value"], written[1]["holds"]) == (True, None, False)
+    assert "FAIL" in capsys.readouterr().out
+    assert [f.name for f in (tmp_path / "deep").iterdir()] == ["rows.json"]
+
+
+def test_figures_are_made_only_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def figures() -> dict[str, Figure]:
+        return {"empty": Figure()}
+
+    assert finish(frame([GOOD]), arguments("").parse_args([]), figures) == 0
+    assert finish(frame([GOOD]), arguments("").parse_args(["--out", str(tmp_path)]), figures) == 0
+    assert (tmp_path / "empty.png").stat().st_size > 0
+    assert "empty.png" in capsys.readouterr().out
