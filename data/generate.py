@@ -1,4 +1,4 @@
-"""Make the example logs of this folder again, to the byte: `python data/generate.py`. They are generated, not measured.
+"""Make the example logs of this folder: `python data/generate.py`. They are generated, not measured.
 
 Truth is integrated by `pneuopt.simulate` (LSODA, 1e-8); a delay is exact, the sensors add noise and are quantised.
 """

@@ -142,6 +142,7 @@ class Rollout:
         for name, array in (("x0", x0), ("u", u)):
             require(array.shape == expected[name], f"{name}: {array.shape}, expected {expected[name]}", ModelError)
         require(p.shape in ((self.n_parameters,), (m, self.n_parameters)), f"p has shape {p.shape}", ModelError)
+        require(substeps >= 1, f"substeps must be at least 1, got {substeps}", ModelError)
         run = self._run_compiled if self._library is not None else self._run_vm
         return run(x0, u, p, t, h, substeps, states)
 
@@ -162,7 +163,7 @@ class Rollout:
         function = self._library.rollout
         function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int, ctypes.c_longlong] + [ctypes.c_void_p] * 10
         function.restype = None
-        parts = min(self._threads, m)
+        parts = max(1, min(self._threads, m))
         edges = [m * i // parts for i in range(parts + 1)]
         calls = [(a, b, n, substeps, stride, *pointers) for a, b in itertools.pairwise(edges)]
         if len(calls) == 1:
@@ -217,8 +218,8 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
         return lambda *inputs: tuple(
             _shaped(np.array(a), s) for a, s in zip(function.call(list(inputs)), shapes, strict=True)
         )
-    buffers = [np.zeros(max(1, function.nnz_in(i))) for i in range(function.n_in())]
-    results = [np.zeros(max(1, function.nnz_out(i))) for i in range(function.n_out())]
+    buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
+    results = [_buffer(shape) for shape in shapes]
     work = np.zeros(max(1, function.sz_w()))
     sz_arg, sz_res = max(1, function.sz_arg()), max(1, function.sz_res())
     arg = (ctypes.c_void_p * sz_arg)(*(b.ctypes.data for b in buffers))
@@ -229,10 +230,12 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
 
     def evaluate(*inputs: ArrayLike) -> tuple[Array, ...]:
         for buffer, value in zip(buffers, inputs, strict=True):
-            flat = np.asarray(value, dtype=np.float64).ravel(order="F")
-            buffer[: flat.size] = flat
+            try:
+                buffer[...] = value
+            except ValueError as error:
+                raise ModelError(f"an argument does not fit: {error}") from None
         call(*pointers)
-        return tuple(_shaped(r[: s[0] * s[1]].copy(), s) for r, s in zip(results, shapes, strict=True))
+        return tuple([result.copy() for result in results])
 
     evaluate.keep_alive = (library, arg, res, work)  # type: ignore[attr-defined]
     return evaluate
@@ -325,16 +328,24 @@ def _build(source: str) -> ctypes.CDLL | None:
     if cc is None:
         _say_once("no C compiler found: models run in the CasADi VM, with the same answers, about ten times slower")
         return None
-    key = hashlib.sha256("\0".join([source, *FLAGS, _compiler_version(cc), platform.processor(), _cpu()]).encode())
-    binary = cache_directory() / f"{key.hexdigest()[:32]}.so"
     try:
-        if not binary.exists():
-            _compile(cc, source, binary)
-        return ctypes.CDLL(str(binary))
+        identity = [source, *FLAGS, _compiler_version(cc), platform.processor(), _cpu()]
+        name = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:32]
+        return _loaded(cc, source, cache_directory() / f"{name}.so")
     except (OSError, subprocess.SubprocessError) as error:
         detail = getattr(error, "stderr", None) or str(error)
         _say_once(f"compiling with {cc} failed, the CasADi VM runs instead, with the same answers: {detail[:400]}")
         return None
+
+
+def _loaded(cc: str, source: str, binary: Path) -> ctypes.CDLL:
+    if binary.exists():
+        try:
+            return ctypes.CDLL(str(binary))
+        except OSError:  # damaged on the disk; it is built anew
+            log.debug("%s cannot be loaded, compiling it anew", binary)
+    _compile(cc, source, binary)
+    return ctypes.CDLL(str(binary))
 
 
 def _compile(cc: str, source: str, binary: Path) -> None:
@@ -380,6 +391,11 @@ def _unstacked(block: Array, rows: int, m: int, columns: int) -> Array:
 
 def _swapped(array: Array | None) -> Array | None:
     return None if array is None else np.swapaxes(array, -1, -2)
+
+
+def _buffer(shape: tuple[int, int]) -> Array:
+    """Vectors flat, matrices in CasADi's column order."""
+    return np.zeros(shape[0] * shape[1]) if 1 in shape else np.zeros(shape, order="F")
 
 
 def _shaped(array: Array, shape: tuple[int, int]) -> Array:

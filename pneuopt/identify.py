@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import ConvergenceError, LogError, check_known, require
+from pneuopt.checks import check_free, check_logs, measured_outputs
+from pneuopt.errors import ConvergenceError, InputError
 from pneuopt.experiments import Experiment
 from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status
@@ -19,7 +20,7 @@ from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.provenance import provenance
 from pneuopt.simulate import simulate
-from pneuopt.statistics import agreement, confidence_interval, correlation_time, noise_level
+from pneuopt.statistics import agreement, confidence_interval, correlation_time
 from pneuopt.system import Log, Start, System, discretise, names
 from pneuopt.trajectories import Trajectory
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-REFERENCES = ("speed_reference", "position_reference")  # a loop's set-points may stay in a log; no plant reads them
+NOISE_LEVEL = 1.2  # squared residuals a sample, in noise variances, up to which a fit is as good as the noise allows
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class IdentificationResult:
     Attributes
     ----------
     parameters : ParameterSet
-        The given ones with the estimates filled in; a `per_log` parameter keeps its given value here.
+        The system's, with the given values and the estimates; a `per_log` parameter keeps its given value here.
     estimates : DataFrame
         A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
         at_bound, unit, source. No interval at a bound or where the data do not determine the parameter.
@@ -95,8 +96,9 @@ def identify(
         If no candidate start converged; the error's `solution` is the result, marked.
     """
     method = method or LeastSquares()
-    experiments = _checked(system, experiments, parameters)
-    problem = _Problem(system, tuple(experiments), parameters, method)
+    experiments = check_logs(system, experiments, parameters)
+    check_free(experiments, parameters)
+    problem = _Problem(system, tuple(experiments), system.parameters | parameters, method)
     fit, label = _best(problem, method)
     result = problem.result(fit, label)
     if throw and not result.status.converged:
@@ -121,9 +123,9 @@ def validate(system: System, experiments: Sequence[Experiment], parameters: Para
     """
     import pandas as pd
 
-    fixed = parameters.fixed(*parameters.free_names)
+    fixed = system.parameters | parameters.fixed(*parameters.free_names)
     rows = []
-    for experiment in _checked(system, experiments, fixed):
+    for experiment in check_logs(system, experiments, fixed):
         rows += _agreements(system, experiment, _predicted(system, experiment, fixed))
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
@@ -142,8 +144,8 @@ def predict(system: System, experiment: Experiment, parameters: ParameterSet) ->
     Trajectory
         States and outputs on the log's grid.
     """
-    fixed = parameters.fixed(*parameters.free_names)
-    return _predicted(system, _checked(system, [experiment], fixed)[0], fixed)
+    fixed = system.parameters | parameters.fixed(*parameters.free_names)
+    return _predicted(system, check_logs(system, [experiment], fixed)[0], fixed)
 
 
 def _predicted(system: System, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
@@ -172,14 +174,15 @@ class _Problem:
     def unknowns(self) -> ParameterSet:
         """The problem's parameters: the system's, each log's conditions, each log's own copies."""
         own: dict[str, Parameter] = {}
-        shared = dict(self.system.parameters | self.parameters)
+        shared = dict(self.parameters)
         for experiment in self.experiments:
             for name, value in experiment.conditions.items():
                 own[f"{name}[{experiment.name}]"] = Parameter(value, shared[name].unit, source="condition of the log")
         for name in self.parameters.free_names:
             if self.parameters[name].per_log:
                 shared[name] = replace(self.parameters[name], free=False)
-                own |= {f"{name}[{e.name}]": self.parameters[name] for e in self.experiments}
+                unknown = (e.name for e in self.experiments if name not in e.conditions)
+                own |= {f"{name}[{log}]": self.parameters[name] for log in unknown}
         return ParameterSet({**shared, **own})
 
     def transcription(self, candidate: Start) -> Transcription:
@@ -204,7 +207,7 @@ class _Problem:
         return len(h) if math.isinf(samples) else max(2, round(samples))
 
     def _residuals(self, index: int, experiment: Experiment) -> Residuals:
-        outputs = _measured_outputs(self.system, experiment)
+        outputs = measured_outputs(self.system, experiment)
         noise = np.array([experiment.noise[o] for o in outputs])
         return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
 
@@ -215,7 +218,8 @@ class _Problem:
         shared = [n for n in free if n in self.parameters]
         values = {n: solution.parameters.value(n) for n in shared}
         runs = {e.name: t for e, t in zip(self.experiments, solution.trajectories, strict=True)}
-        variance = fit.chi_square / max(1, fit.count - len(free))
+        starts = len(self.experiments) * len(self.system.states)
+        variance = fit.chi_square / max(1, fit.count - len(free) - starts)
         correlated = _correlated(self.system, self.experiments, runs)
         covariance = None if fit.covariance is None else fit.covariance * variance * correlated
         return IdentificationResult(
@@ -231,83 +235,44 @@ class _Problem:
 
 
 def _best(problem: _Problem, method: LeastSquares) -> tuple[Fit, str]:
-    """The first candidate that converges; if none does, the one of least cost, with how many were tried."""
-    candidates = problem.candidates()
+    """The first candidate that converges at the noise's level; else the least cost, once two have found it, or of all.
+
+    A wrong basin can converge, too; its residuals then exceed the noise.
+    """
     fits: list[tuple[Fit, str]] = []
-    for candidate in candidates:
+    for candidate in problem.candidates():
         fit = solve_least_squares(problem.transcription(candidate), method)
-        if fit.solution.status.code in (Code.CONVERGED, Code.INTERRUPTED):
+        if fit.solution.status.code is Code.INTERRUPTED or (
+            fit.solution.status.converged and fit.chi_square <= NOISE_LEVEL * fit.count
+        ):
             return fit, candidate.label
         fits.append((fit, candidate.label))
-    fit, label = min(fits, key=lambda f: f[0].solution.stats["cost"])
+        fits.sort(key=lambda found: _cost(found[0]))
+        if len(fits) > 1 and _are_alike(fits[0][0], fits[1][0]):
+            break
+    fit, label = fits[0]
     status = fit.solution.status
-    told = Status(status.code, f"none of {len(fits)} starts converged; in the best, {status.message}")
-    return replace(fit, solution=replace(fit.solution, status=told)), label
+    if not status.converged and len(fits) > 1:
+        status = Status(status.code, f"none of {len(fits)} starts will do; in the best, {status.message}")
+    return replace(fit, solution=replace(fit.solution, status=status)), label
 
 
-def _checked(system: System, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
-    """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
-    require(len(experiments) > 0, "no experiments: give at least one log", LogError)
-    check_known("parameter", parameters, system.parameters)
-    known = {*names(system.inputs), *names(system.outputs), *REFERENCES}
-    taken: set[str] = set()
-    out = []
-    for number, experiment in enumerate(experiments, 1):
-        name = experiment.name or f"log {number}"
-        name = name if name not in taken else f"{name} ({number})"
-        taken.add(name)
-        _check_channels(system, experiment, name, known)
-        check_known("parameter", experiment.conditions, system.parameters, f"{name}: condition")
-        out.append(replace(experiment, name=name))
-    return _with_noise(system, out)
+def _cost(fit: Fit) -> float:
+    return fit.solution.stats["cost"]
 
 
-def _check_channels(system: System, experiment: Experiment, name: str, known: set[str]) -> None:
-    trajectory = experiment.trajectory
-    for q in system.inputs:
-        needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
-        require(q.name in trajectory, needed + ", ".join(trajectory.names), LogError)
-        missing = np.flatnonzero(~np.isfinite(trajectory[q.name]))
-        where = f"t = {trajectory.t[missing[0]]:g} s" if missing.size else ""
-        require(
-            not missing.size, f"{name}: input {q.name!r} is missing at {where}; cut or fill the log there", LogError
-        )
-    for channel in trajectory:
-        remedy = "leave it out (Experiment.select, or the sidecar's [columns])"
-        reads = ", ".join(sorted(known.difference(REFERENCES)))
-        message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
-        require(channel in known, message, LogError)
-    outputs = ", ".join(names(system.outputs))
-    require(bool(_measured_outputs(system, experiment)), f"{name}: none of the outputs is logged: {outputs}", LogError)
-    require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
-
-
-def _with_noise(system: System, experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Where a log declares no noise: the median over all logs of what the channel shows, for sensors are shared."""
-    found: dict[str, list[float]] = {}
-    for experiment in experiments:
-        for channel in set(_measured_outputs(system, experiment)).difference(experiment.noise):
-            found.setdefault(channel, []).append(noise_level(experiment.trajectory[channel]))
-    pooled = {channel: float(np.nanmedian(levels)) for channel, levels in found.items() if not np.isnan(levels).all()}
-    for channel in found:
-        message = (
-            f"{experiments[0].name}: channel {channel!r} is constant; leave it out, or log a run in which it moves"
-        )
-        require(channel in pooled, message, LogError)
-    return [
-        e.with_noise({n: s for n, s in pooled.items() if n in e.trajectory and n not in e.noise}) for e in experiments
-    ]
-
-
-def _measured_outputs(system: System, experiment: Experiment) -> tuple[str, ...]:
-    inputs = names(system.inputs)
-    return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)
+def _are_alike(best: Fit, second: Fit) -> bool:
+    """Whether both converged, at the same cost."""
+    converged = best.solution.status.converged and second.solution.status.converged
+    return converged and _cost(second) <= 1.001 * _cost(best)
 
 
 def _conditioned(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:
-    """The parameters as they are in one log."""
-    conditions = {n: v for n, v in experiment.conditions.items() if n in parameters}
-    return parameters.with_values(conditions)
+    """The parameters as they are in one log, where its conditions are known and so not free."""
+    try:
+        return parameters.with_values(experiment.conditions).fixed(*experiment.conditions)
+    except InputError as error:
+        raise InputError(f"{experiment.name}: condition {error}") from None
 
 
 def _fit_table(system: System, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
@@ -320,7 +285,7 @@ def _fit_table(system: System, experiments: Sequence[Experiment], runs: Mapping[
 def _agreements(system: System, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
     units = {q.name: q.unit for q in system.outputs}
     rows: list[dict[str, object]] = []
-    for channel in _measured_outputs(system, experiment):
+    for channel in measured_outputs(system, experiment):
         figures = agreement(experiment.trajectory[channel], run[channel])
         noise = experiment.noise[channel]
         rows.append({"log": experiment.name, "channel": channel, **figures, "noise": noise, "unit": units[channel]})
@@ -332,7 +297,7 @@ def _correlated(system: System, experiments: Sequence[Experiment], runs: Mapping
     times = [
         correlation_time(e.trajectory[channel] - runs[e.name][channel])
         for e in experiments
-        for channel in _measured_outputs(system, e)
+        for channel in measured_outputs(system, e)
     ]
     return float(np.mean(times))
 

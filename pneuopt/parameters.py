@@ -50,7 +50,7 @@ class Parameter:
     unit : str
         SI unit.
     log : bool
-        Solvers work on its logarithm; the value and both finite bounds must be positive.
+        Solvers work on its logarithm; the value must be positive, and a bound of zero or below is then no bound.
     free : bool
         It is to be identified or tuned.
     per_log : bool
@@ -112,7 +112,7 @@ class ParameterSet(Mapping[str, Parameter]):
         return len(self._parameters)
 
     def __hash__(self) -> int:
-        return hash(tuple(self._parameters.items()))
+        return hash(frozenset(self._parameters.items()))  # a mapping's equality knows no order
 
     def __or__(self, other: "ParameterSet") -> "ParameterSet":
         """Join two sets; on a shared name the right one wins."""

@@ -20,6 +20,7 @@ def provenance(*options: object) -> dict[str, str]:
         "pneuopt": _version("pneuopt"),
         "casadi": _version("casadi"),
         "numpy": _version("numpy"),
+        "scipy": _version("scipy"),
         "python": platform.python_version(),
         "options": "; ".join(repr(o) for o in options),
     }

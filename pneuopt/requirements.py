@@ -10,13 +10,6 @@ from math import inf
 from pneuopt.errors import require
 
 PERCENT = ("Overshoot", "SteadyStateError")
-SHARE = {
-    "SettlingTime": 0.0,
-    "Overshoot": 1.0,
-    "SteadyStateError": 1.0,
-    "PeakControl": 1 / 300,
-    "MaxSensitivity": 1 / 300,
-}
 
 
 @dataclass(frozen=True)
@@ -134,13 +127,18 @@ class Specification:
         """Whether this kind of requirement is a term or a limit."""
         return self.weight(kind) > 0 or self.limit(kind) < inf
 
-    def tightened(self, margin: float) -> "Specification":
-        """Bands and fractions smaller by `margin`, a share; peak and sensitivity by a 300th of it.
+    def tightened(self, margin: float, peaks: float) -> "Specification":
+        """Bands and fractions smaller by `margin`, a share; peak control and sensitivity by the share `peaks`.
 
         An optimum lies on its limits: found on tightened ones, it keeps those asked for when simulated and printed.
         """
-        limits = tuple(replace(q, max=(q.max or 0.0) * (1 - margin * SHARE[name(q)])) for q in self.limits)
+        room = {"SettlingTime": 0.0, "PeakControl": peaks, "MaxSensitivity": peaks}
+        limits = tuple(replace(q, max=(q.max or 0.0) * (1 - room.get(name(q), margin))) for q in self.limits)
         return replace(self, limits=limits, band=self.band * (1 - margin))
+
+    def without(self, kind: type) -> "Specification":
+        """The same without the limit of this kind, by copy."""
+        return replace(self, limits=tuple(q for q in self.limits if not isinstance(q, kind)))
 
     def with_band(self, band: float) -> "Specification":
         """Another settling band, by copy."""

@@ -109,8 +109,7 @@ class System:
         return [Start({name: self._as_logged(log.measured) for name, log in logs.items()}, {}, "as given")]
 
     def _as_logged(self, measured: Trajectory) -> Trajectory:
-        zero = np.zeros(len(measured))
-        columns = {s.name: np.nan_to_num(measured[s.name]) if s.name in measured else zero for s in self.states}
+        columns = {s.name: _filled(measured, s.name) for s in self.states}
         return Trajectory(measured.t, columns)
 
     def equilibrium(self, u: Mapping[str, float], p: ParameterSet, guess: Mapping[str, float] | None = None) -> Array:
@@ -140,7 +139,9 @@ class System:
         if not np.max(rate, initial=0.0) < 1e-6:
             worst = self.states[int(np.argmax(rate))]
             raise ConvergenceError(
-                f"no equilibrium found: d({worst.name})/dt stays at {rate.max() * worst.nominal:.3g} {worst.unit}/s", x
+                f"no equilibrium found: d({worst.name})/dt stays at {np.max(rate) * worst.nominal:.3g} "
+                f"{worst.unit}/s; give a guess nearer to it",
+                x,
             )
         return x
 
@@ -243,8 +244,10 @@ def define(
     Raises
     ------
     ModelError
-        If the right-hand side leaves out a state's rate or an output.
+        If the right-hand side leaves out a state's rate or an output, or if two signals of a kind share a name.
     """
+    for kind, quantities in (("state", states), ("input", inputs), ("output", outputs)):
+        _check_distinct(kind, quantities)
     t = ca.SX.sym("t")
     x, u = symbols(states), symbols(inputs)
     p = {n: ca.SX.sym(n) for n in parameters}
@@ -256,7 +259,24 @@ def define(
 
 
 def discretise(system: System, substeps: int = 1) -> DiscreteSystem:
-    """Classical Runge-Kutta steps of fourth order (RK4); stable for h < 2.78/|lambda|."""
+    """Classical Runge-Kutta steps of fourth order (RK4); stable for h < 2.78/|lambda|.
+
+    Parameters
+    ----------
+    system : System
+    substeps : int
+        Steps from one sample to the next.
+
+    Returns
+    -------
+    DiscreteSystem
+
+    Raises
+    ------
+    InputError
+        If there are no steps.
+    """
+    require(substeps >= 1, f"substeps must be at least 1, got {substeps}")
     n = {k: system.ode.size1_in(i) for i, k in enumerate("txup")}
     t, h = ca.SX.sym("t"), ca.SX.sym("h")
     x, u, p = (ca.SX.sym(k, n[k]) for k in "xup")
@@ -266,9 +286,7 @@ def discretise(system: System, substeps: int = 1) -> DiscreteSystem:
     k4 = system.ode(t + h, x + h * k3, u, p)[0]
     x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     step = ca.Function("step", [t, h, x, u, p], [x_next, y], ["t", "h", "x", "u", "p"], ["x_next", "y"])
-    return DiscreteSystem(
-        system.states, system.inputs, system.outputs, system.parameters, step, None, max(1, int(substeps))
-    )
+    return DiscreteSystem(system.states, system.inputs, system.outputs, system.parameters, step, None, substeps)
 
 
 def symbols(quantities: Sequence[Quantity]) -> dict[str, ca.SX]:
@@ -298,6 +316,19 @@ def describe(system: System | DiscreteSystem) -> str:
         lines += [f"  {kind}: " + (", ".join(f"{q.name} [{q.unit}]" for q in getattr(system, kind)) or "none")]
     lines += ["  parameters:"] + ["    " + line for line in repr(system.parameters).splitlines()]
     return "\n".join(lines)
+
+
+def _filled(measured: Trajectory, name: str) -> Array:
+    """The channel with its missing samples interpolated; zeros where it was not logged."""
+    column = measured[name] if name in measured else np.full(len(measured), np.nan)
+    known = np.isfinite(column)
+    return np.interp(measured.t, measured.t[known], column[known]) if known.any() else np.zeros(len(measured))
+
+
+def _check_distinct(kind: str, quantities: Sequence[Quantity]) -> None:
+    listed = names(quantities)
+    twice = {n for n in listed if listed.count(n) > 1}
+    require(not twice, f"{kind} {', '.join(map(repr, sorted(twice)))} is declared twice; rename one", ModelError)
 
 
 def _ordered(kind: str, values: Symbols, quantities: Sequence[Quantity]) -> ca.SX:

@@ -39,7 +39,10 @@ class Trajectory:
     def __init__(self, t: ArrayLike, values: Mapping[str, ArrayLike]) -> None:
         grid = _frozen(t)
         require(grid.ndim == 1 and grid.size > 0, f"a trajectory needs a time grid of shape (n,), got {grid.shape}")
-        require(bool(np.all(np.diff(grid) > 0)), "a trajectory's time must increase strictly")
+        require(bool(np.isfinite(grid).all()), "a trajectory's time must be finite")
+        back = np.flatnonzero(np.diff(grid) <= 0)
+        where = f"sample {back[0] + 1} at {grid[back[0] + 1]:g} s follows {grid[back[0]]:g} s" if back.size else ""
+        require(not back.size, f"a trajectory's time must increase strictly; {where}")
         columns = {name: _frozen(column) for name, column in values.items()}
         for name, column in columns.items():
             require(column.shape == grid.shape, f"column {name!r} has shape {column.shape}, time has {grid.shape}")
@@ -89,7 +92,7 @@ class Trajectory:
         return Trajectory(self.t[start:stop], {n: c[start:stop] for n, c in self.values.items()})
 
     def at(self, t: ArrayLike) -> "Trajectory":
-        """Interpolate linearly onto another grid."""
+        """Interpolate linearly onto another grid; before the first and after the last sample, their values stay."""
         grid = np.asarray(t, dtype=float)
         return Trajectory(grid, {n: np.interp(grid, self.t, c) for n, c in self.values.items()})
 

@@ -19,9 +19,10 @@ from pneuopt.errors import ConvergenceError, require
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.provenance import provenance
-from pneuopt.requirements import Requirement, Specification, name, read, specify
+from pneuopt.requirements import PeakControl, Requirement, Specification, name, read, specify
 from pneuopt.simulate import simulate
-from pneuopt.tuning.candidates import Simulator, Space, inputs, measure, spacing, span, worst
+from pneuopt.trajectories import Trajectory
+from pneuopt.tuning.candidates import Simulator, Space, cut, inputs, measure, spacing, span, worst
 from pneuopt.tuning.screening import Screening, screen
 from pneuopt.tuning.two_phase import TwoPhase, is_linear, solve_two_phase
 
@@ -33,6 +34,7 @@ Method = TwoPhase | Screening
 ATTEMPTS = 3  # margins tried, each twice the one before
 TRIED = 5  # printed gains certified at each margin, at most
 GRAZING = 0.01  # relative excess of the certified over the claimed settling time
+PEAKS_EXACT, PEAKS_SCREENED = 1 / 300, 1 / 5  # of the margin, for peak control and sensitivity
 FINE = 4  # points of the certifying record a sample of the search's
 UNFELT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # by a linear loop's average
 SHOWN = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity")
@@ -55,8 +57,8 @@ class TuningResult:
     status : Status
     stats : mapping of str to float
         "seconds", "deviation.SettlingTime" and so on (the largest |claimed - certified|), and the search's own:
-        "starts", "starts_converged", "starts_agreeing", "optimum" (before rounding), "simulations"; where nothing is
-        certified "rejected.pid.Kp" and so on.
+        "margin", "starts", "starts_converged", "starts_agreeing", "optimum" (before rounding), "simulations"; where
+        nothing is certified "rejected.pid.Kp" and so on.
     provenance : mapping of str to str
     """
 
@@ -126,6 +128,7 @@ def tune(
     """
     begun = time.perf_counter()
     spec, steps = specify(minimise, subject_to), [references] if isinstance(references, Step) else list(references)
+    spec = spec.without(PeakControl) if _clip(loop, parameters) <= spec.limit(PeakControl) else spec
     require(len(steps) > 0, "no reference to tune for; give a Step")
     space = span(loop, parameters)
     linear = is_linear(loop)
@@ -149,6 +152,12 @@ def tune(
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status}; the given gains stand", result)
     return result
+
+
+def _clip(loop: ClosedLoop, parameters: ParameterSet) -> float:
+    """The largest command that the controller's own limits let through."""
+    full = loop.parameters | parameters
+    return max(abs(full.value("pid.lower")), abs(full.value("pid.upper"))) if loop.pid.limits else np.inf
 
 
 def evaluate(
@@ -182,19 +191,35 @@ def evaluate(
     return pd.DataFrame({_label(r): _certified(loop, r, parameters, band) for r in steps})
 
 
+def respond(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory:
+    """The response that `evaluate` measures: simulated tightly from rest, on a grid finer than the search's.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    reference : Step
+    parameters : ParameterSet
+
+    Returns
+    -------
+    Trajectory
+        States and outputs of the loop.
+    """
+    run = inputs(loop, reference, spacing(loop, reference))
+    fine = np.linspace(run.t[0], run.t[-1], FINE * (len(run) - 1) + 1)
+    start = loop.initial(parameters, reference=reference.initial)
+    return simulate(loop, run, parameters, initial=start, t_out=fine)
+
+
 def _label(reference: Step) -> str:
     return f"{reference.initial:g} to {reference.final:g}"
 
 
 def _certified(loop: ClosedLoop, reference: Step, parameters: ParameterSet, band: float) -> dict[str, float]:
-    h = spacing(loop, reference)
-    run = inputs(loop, reference, h)
-    fine = np.linspace(run.t[0], run.t[-1], FINE * (len(run) - 1) + 1)
-    start = loop.initial(parameters, reference=reference.initial)
-    response = simulate(loop, run, parameters, initial=start, t_out=fine)
+    response = respond(loop, reference, parameters)
     metrics = measure(loop, parameters, reference, response, band)
     x = np.array([response[q.name][-1] for q in loop.plant.states])
-    robust = margins(loop.open_loop(parameters, x, {loop.command.name: float(response["control"][-1])}))
+    robust = margins(cut(loop, parameters, x, float(response["control"][-1])))
     return metrics | {
         "MaxSensitivity": robust.max_sensitivity if robust.stable else np.inf,
         "GainMargin": robust.gain_margin,
@@ -224,10 +249,12 @@ class _Search:
 
     def run(self) -> TuningResult:
         simulator = Simulator(self.loop, self.references, self.space)
-        result, start = None, self.space.start
+        result, start, counts = None, self.space.start, dict[str, float]()
         for attempt in range(ATTEMPTS):
             margin = min(self.method.margin * 2**attempt, 0.5)
             found = self._search(simulator, attempt, margin, start)
+            counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
+            found = replace(found, stats={**found.stats, **counts, "margin": margin})
             if not found.status.converged:
                 return result or self._result(simulator, found, found.point)
             for point in self._printed(simulator, found.point, margin):
@@ -247,7 +274,7 @@ class _Search:
         assert isinstance(self.method, TwoPhase)
         method = self.method if attempt == 0 else replace(self.method, starts=1)
         space = Space(self.space.filled(start), self.space.names)
-        optima = solve_two_phase(self.loop, self.references, space, self.spec.tightened(margin), method)
+        optima = solve_two_phase(self.loop, self.references, space, self._tightened(margin), method)
         best, values = optima.best, optima.best.parameters
         stats = {
             "starts": float(optima.starts),
@@ -259,9 +286,15 @@ class _Search:
         point = np.array([values.value(n) for n in self.space.names])
         return _Found(point, best.status, tuple(best.multipliers), stats)
 
+    def _tightened(self, margin: float) -> Specification:
+        """An exact problem needs next to no room on peaks; a screening's coarser simulation needs some."""
+        return self.spec.tightened(
+            margin, margin * (PEAKS_EXACT if isinstance(self.method, TwoPhase) else PEAKS_SCREENED)
+        )
+
     def _screen(self, simulator: Simulator, margin: float, start: Array) -> _Found:
         assert isinstance(self.method, Screening)
-        spec = self.spec.tightened(margin)
+        spec = self._tightened(margin)
         point, count = screen(simulator, self.references, self.space, spec, self.method, start)
         values = simulator.values(point[None], spec)[0]
         stats = {"simulations": float(count), "optimum": spec.objective(values)}
@@ -271,7 +304,7 @@ class _Search:
         """Near the point, of the gains as printed, those that keep the limits, the best first."""
         if self.method.digits is None:
             return [point]
-        spec = self.spec.tightened(margin / 2)
+        spec = self._tightened(margin / 2)
         points = self.space.printed(point, self.method.digits, 1)
         found = simulator.values(points, spec)
         good = [(spec.objective(v), k) for k, v in enumerate(found) if not spec.violated(v)]

@@ -88,7 +88,7 @@ class Tuned(Protocol):
 
     @property
     def certified(self) -> "pd.DataFrame":
-        """A row a reference, a column a metric."""
+        """A row a metric, a column a reference."""
         ...
 
     @property
@@ -129,7 +129,8 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     minimise, subject_to = _minimise(said, path), _limits(said, loop, path)
     if minimise:
         _checked(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
-    return Tuning(loop, _references(said, loop, path), _parameters(said, loop, path), minimise, subject_to)
+    parameters = _parameters(said, loop, path)
+    return Tuning(loop, _references(said, loop, path), parameters, minimise, subject_to)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: Tuned) -> None:
@@ -155,7 +156,7 @@ def write_tuned(path: str | Path, source: str | Path, result: Tuned) -> None:
     status = {"code": result.status.code.value, "message": result.status.message}
     if result.status.converged:
         _fill(document, result.parameters, source)
-        rows = result.certified.to_dict(orient="index")
+        rows = result.certified.to_dict(orient="dict")
         document["certified"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
     else:
         status["gains"] = f"as in {Path(source).name}: not tuned"
@@ -255,7 +256,12 @@ def _references(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Ste
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
     require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
-    return tuple(_step(e, loop.feedback.unit, f"{path}: [[reference]] {k}") for k, e in enumerate(entries, 1))
+    steps = [_step(e, loop.feedback.unit, f"{path}: [[reference]] {k}") for k, e in enumerate(entries, 1)]
+    ends = [(s.initial, s.final) for s in steps]
+    require(
+        len(set(ends)) == len(ends), f"{path}: two references step between the same values; tables tell them by that"
+    )
+    return tuple(steps)
 
 
 def _step(entry: Mapping[str, Any], unit: str, where: str) -> Step:
@@ -291,7 +297,7 @@ def _limits(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Require
         entry = given if isinstance(given, dict) else {"max": given}
         check_known("key", entry, ("max", *_band_key(key)), spot)
         require("max" in entry, f"{spot} says no max")
-        most = _value(entry, "max", units.get(key, "1"), spot)
+        most = read_value(entry["max"], units.get(key, "1"), where=f"{spot} max" if entry is given else spot)
         found.append(_requirement(key, entry, {"max": most}, spot))
     return tuple(found)
 

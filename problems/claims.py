@@ -14,11 +14,25 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from pneuopt.parameters import ParameterSet
+
 COLUMNS = ("name", "value", "unit", "reference", "bound", "holds")
+KNOBS = {n: f"pid.{n}" for n in ("Kp", "Ki", "Kd", "Tf")}
+KNOBS |= {f"dither_{n}": f"dither.{n}" for n in ("amplitude", "offset")}
+METRICS = {
+    "settling_time": ("SettlingTime", "s"),
+    "overshoot": ("Overshoot", "%"),
+    "steady_state_error": ("SteadyStateError", "%"),
+    "peak_control": ("PeakControl", ""),
+    "max_sensitivity": ("MaxSensitivity", "1"),
+    "ripple": ("Ripple", ""),
+}
 COMPARISONS: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 
 
@@ -73,6 +87,31 @@ def frame(claims: Iterable[Claim]) -> "pd.DataFrame":
 
     rows = [asdict(claim) | {"holds": claim.holds} for claim in claims]
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "reference": float})
+
+
+def design(
+    name: str, parameters: "ParameterSet", certified: "pd.DataFrame", bounds: Mapping[str, str] | None = None
+) -> list[Claim]:
+    """A tuned loop's rows: its gains and dither, and its certified metrics, the worst over the references.
+
+    Parameters
+    ----------
+    name : str
+    parameters : ParameterSet
+    certified : DataFrame
+        Of `tune` or `evaluate`: a row a metric, a column a reference.
+    bounds : mapping of str to str, optional
+        By row, as in "settling_time".
+    """
+    bounds, rows = bounds or {}, []
+    for row, parameter in KNOBS.items():
+        if parameter in parameters:
+            rows.append(Claim(f"{name}.{row}", parameters.value(parameter), parameters[parameter].unit))
+    for row, (metric, unit) in METRICS.items():
+        if metric in certified.index:
+            worst = float(np.max(certified.loc[metric].to_numpy(dtype=float)))
+            rows.append(Claim(f"{name}.{row}", worst, unit, None, bounds.get(row, "")))
+    return rows
 
 
 def table(rows: "pd.DataFrame") -> str:

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 
 import casadi as ca
 
+from pneuopt.errors import ModelError, require
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
@@ -185,6 +186,12 @@ class PressureDependent:
 
     base: FrictionModel
     chambers: tuple[str, ...] = ("pressure_a", "pressure_b")
+
+    def __post_init__(self) -> None:
+        message = (
+            f"{self.base} has no Coulomb level that could rise with pressure; take Coulomb(), Stribeck() or LuGre()"
+        )
+        require("coulomb" in self.base.parameters, message, ModelError)
 
     @property
     def states(self) -> tuple[Quantity, ...]:

@@ -22,6 +22,8 @@ STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the or
 FILTER_TIME = 0.031  # [s] window of the Savitzky-Golay filter, order 3
 SLIDING_SPEED = 4e-3  # [m/s] slower samples say nothing of sliding friction
 STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recipe
+LEAST_EXCESS = 0.03  # of static friction over Coulomb's, as a fraction of it (step 2)
+SLOW_SPEED = 1e-2  # [m/s] below it friction comes near its static level, and bristles still bend
 
 
 def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -36,6 +38,8 @@ def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
     for name, (measured, parameters) in logs.items():
         position, speed, acceleration = motion(measured)
         inertia = {"load.mass": acceleration, "load.force": np.ones(len(measured))}
+        if "load.stiffness" in parameters:
+            inertia["load.stiffness"] = position - parameters.value("load.rest_position")
         states = {"position": position, "speed": speed}
         rows[name] = _Rows(measured, parameters, speed, measured["force"], inertia, states)
     return _candidates(rows)
@@ -94,17 +98,29 @@ def _candidates(logs: Mapping[str, _Rows]) -> Sequence[Start]:
     parameters = next(iter(logs.values())).parameters
     searched = "friction.stribeck_velocity" in parameters.free_names
     given = parameters.value("friction.stribeck_velocity") if "friction.stribeck_velocity" in parameters else np.inf
+    if searched:
+        bounds = parameters["friction.stribeck_velocity"]
+        tried = np.clip(STRIBECK_VELOCITIES, bounds.lower, bounds.upper).tolist()
     starts = []
-    for velocity in STRIBECK_VELOCITIES if searched else (given,):
+    for velocity in dict.fromkeys(tried) if searched else (given,):
         values = _regress(logs, parameters, velocity)
         if searched:
-            bounds = parameters["friction.stribeck_velocity"]
-            values["friction.stribeck_velocity"] = float(np.clip(velocity, bounds.lower, bounds.upper))
+            values |= _named("friction.stribeck_velocity", velocity, logs)
         label = f"stribeck velocity {velocity:g} m/s" if searched else "equation error"
         bristles = _bristles(logs, values)
         states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
         starts.append(Start(states, values, label))
     return starts
+
+
+def _named(name: str, value: float, logs: Mapping[str, _Rows]) -> dict[str, float]:
+    """A start value, for each log where the parameter is each log's own."""
+    per_log = any(rows.parameters[name].per_log for rows in logs.values())
+    return (
+        {f"{name}[{log}]": value for log, rows in logs.items() if rows.parameters[name].free}
+        if per_log
+        else {name: value}
+    )
 
 
 def _regress(logs: Mapping[str, _Rows], parameters: ParameterSet, velocity: float) -> dict[str, float]:
@@ -116,15 +132,18 @@ def _regress(logs: Mapping[str, _Rows], parameters: ParameterSet, velocity: floa
     A = np.vstack([np.column_stack([columns.get(n, np.zeros(len(y))) for n in free]) for columns, y in parts])
     y = np.concatenate([y for _, y in parts])
     known = np.isfinite(y)
-    sliding = known & (np.abs(np.concatenate([r.speed for r in logs.values()])) > SLIDING_SPEED)
+    speed = np.abs(np.concatenate([rows.speed for rows in logs.values()]))
+    sliding = known & (speed > SLIDING_SPEED)
     rows = sliding if np.count_nonzero(sliding) > 10 * len(free) else known
-    bases = [parameters[n.split("[")[0]] for n in free]
-    lower, upper = _bounds(free, bases, float(np.median(np.abs(y[rows]))))
+    bases = {n: parameters[n.split("[")[0]] for n in free}
+    lower, upper = _bounds(bases, float(np.median(np.abs(y[rows]))))
     x = _robust(A[rows], y[rows], lower, upper)
     values = dict(zip(free, x.tolist(), strict=True))
-    if "friction.static" in values:
-        values["friction.static"] += values.get("friction.coulomb", parameters.value("friction.coulomb"))
-    return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in zip(free, bases, strict=True)}
+    for name in [n for n in free if n.startswith("friction.static")]:
+        own = name.replace("static", "coulomb")
+        coulomb = values.get(own, values.get("friction.coulomb", parameters.value("friction.coulomb")))
+        values[name] = coulomb + max(values[name], LEAST_EXCESS * coulomb)
+    return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}
 
 
 def _log_columns(name: str, rows: _Rows, velocity: float) -> tuple[dict[str, Array], Array]:
@@ -132,8 +151,12 @@ def _log_columns(name: str, rows: _Rows, velocity: float) -> tuple[dict[str, Arr
     p = rows.parameters
     columns = {n: c for n, c in {**rows.columns, **_friction_columns(rows, velocity)}.items() if n in p}
     known = {n: p.value(n) for n in columns}
-    if "friction.static" in known:
+    if "friction.static" in columns:
         known["friction.static"] -= p.value("friction.coulomb")
+        if p["friction.coulomb"].free and not p["friction.static"].free:
+            # the level is known, so what is above Coulomb's shrinks as Coulomb's grows
+            known["friction.static"] = p.value("friction.static")
+            columns["friction.coulomb"] = columns["friction.coulomb"] - columns["friction.static"]
     target = rows.force - sum(
         (known[n] * c for n, c in columns.items() if not p[n].free), start=np.zeros(len(rows.force))
     )
@@ -166,12 +189,13 @@ def _robust(A: Array, y: Array, lower: Array, upper: Array) -> Array:
     return x
 
 
-def _bounds(free: Sequence[str], bases: Sequence[Parameter], level: float) -> tuple[Array, Array]:
+def _bounds(bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]:
     """Of the regression: the parameters' own, and floors that keep friction positive (NUMERICS section 3, step 2)."""
-    floors = {"friction.coulomb": 0.05 * level, "friction.static": 0.0015 * level, "friction.viscous": 0.0}
-    given = [0.0 if n == "friction.static" else p.lower for n, p in zip(free, bases, strict=True)]
-    lower = np.array([max(floors.get(n, -np.inf), lo) for n, lo in zip(free, given, strict=True)])
-    upper = np.array([max(p.upper, lo + 1e-9) for p, lo in zip(bases, lower, strict=True)])
+    floors = {"friction.coulomb": 0.05 * level, "friction.viscous": 0.0}
+    own = {n: n.split("[")[0] for n in bases}
+    given = [0.0 if own[n] == "friction.static" else p.lower for n, p in bases.items()]
+    lower = np.array([max(floors.get(own[n], -np.inf), lo) for n, lo in zip(bases, given, strict=True)])
+    upper = np.array([max(p.upper, lo + 1e-9) for p, lo in zip(bases.values(), lower, strict=True)])
     return lower, upper
 
 
@@ -189,24 +213,25 @@ def _bristles(logs: Mapping[str, _Rows], values: dict[str, float]) -> dict[str, 
     if stiffness.free:
         slope = _presliding_slope(logs, friction, 0.6 * number("friction.coulomb"))
         low, high = max(STIFFNESS_RANGE[0], stiffness.lower), min(STIFFNESS_RANGE[1], stiffness.upper)
-        values["friction.bristle_stiffness"] = float(np.clip(slope, low, high))
-    limit = number("friction.static") / number("friction.bristle_stiffness")
-    deflections = {
-        n: (friction[n] - number("friction.viscous") * rows.speed) / number("friction.bristle_stiffness")
-        for n, rows in logs.items()
-    }
+        found = float(np.clip(slope, low, high))
+        values |= _named("friction.bristle_stiffness", found, logs)
+    else:
+        found = stiffness.value
+    limit = number("friction.static") / found
+    deflections = {n: (friction[n] - number("friction.viscous") * rows.speed) / found for n, rows in logs.items()}
     return {n: {"friction.bristle": np.clip(z, -limit, limit)} for n, z in deflections.items()}
 
 
 def _presliding_slope(logs: Mapping[str, _Rows], friction: Mapping[str, Array], level: float) -> float:
-    """sum(dF/dt v) / sum(v^2) over slow samples below the sliding level [N/m]; zero where there are none."""
+    """Robust slope of dF/dt over v in slow samples below the sliding level [N/m]; zero where there are none."""
     rate, speed = [], []
     for n, rows in logs.items():
-        presliding = (np.abs(rows.speed) < 0.01) & (np.abs(friction[n]) < level)
+        presliding = (np.abs(rows.speed) < SLOW_SPEED) & (np.abs(friction[n]) < level)
         rate.append(np.gradient(friction[n], rows.measured.t)[presliding])
         speed.append(rows.speed[presliding])
     v = np.concatenate(speed)
-    return float(np.concatenate(rate) @ v / max(float(v @ v), 1e-300))
+    # a step of the force, or the log's edge, is no presliding: the robust weights take it out
+    return float(_robust(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0]) if v.size else 0.0
 
 
 def _friction_force(name: str, rows: _Rows, values: Mapping[str, float]) -> Array:

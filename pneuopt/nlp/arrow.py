@@ -13,6 +13,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, c
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 STATE_FLOOR = 1e-6  # on D's diagonal (scaled states): a state that no data reach stays put, the optimum does not move
 
 
@@ -98,18 +99,32 @@ class Arrow:
 
 
 def _solve_scaled(matrix: Array, right: Array) -> Array:
-    """Solve a positive definite system, scaled to a unit diagonal so that units do not decide its rank."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    factor = cho_factor(matrix * np.outer(scale, scale), check_finite=False)
+    scaled, scale = _unit_diagonal(matrix)
+    factor = cho_factor(scaled, check_finite=False)
     return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
 
 
 def scaled_inverse(matrix: Array) -> Array | None:
     """Inverse of a positive definite matrix, or None where it is singular to working precision."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    scaled = matrix * np.outer(scale, scale)
     if not matrix.size:
         return matrix
+    scaled, scale = _unit_diagonal(matrix)
     if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] < 1e-12:
         return None
     return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))
+
+
+def indistinct(matrix: Array) -> Indices:
+    """Positions that make up the weakest direction of a matrix scaled to a unit diagonal."""
+    scaled, _ = _unit_diagonal(matrix)
+    if not np.all(np.isfinite(scaled)):
+        return np.arange(len(matrix))
+    weakest = np.abs(np.linalg.eigh(scaled)[1][:, 0])
+    return np.flatnonzero(weakest > 0.1 * weakest.max())
+
+
+def _unit_diagonal(matrix: Array) -> tuple[Array, Array]:
+    """The matrix scaled so that units do not decide its rank, and the scales."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        return np.asarray(matrix * np.outer(scale, scale)), scale

@@ -48,6 +48,11 @@ class Equations:
     largest_gap: float
     count: int
 
+    @property
+    def gap_share(self) -> float:
+        """Part of the cost that the gaps carry, 0 to 1."""
+        return 1 - self.chi_square / (2 * self.cost) if 0 < self.cost < math.inf else 0.0
+
     def covariance(self, keep: Mask) -> Array | None:
         """Covariance of the parameters (own units, unit noise): the sandwich over true data noise only.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.nlp.arrow import Step
+from pneuopt.nlp.arrow import Step, indistinct, scaled_inverse
 from pneuopt.nlp.equations import Equations, normal_equations, reconnected
 from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for, tightness
 from pneuopt.nlp.status import Code, Solution, Status
@@ -21,6 +21,9 @@ from pneuopt.nlp.transcription import Transcription
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
+REFINEMENTS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
+MOST_REFINED = 8  # how far a stage may refine the start's integration steps
+MOST_GAP_SHARE = 0.05  # of the cost: the gaps' residuals above it mean that they take up what the model cannot
 UNFELT = 1e-6  # squared residuals that an e-fold change of a log parameter has to move, or it stays where it is
 
 
@@ -54,10 +57,10 @@ class LeastSquares:
     segment_time : float
         Time between two shooting nodes [s]; math.inf for one segment a log.
     substeps : int, optional
-        Integration steps a sample; default: from the stiffness along the start, h |lambda| <= 1.4 a step, and half that
-        in the last stage.
+        Integration steps a sample; default: from the stiffness at the start of each stage, h |lambda| <= 1.4 a step,
+        half that in the last stage, and finer until halving the steps moves no estimate.
     tolerance : float
-        Of the last undamped parameter step, in standard deviations.
+        Of the last undamped parameter step, in the parameter's standard deviations.
     kinematic : float
         States whose rate holds no free parameter keep their gaps this much smaller.
     progress : callable, optional
@@ -142,117 +145,160 @@ class _Search:
         self.q = np.array([p.value for p in parameters.values()])
         self.log = np.array([p.log for p in free], dtype=bool)
         self.lower, self.upper = (self._searched(np.array([getattr(p, b) for p in free])) for b in ("lower", "upper"))
-        self.iterations = 0
-        self.start = start_nodes(segments)
-        self.substeps = method.substeps or substeps_for(segments, self.start, self.q)
         self.tightness = tightness(segments, method.kinematic)
+        self.iterations, self.stage = 0, method.stages[0]
+        nodes = start_nodes(segments)
+        self.substeps = self.coarsest = method.substeps or substeps_for(segments, nodes, self.q)
+        z = np.clip(self._searched(self.q[segments.transcription.free]), self.lower, self.upper)
+        self.current = self._evaluate(nodes, z)
 
     def solve(self) -> Fit:
         began = time.perf_counter()
-        z = np.clip(self._searched(self.q[self.segments.transcription.free]), self.lower, self.upper)
-        current = self._evaluate(self.start, z, self.method.stages[0])
-        status = Status(Code.DIVERGED, "the model is not finite at the start; check values and units")
-        stage = self.method.stages[0]
         try:
-            for stage in self.method.stages:
-                current = self._evaluate(current.nodes, current.z, stage)
-                if not math.isfinite(current.cost):
-                    break
-                current = self._run_stage(current, stage)
-                status = self._judge(current)
+            status = self._run_stages()
         except KeyboardInterrupt:
             status = Status(Code.INTERRUPTED, "the best iterate so far; run again for an answer")
-        return self._fit(current, stage, status, time.perf_counter() - began)
+        return self._fit(status, time.perf_counter() - began)
 
-    def _run_stage(self, current: _Iterate, stage: Stage) -> _Iterate:
-        is_last = stage is self.method.stages[-1]
+    def _run_stages(self) -> Status:
+        for stage in self.method.stages:
+            self.stage, self.substeps = stage, self._steps_of(stage)
+            self.current = self._evaluate(self.current.nodes, self.current.z)
+            if not math.isfinite(self.current.cost):
+                return Status(Code.DIVERGED, "the model is not finite at the start; check values and units")
+            self._run_stage()
+        status = self._judge(self.current)
+        return status if self.method.substeps else self._refine(status)
+
+    def _steps_of(self, stage: Stage) -> int:
+        """Integration steps a sample of a stage: from the stiffness where it begins, for the start may mislead."""
+        if self.method.substeps:
+            return self.method.substeps * stage.refine
+        needed = substeps_for(self.segments, self.current.nodes, self._values(self.current.z))
+        return min(max(self.coarsest, needed), MOST_REFINED * self.coarsest) * stage.refine
+
+    def _refine(self, status: Status) -> Status:
+        """Halve the integration steps until that moves no estimate."""
+        for _ in range(REFINEMENTS):
+            self.substeps *= 2
+            finer = self._evaluate(self.current.nodes, self.current.z)
+            if not math.isfinite(finer.cost) or self._judge(finer).converged:
+                self.substeps //= 2
+                return status
+            self.current = finer
+            self._run_stage()
+            status = self._judge(self.current)
+        return status
+
+    def _run_stage(self) -> None:
+        is_last = self.stage is self.method.stages[-1]
         damping = 1e-3
-        for _ in range(stage.iterations):
+        for _ in range(self.stage.iterations):
             self.iterations += 1
-            trial, damping = self._step(current, damping, stage)
+            trial, damping = self._step(self.current, damping)
             if trial is None:
                 break
-            drop = (current.cost - trial.cost) / max(current.cost, 1e-300)
-            moved = float(np.max(np.abs(trial.z - current.z) / (1e-3 + np.abs(current.z)), initial=0.0))
-            current = trial
-            self._report(current, stage)
-            if drop < (1e-6 if is_last else 1e-3) and (not is_last or moved < 1e-4):
+            before, self.current = self.current, trial
+            drop = (before.cost - trial.cost) / max(before.cost, 1e-300)
+            moved = float(np.max(np.abs(trial.z - before.z) / (1e-3 + np.abs(before.z)), initial=0.0))
+            self._report()
+            if drop < (1e-8 if is_last else 1e-3) and (not is_last or moved < 1e-4):
                 break
-        return current
 
-    def _step(self, current: _Iterate, damping: float, stage: Stage) -> tuple[_Iterate | None, float]:
+    def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
         """Shorten the step until the cost falls; None where ten tries do not help."""
         keep = self._movable(current)
         for _ in range(10):
             solved = current.equations.arrow.solve(damping, keep)
             if solved is not None and np.max(np.abs(solved.parameters[self.log]), initial=0.0) <= 2:
-                for trial in self._trials(current, solved, stage):
+                for trial in self._trials(current, solved):
                     if trial.cost < current.cost:
                         return trial, damping * 0.1 if damping > 1e-9 else 0.0
             damping = max(damping * 10, 1e-9)
         return None, damping
 
-    def _trials(self, current: _Iterate, step: Step, stage: Stage) -> Iterator[_Iterate]:
+    def _trials(self, current: _Iterate, step: Step) -> Iterator[_Iterate]:
         """The step with its gaps corrected to second order (curved valleys of tight gaps), then the step as it is."""
         z = np.clip(current.z + step.parameters, self.lower, self.upper)
-        nodes = current.nodes + step.nodes * self.segments.nominal
+        moved = z - current.z
+        # where a bound cuts the parameters' step short, the nodes follow the shorter one
+        shift = step.nodes + step.eliminated @ (step.parameters - moved)
+        nodes = current.nodes + shift * self.segments.nominal
         if self.segments.linked.any():
-            end = self.segments.run(nodes, self._values(z), self.substeps * stage.refine, sensitivities=False).x_end
-            shifted = reconnected(self.segments, current.equations, step.nodes, z - current.z, nodes, end)
+            end = self.segments.run(nodes, self._values(z), self.substeps, sensitivities=False).x_end
+            with np.errstate(all="ignore"):
+                shifted = reconnected(self.segments, current.equations, shift, moved, nodes, end)
             if np.isfinite(shifted).all():
-                yield self._evaluate(shifted, z, stage)
-        yield self._evaluate(nodes, z, stage)
+                yield self._evaluate(shifted, z)
+        yield self._evaluate(nodes, z)
 
-    def _evaluate(self, nodes: Array, z: Array, stage: Stage) -> _Iterate:
-        sigma = stage.gap * self.tightness
+    def _evaluate(self, nodes: Array, z: Array) -> _Iterate:
+        sigma = self.stage.gap * self.tightness
         chain = np.where(self.log, np.exp(np.where(self.log, z, 0.0)), 1.0)
-        equations = normal_equations(self.segments, nodes, self._values(z), chain, sigma, self.substeps * stage.refine)
+        with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
+            equations = normal_equations(self.segments, nodes, self._values(z), chain, sigma, self.substeps)
         return _Iterate(nodes, z, equations)
 
     def _movable(self, current: _Iterate) -> Mask:
         """Parameters that are neither pressed against a bound nor without any effect on the residuals here."""
-        gradient, felt = current.equations.arrow.gradient, np.diag(current.equations.arrow.corner)
-        return (felt > np.where(self.log, UNFELT, 0.0)) & ~(
+        gradient = current.equations.arrow.gradient
+        return self._felt(current) & ~(
             ((current.z <= self.lower) & (gradient > 0)) | ((current.z >= self.upper) & (gradient < 0))
         )
 
+    def _felt(self, current: _Iterate) -> Mask:
+        """Parameters that have an effect on the residuals here."""
+        return np.asarray(np.diag(current.equations.arrow.corner) > np.where(self.log, UNFELT, 0.0))
+
+    def _at_bound(self, current: _Iterate) -> Mask:
+        return np.asarray((current.z <= self.lower) | (current.z >= self.upper))
+
     def _judge(self, current: _Iterate) -> Status:
         """Converged means that a full undamped step would move nothing that the data can tell apart."""
-        keep = self._movable(current)
-        solved = current.equations.arrow.solve(0.0, keep)
-        if solved is None:
-            return Status(Code.NOT_CONVERGED, "the data do not determine all free parameters; fix some or log more")
-        names = self.segments.transcription.parameters.free_names
-        deviation = 1 / np.sqrt(np.maximum(np.diag(solved.schur), 1e-300))
-        step = np.where(keep, np.abs(solved.parameters) / deviation, 0.0)
-        worst = int(np.argmax(step)) if len(step) else 0
-        noise = max(1.0, math.sqrt(current.equations.chi_square / max(1, current.equations.count)))
-        if len(step) and step[worst] > self.method.tolerance * noise:
-            return Status(
-                Code.NOT_CONVERGED,
-                f"{names[worst]} would still move by {step[worst]:.2g} standard deviations; "
-                "try more iterations, other start values, or fix a parameter",
-            )
-        gap = current.equations.largest_gap
+        names = np.array(self.segments.transcription.parameters.free_names, dtype=object)
+        keep, equations = self._movable(current), current.equations
+        idle = ~self._felt(current) & ~self._at_bound(current)
+        if idle.any():
+            told = f"the data do not feel {' and '.join(names[idle])}; fix it, or log a run that does"
+            return Status(Code.NOT_CONVERGED, told)
+        solved = equations.arrow.solve(0.0, keep)
+        schur = None if solved is None else solved.schur[np.ix_(keep, keep)]
+        inverse = None if schur is None else scaled_inverse(schur)
+        if solved is None or inverse is None:
+            alike = names[keep] if schur is None else names[keep][indistinct(schur)]
+            told = f"the data do not determine {' and '.join(alike)}; fix one, or log a run that tells them apart"
+            return Status(Code.NOT_CONVERGED, told)
+        step = np.abs(solved.parameters[keep]) / np.sqrt(np.diag(inverse))
+        noise = max(1.0, math.sqrt(equations.chi_square / max(1, equations.count)))
+        if np.max(step, initial=0.0) > self.method.tolerance * noise:
+            worst = int(np.argmax(step))
+            told = f"{names[keep][worst]} would still move by {step[worst] / noise:.2g} standard deviations; "
+            return Status(Code.NOT_CONVERGED, told + "try more iterations, other start values, or fix a parameter")
+        gap = equations.largest_gap
+        if equations.gap_share > MOST_GAP_SHARE:
+            told = f"the gaps between segments carry {equations.gap_share:.0%} of the cost, the largest is {gap:.1g} "
+            remedy = "of a state's nominal size: the model cannot follow the log; check its terms, inputs and units"
+            return Status(Code.NOT_CONVERGED, told + remedy)
         return Status(Code.CONVERGED, f"{self.iterations} iterations, largest gap {gap:.1g} of a state's nominal size")
 
-    def _fit(self, current: _Iterate, stage: Stage, status: Status, seconds: float) -> Fit:
-        transcription, equations = self.segments.transcription, current.equations
+    def _fit(self, status: Status, seconds: float) -> Fit:
+        transcription, current, equations = self.segments.transcription, self.current, self.current.equations
         q = self._values(current.z)
         free = transcription.parameters.free_names
         values = dict(zip(free, q[transcription.free].tolist(), strict=True))
-        substeps = self.substeps * stage.refine
-        trajectories = self.segments.trajectories(current.nodes, q, substeps)
+        trajectories = self.segments.trajectories(current.nodes, q, self.substeps)
         stats = {
             "iterations": float(self.iterations),
             "seconds": seconds,
             "cost": equations.cost,
-            "substeps": float(substeps),
+            "substeps": float(self.substeps),
             "largest_gap": equations.largest_gap,
-            "integration_error": self._integration_error(current.nodes, q, substeps),
+            "gap_share": equations.gap_share,
+            "integration_error": self._integration_error(current.nodes, q, self.substeps),
         }
-        at_bound = (current.z <= self.lower) | (current.z >= self.upper)
-        covariance = equations.covariance(~at_bound) if math.isfinite(equations.cost) else None
+        at_bound = self._at_bound(current)
+        keep = self._felt(current) & ~at_bound
+        covariance = equations.covariance(keep) if math.isfinite(equations.cost) else None
         solution = Solution(trajectories, transcription.parameters.with_values(values), status, stats)
         return Fit(solution, covariance, equations.chi_square, equations.count, at_bound)
 
@@ -262,10 +308,10 @@ class _Search:
         error = np.abs(coarse - fine) / self.segments.noise
         return float(np.max(error, where=np.isfinite(self.segments.measured), initial=0.0))
 
-    def _report(self, current: _Iterate, stage: Stage) -> None:
+    def _report(self) -> None:
         if self.method.progress is not None:
-            gap = current.equations.largest_gap
-            number = self.method.stages.index(stage) + 1
+            current, gap = self.current, self.current.equations.largest_gap
+            number = self.method.stages.index(self.stage) + 1
             self.method.progress(
                 f"stage {number}/{len(self.method.stages)}  iteration {self.iterations}  "
                 f"cost {current.cost:.6g}  largest gap {gap:.1e}"

@@ -36,7 +36,8 @@ class Segments:
     linked : ndarray of bool, shape (m,)
         Whether the next segment continues this one.
     fixed_start : ndarray, shape (m, n_states)
-        The known start state; NaN where the node is an unknown.
+        The known start state; NaN where the node is an unknown. A state that no measured output feels (the position
+        under a logged speed) is held to its guess there, for it could be anything.
     phase, lengths : ndarray of int, shape (m,)
         The phase of each segment, and its samples without padding.
     """
@@ -133,6 +134,7 @@ def segment(transcription: Transcription) -> Segments:
     t, h, inputs, y, noise, gather, linked, start, index, lengths = joined
     for i, phase in enumerate(transcription.phases[1:], 1):
         linked[np.flatnonzero(index == i)[0] - 1] = phase.follows
+    _anchor(transcription, start, np.flatnonzero(np.append(True, ~linked[:-1])), index)
     return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
 
 
@@ -176,6 +178,29 @@ def _slope(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
     symbols = {n: ca.SX.sym(n, system.step.size1_in(i)) for i, n in enumerate(("t", "h", "x", "u", "p"))}
     x_next = system.step(*symbols.values())[0]
     return ca.substitute(ca.jacobian(x_next, symbols["h"]), symbols["h"], ca.SX(0)), symbols
+
+
+def _anchor(transcription: Transcription, start: Array, heads: Indices, index: Indices) -> None:
+    """Hold what the data do not reach to its guess, at the head of each run of linked segments (changes `start`)."""
+    for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):
+        guess = transcription.phases[index[head]].guess
+        measured = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
+        idle = ~_felt(transcription.system, measured) & np.isnan(start[head])
+        start[head, idle] = 0.0 if guess is None else guess[0, idle]
+
+
+def _felt(system: DiscreteSystem, outputs: set[str]) -> Mask:
+    """The states on which these outputs depend, directly or through other states' rates. Shape (n_states,)."""
+    if system.update is not None or not system.states:
+        return np.ones(len(system.states), dtype=bool)
+    slope, s = _slope(system)
+    rows = [i for i, name in enumerate(names(system.outputs)) if name in outputs]
+    seen = system.step(*s.values())[1][rows]
+    reads, felt = (np.array(ca.DM(ca.jacobian_sparsity(f, s["x"]), 1)) > 0 for f in (slope, seen))
+    felt = np.asarray(felt.any(axis=0))
+    for _ in system.states:
+        felt |= reads[felt].any(axis=0)
+    return np.asarray(felt)
 
 
 def _data(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[Array, Array]:

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from pneuopt.codegen import Pieces, Rollout
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_grid, frequency_response
+from pneuopt.control.margins import frequency_response
 from pneuopt.control.metrics import About, step_metrics
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError, ModelError, require
-from pneuopt.parameters import ParameterSet
+from pneuopt.errors import require
+from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.requirements import MaxSensitivity, Specification, read
-from pneuopt.system import names
+from pneuopt.system import Linearisation, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -149,6 +149,17 @@ def measure(
     )
 
 
+def cut(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> Linearisation:
+    """The open loop for margins, about a plant state x under a command.
+
+    A sampled derivative without a filter is one over a sample, which lags by half of it: that counts as its filter.
+    """
+    h = loop.pid.sample_time
+    unfiltered = h is not None and "pid.Tf" in parameters and parameters.value("pid.Tf") == 0
+    filtered = parameters | ParameterSet({"pid.Tf": Parameter(0.5 * (h or 0.0), "s")}) if unfiltered else parameters
+    return loop.open_loop(filtered, x, {loop.command.name: command})
+
+
 def inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
     """The loop's inputs under a reference; those that the reference does not name are zero."""
     run = reference.trajectory(step)
@@ -178,7 +189,7 @@ def fastest(loop: ClosedLoop, space: Space, states: Sequence[Array]) -> float:
     return found
 
 
-def substeps(rate: float, h: float, loop: ClosedLoop) -> int:
+def substeps(rate: float, h: float) -> int:
     """RK4 steps in a sample of length h so that the rate stays stable.
 
     Raises
@@ -189,8 +200,8 @@ def substeps(rate: float, h: float, loop: ClosedLoop) -> int:
     k = int(np.ceil(rate * h / STABLE))
     require(
         k <= MOST_SUBSTEPS,
-        f"within the bounds the loop has a mode as fast as {rate:.3g} 1/s, which takes {k} steps in {h:.3g} s; raise "
-        f"the lower bound of {'pid.Tf' if loop.pid.sample_time is None else 'the smoothing speed'}",
+        f"within the bounds the loop has a mode as fast as {rate:.3g} 1/s, which takes {k} steps in {h:.3g} s, at most "
+        f"{MOST_SUBSTEPS}; narrow the gains' bounds (raise the lower one of pid.Tf), smooth the friction, or shorten h",
     )
     return max(1, k)
 
@@ -212,7 +223,9 @@ class Simulator:
         self._rollout = Rollout(Pieces(self._system.step, self._system.update))
         moving = [x for r, rest in zip(references, self._rest, strict=True) for x in self._visited(r, rest)]
         rate = fastest(loop, space, moving)
-        self._substeps = [substeps(rate, spacing(loop, r), loop) for r in references]
+        self._substeps = [substeps(rate, spacing(loop, r)) for r in references]
+        slowest = 1 / max(r.horizon for r in references)
+        self._omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
 
     def values(self, points: Array, spec: Specification) -> list[dict[str, float]]:
         """What the requirements read, the worst over the references, of each candidate.
@@ -258,8 +271,14 @@ class Simulator:
         error = np.abs(response[self._loop.feedback.name][late] - reference.final)
         metrics["Excess"] = float(np.mean(error)) / abs(reference.size)
         if robust:
-            metrics["MaxSensitivity"] = _sensitivity(self._loop, parameters, x_end, float(response["control"][-1]))
+            metrics["MaxSensitivity"] = self._sensitivity(parameters, x_end, float(response["control"][-1]))
         return metrics
+
+    def _sensitivity(self, parameters: ParameterSet, x_end: Array, command: float) -> float:
+        """Ms on a grid, about the state in which the response ends."""
+        open_loop = cut(self._loop, parameters, x_end[: len(self._loop.plant.states)], command)
+        L = frequency_response(open_loop, self._omega)
+        return float(1 / np.min(np.abs(1 + L)))
 
     def _starts(self, k: int, reference: Step, sets: Sequence[ParameterSet]) -> Array:
         rest = self._rest[k]
@@ -293,13 +312,3 @@ def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array | None:
     other = loop.initial(space.filled(space.draw(np.full(len(space.names), 0.7))), reference=reference.initial)
     scale = np.array([q.nominal for q in loop.states])
     return first if bool(np.all(np.abs(first - other) <= 1e-9 * scale)) else None
-
-
-def _sensitivity(loop: ClosedLoop, parameters: ParameterSet, x_end: Array, command: float) -> float:
-    """Ms on a grid, about the state in which the response ends."""
-    x = x_end[: len(loop.plant.states)]
-    try:
-        open_loop = loop.open_loop(parameters, x, {loop.command.name: command})
-        return float(1 / np.min(np.abs(1 + frequency_response(open_loop, frequency_grid(open_loop, 20)))))
-    except (InputError, ConvergenceError, ModelError, np.linalg.LinAlgError):
-        return np.inf

@@ -1,0 +1,97 @@
+"""Whether logs, a system and parameters fit together: refused here, before anything is solved, with the remedy."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pneuopt.errors import LogError, ModelError, check_known, require
+from pneuopt.experiments import Experiment
+from pneuopt.parameters import ParameterSet
+from pneuopt.statistics import noise_level
+from pneuopt.system import System, names
+
+REFERENCES = ("speed_reference", "position_reference")  # a loop's set-points may stay in a log; no plant reads them
+LONGEST_PAUSE = 50  # usual steps without a sample; the inputs in between are unknown
+
+
+def check_logs(system: System, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
+    """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
+    require(len(experiments) > 0, "no experiments: give at least one log", LogError)
+    check_known("parameter", parameters, system.parameters)
+    known = {*names(system.inputs), *names(system.outputs), *REFERENCES}
+    taken: set[str] = set()
+    out = []
+    for number, experiment in enumerate(experiments, 1):
+        name = experiment.name or f"log {number}"
+        name = name if name not in taken else f"{name} ({number})"
+        taken.add(name)
+        _check_channels(system, experiment, name, known)
+        check_known("parameter", experiment.conditions, system.parameters, f"{name}: condition")
+        out.append(replace(experiment, name=name))
+    return _with_noise(system, out)
+
+
+def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> None:
+    """Refuse what leaves nothing to estimate."""
+    free = parameters.free_names
+    require(len(free) > 0, "no parameter is free; mark what to estimate, as parameters.freed('friction.*')", ModelError)
+    for name in free:
+        known = all(name in e.conditions for e in experiments)
+        message = f"{name} is free, but every log's conditions give its value; fix it, or drop the condition"
+        require(not known, message, ModelError)
+
+
+def _check_channels(system: System, experiment: Experiment, name: str, known: set[str]) -> None:
+    trajectory = experiment.trajectory
+    require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
+    steps = np.diff(trajectory.t)
+    widest, usual = int(np.argmax(steps)), float(np.median(steps))
+    pause = f"{name}: nothing is logged for {steps[widest]:g} s from t = {trajectory.t[widest]:g} s"
+    remedy = f"the usual step is {usual:g} s; cut the log in two there"
+    require(steps[widest] <= LONGEST_PAUSE * usual, f"{pause}; {remedy}", LogError)
+    for q in system.inputs:
+        needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
+        require(q.name in trajectory, needed + ", ".join(trajectory.names), LogError)
+        missing = np.flatnonzero(~np.isfinite(trajectory[q.name]))
+        where = f"t = {trajectory.t[missing[0]]:g} s" if missing.size else ""
+        require(
+            not missing.size, f"{name}: input {q.name!r} is missing at {where}; cut or fill the log there", LogError
+        )
+    for channel in trajectory:
+        remedy = "leave it out (Experiment.select, or the sidecar's [columns])"
+        reads = ", ".join(sorted(known.difference(REFERENCES)))
+        message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
+        require(channel in known, message, LogError)
+    outputs = ", ".join(names(system.outputs))
+    require(bool(measured_outputs(system, experiment)), f"{name}: none of the outputs is logged: {outputs}", LogError)
+    for channel in measured_outputs(system, experiment):
+        empty = f"{name}: channel {channel!r} holds no sample; leave it out"
+        require(bool(np.isfinite(trajectory[channel]).any()), empty, LogError)
+
+
+def _with_noise(system: System, experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Where a log declares no noise: the median over all logs of what the channel shows, for sensors are shared."""
+    found: dict[str, dict[str, float]] = {}
+    for experiment in experiments:
+        for channel in measured_outputs(system, experiment):
+            if channel not in experiment.noise:
+                found.setdefault(channel, {})[experiment.name] = noise_level(experiment.trajectory[channel])
+    pooled = {}
+    for channel, levels in found.items():
+        shown = [level for level in levels.values() if not math.isnan(level)]
+        constant = (
+            f"{next(iter(levels))}: channel {channel!r} is constant; leave it out, or log a run in which it moves"
+        )
+        require(len(shown) > 0, constant, LogError)
+        pooled[channel] = float(np.median(shown))
+    return [
+        e.with_noise({n: s for n, s in pooled.items() if n in e.trajectory and n not in e.noise}) for e in experiments
+    ]
+
+
+def measured_outputs(system: System, experiment: Experiment) -> tuple[str, ...]:
+    """The system's outputs that a log holds, unless they are its inputs, too."""
+    inputs = names(system.inputs)
+    return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)

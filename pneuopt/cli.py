@@ -1,0 +1,163 @@
+"""The command line: `pneuopt identify | tune | simulate | info`.
+
+Exit status: 0 good, 1 not converged or not certified, 2 bad input, 130 interrupted. Whatever is heavy is imported by
+the command that needs it, so that help is quick.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pneuopt.errors import ConvergenceError, InputError, require
+
+NOT_GOOD, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+app = typer.Typer(
+    name="pneuopt",
+    help="Identify and optimally tune pneumatic drives: friction from logs, PID and dither together, certified.",
+    epilog="Exit status: 0 good, 1 not converged or not certified, 2 bad input, 130 interrupted.",
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all figures as JSON.")]
+Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw: .png, .pdf or .svg.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+
+
+def main() -> None:
+    """Run the command line."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a console that lacks a letter shows "?" instead of failing
+            stream.reconfigure(errors="replace")
+    app()
+
+
+@app.callback(invoke_without_command=True)
+def options(
+    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show the version and exit.")] = False,
+) -> None:
+    """Take the options that stand before a command."""
+    if version:
+        from pneuopt import __version__
+
+        typer.echo(f"pneuopt {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def identify(
+    drive: Annotated[
+        Path, typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is identified.")
+    ],
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOGS", help="CSV files, each with its sidecar .toml if it has one.")
+    ],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write fit.toml.")] = None,
+    json: Json = None,
+    plot: Plot = None,
+    window: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Fit parameters to logs, with confidence intervals."""
+    with _guarded():
+        from pneuopt.commands import Outputs, run_identify
+
+        raise typer.Exit(run_identify(drive, _expanded(logs), Outputs(output, json, plot), window, quiet))
+
+
+@app.command()
+def tune(
+    fit: Annotated[
+        Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant; nothing of it is tuned.")
+    ],
+    tuning: Annotated[
+        Path, typer.Argument(metavar="TUNING", help="tuning.toml: controller, references, requirements.")
+    ],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write tuned.toml.")] = None,
+    json: Json = None,
+    plot: Plot = None,
+    quiet: Quiet = False,
+) -> None:
+    """Tune PID and dither together, and certify them."""
+    with _guarded():
+        from pneuopt.commands import Outputs, run_tune
+
+        raise typer.Exit(run_tune(fit, tuning, Outputs(output, json, plot), quiet))
+
+
+@app.command()
+def simulate(
+    fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml.")],
+    tuning: Annotated[
+        Path | None, typer.Argument(metavar="[TUNING]", help="tuning.toml or tuned.toml: simulate its closed loop.")
+    ] = None,
+    log: Annotated[Path | None, typer.Option(metavar="LOG", help="Predict this log instead, in open loop.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
+    json: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Simulate a closed loop, or predict a log."""
+    with _guarded():
+        require((tuning is None) != (log is None), "give either a tuning file or --log, to say what to simulate")
+        from pneuopt.commands import Outputs, run_predict, run_simulate
+
+        outputs = Outputs(output, json, plot)
+        if tuning is not None:
+            raise typer.Exit(run_simulate(fit, tuning, outputs))
+        if log is not None:
+            raise typer.Exit(run_predict(fit, log, outputs))
+
+
+@app.command()
+def info() -> None:
+    """Show versions, compiler and cache: say them when asking for help."""
+    import os
+    import platform
+    from importlib.metadata import version
+
+    from pneuopt.codegen import cache_directory, compiler
+    from pneuopt.console import screen, show_pairs
+
+    packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
+    with _guarded():
+        machine = {
+            "python": f"{platform.python_version()} ({sys.executable})",
+            "platform": f"{platform.platform()}, {os.cpu_count()} CPUs",
+            "compiler": compiler() or "none found: models run on the CasADi VM, more slowly",
+            "cache": cache_directory(),
+        }
+        show_pairs(screen(), {n: version(n) for n in packages} | machine)
+
+
+@contextmanager
+def _guarded() -> Iterator[None]:
+    """Turn what a user can mend into one message and an exit status."""
+    try:
+        yield
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(BAD_INPUT) from None
+    except ConvergenceError as error:
+        typer.echo(f"NOT converged: {error}", err=True)
+        raise typer.Exit(NOT_GOOD) from None
+    except KeyboardInterrupt:
+        typer.echo("interrupted: no file was left half-written", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _expanded(paths: Sequence[Path]) -> list[Path]:
+    """Patterns that the shell has left alone, as on Windows."""
+    found: list[Path] = []
+    for path in paths:
+        is_pattern = any(c in path.name for c in "*?[") and not path.exists()
+        found += sorted(path.parent.glob(path.name)) if is_pattern else [path]
+    require(bool(found), f"{paths[0]}: no file matches; check the name and the folder")
+    return found

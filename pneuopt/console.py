@@ -1,0 +1,250 @@
+"""What the command line shows: tables that are read at 80 columns or piped, and a progress line on a terminal only."""
+
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import ParallelForm, to_standard
+from pneuopt.nlp.least_squares import Progress as Tell
+from pneuopt.nlp.status import Status
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import PERCENT, Requirement, name
+from pneuopt.units import write_value
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_ROWS = 12  # of a table of logs
+MOST_REFERENCES = 3  # beside each other
+
+
+def screen(*, error: bool = False) -> Console:
+    """Standard output, or standard error; nothing is read as markup, for names of logs have brackets."""
+    return Console(file=sys.stderr if error else sys.stdout, markup=False, highlight=False, emoji=False)
+
+
+@contextmanager
+def progress(label: str, *, quiet: bool) -> Iterator[Tell]:
+    """A line that shows the latest news and the time; nothing where standard error is no terminal, or if quiet.
+
+    Parameters
+    ----------
+    label : str
+    quiet : bool
+
+    Yields
+    ------
+    callable
+        Takes a line of text.
+    """
+    console = screen(error=True)
+    silent = quiet or not console.is_terminal
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=silent) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda text: bar.update(task, description=f"{label}: {text}")
+
+
+def show_status(console: Console, status: Status) -> None:
+    """How it ended, before anything else."""
+    console.print(Text(str(status), style="bold green" if status.converged else "bold red"), soft_wrap=True)
+
+
+def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
+    """Value and 95 % confidence interval of each free parameter.
+
+    Parameters
+    ----------
+    console : Console
+    estimates : DataFrame
+        Of an `IdentificationResult`.
+    """
+    table = _table("parameter", "value", "95 % confidence interval", "unit", "")
+    for parameter, row in estimates.iterrows():
+        value, interval = _interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
+        table.add_row(str(parameter), value, interval, str(row["unit"]), "at its bound" if row["at_bound"] else "")
+    console.print(table)
+
+
+def show_fit(console: Console, fit: "pd.DataFrame") -> None:
+    """Agreement of each log and channel; of many logs the median and the worst.
+
+    Parameters
+    ----------
+    console : Console
+    fit : DataFrame
+        Of an `IdentificationResult`, or from `validate`.
+    """
+    if len(fit) > MOST_ROWS:
+        _show_many(console, fit)
+        return
+    table = _table("log", "channel", "NRMSE [%]", "RMSE", "unit")
+    for row in fit.reset_index().to_dict(orient="records"):
+        figures = [_figure(100 * row["nrmse"], 4), _figure(row["rmse"], 4)]
+        table.add_row(str(row["log"]), str(row["channel"]), *figures, str(row["unit"]))
+    console.print(table)
+
+
+def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> None:
+    """Each free parameter before and after tuning, within its bounds."""
+    table = _table("parameter", "before", "tuned", "bounds")
+    for n in after.free_names:
+        p, unit = after[n], after[n].unit
+        bounds = f"{_figure(p.lower, 4)} to {_figure(p.upper, 4)}"
+        table.add_row(n, write_value(before.value(n), unit), write_value(p.value, unit), bounds)
+    console.print(table)
+    console.print(_standard_form(after), soft_wrap=True)
+
+
+def show_rejected(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet) -> None:
+    """What stands when a tuning failed, and what it had to reject.
+
+    Parameters
+    ----------
+    console : Console
+    tuning : Path
+        Where the given gains are from.
+    stats : mapping of str to float
+        Of a `TuningResult`, "rejected.pid.Kp" and so on among them.
+    given : ParameterSet
+    """
+    found = {n.removeprefix("rejected."): v for n, v in stats.items() if n.startswith("rejected.")}
+    tried = ", ".join(f"{n} {write_value(v, given[n].unit)}" for n, v in found.items() if not math.isnan(v))
+    console.print(f"the gains of {tuning} stand; rejected: {tried or 'none was found'}", soft_wrap=True)
+
+
+def show_metrics(
+    console: Console,
+    metrics: "pd.DataFrame",
+    loop: ClosedLoop,
+    *,
+    title: str = "certified",
+    before: "pd.DataFrame | None" = None,
+    limits: Sequence[Requirement] = (),
+) -> None:
+    """Certified metrics, a column a reference.
+
+    Parameters
+    ----------
+    console : Console
+    metrics : DataFrame
+        Of `evaluate`, or a `TuningResult`: a row a metric, a column a reference.
+    loop : ClosedLoop
+        Gives the units.
+    title : str
+        What the figures are.
+    before : DataFrame, optional
+        The same with the gains before.
+    limits : sequence of Requirement
+    """
+    units, allowed = metric_units(loop), {name(q): q.max for q in limits}
+    several = len(metrics.columns) > MOST_REFERENCES
+    columns = [f"worst of {len(metrics.columns)}"] if several else [f"{c} {loop.feedback.unit}" for c in metrics]
+    table = _table(title, *columns, *(["limit"] if allowed else []), "unit")
+    for metric in (m for m in units if m in metrics.index and (m != "Ripple" or loop.dither)):
+        now, was = (_row(frame, metric, several) for frame in (metrics, before))
+        cells = [_metric(metric, v) + (f" (was {_metric(metric, was[k])})" if was else "") for k, v in enumerate(now)]
+        most = allowed.get(metric)
+        factor = 100 if metric in PERCENT else 1
+        limit = [f"<= {_figure(factor * most, 4)}" if most is not None else ""] if allowed else []
+        table.add_row(metric, *cells, *limit, units[metric])
+    console.print(table)
+
+
+def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
+    """The metrics that are shown, in that order, with their units."""
+    return {
+        "SettlingTime": "s",
+        "RiseTime": "s",
+        "Overshoot": "%",
+        "SteadyStateError": "%",
+        "PeakControl": loop.command.unit,
+        "Ripple": loop.feedback.unit,
+        "MaxSensitivity": "",
+        "GainMargin": "",
+        "PhaseMargin": "deg",
+    }
+
+
+def show_written(console: Console, paths: Sequence[Any]) -> None:
+    """The files that were written."""
+    for path in paths:
+        console.print(f"wrote {path}", soft_wrap=True)
+
+
+def show_pairs(console: Console, pairs: Mapping[str, object]) -> None:
+    """Names and what they are, a line each."""
+    width = max(len(n) for n in pairs)
+    for key, value in pairs.items():
+        console.print(f"{key:<{width}}  {value}", soft_wrap=True)
+
+
+def _show_many(console: Console, fit: "pd.DataFrame") -> None:
+    table = _table("channel", "logs", "NRMSE [%]: median", "worst", "in log", "RMSE: median", "unit")
+    flat = fit.reset_index()
+    for channel in flat["channel"].unique():
+        rows = flat[flat["channel"] == channel].sort_values("nrmse", na_position="first")
+        worst, middle = rows.iloc[-1], rows[["nrmse", "rmse"]].median()
+        figures = [_figure(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"])]
+        rmse = _figure(middle["rmse"], 4)
+        table.add_row(str(channel), str(len(rows)), *figures, str(worst["log"]), rmse, str(worst["unit"]))
+    console.print(table)
+
+
+def _row(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float]:
+    if frame is None or metric not in frame.index:
+        return []
+    values: list[float] = frame.T[metric].tolist()
+    worst = min if metric in ("GainMargin", "PhaseMargin") else max
+    unknown = any(math.isnan(v) for v in values)
+    return [math.nan if unknown else worst(values)] if several else values
+
+
+def _standard_form(parameters: ParameterSet) -> str:
+    gains = ParallelForm(*(parameters.value(f"pid.{n}") for n in ("Kp", "Ki", "Kd", "Tf")))
+    if gains.Kp == 0:
+        return "no standard form: Kp is zero"
+    form = to_standard(gains)
+    integral = f", Ti {form.Ti:.4g} s" if gains.Ki else ", no integral"
+    derivative = f", Td {form.Td:.4g} s, N {form.N:.4g} (ISA's ratio Td/Tf)" if gains.Kd else ", no derivative"
+    return f"standard form: Kp {form.Kp:.4g}{integral}{derivative}"
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, header_style="bold")
+    for column in columns:
+        text = column in ("parameter", "log", "channel", "certified", "rejected", "unit", "in log", "")
+        table.add_column(column, justify="left" if text else "right", overflow="fold")
+    return table
+
+
+def _metric(metric: str, value: float) -> str:
+    return "never" if metric == "SettlingTime" and math.isnan(value) else _figure(value, 4)
+
+
+def _figure(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}g}"
+
+
+def _interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
+    if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
+        return _figure(value, 4), "not determined"
+    return _to_spread(value, spread), f"{_to_spread(low, spread)} to {_to_spread(high, spread)}"
+
+
+def _to_spread(value: float, spread: float) -> str:
+    """As many digits as two of the standard error say."""
+    if not 0 < spread < math.inf or value == 0 or not spread < abs(value):
+        return _figure(value, 4)
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(spread)) + 2
+    return f"{value:#.{min(digits, 12)}g}".rstrip(".")

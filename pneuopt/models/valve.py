@@ -1,0 +1,111 @@
+"""A 5/3 proportional directional valve: spool, four metering edges, leak."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from math import pi
+from typing import NamedTuple
+
+import casadi as ca
+
+from pneuopt.models.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+
+Symbols = Mapping[str, ca.SX]
+
+
+class Spool(Enum):
+    """How the spool follows its command."""
+
+    RIGID = 0
+    FIRST_ORDER = 1
+    SECOND_ORDER = 2
+
+
+class Flows(NamedTuple):
+    """Mass flows through the four edges [kg/s], each positive from the first port to the second."""
+
+    supply_a: ca.SX
+    a_exhaust: ca.SX
+    supply_b: ca.SX
+    b_exhaust: ca.SX
+
+
+@dataclass(frozen=True)
+class ProportionalValve:
+    """Positive voltage opens supply to a and b to exhaust.
+
+    The spool's position x is a fraction of its half travel, 1 at the voltage `span`. Each edge opens by
+
+    .. math:: o(x) = \\tfrac12 \\left[(x - x_0) + \\sqrt{(x - x_0)^2 + \\delta^2}\\right] + leak
+
+    with x_0 the overlap (a dead zone; negative for underlap) and delta the edge's rounding, and passes
+    C o(x) rho_0 sqrt(T_0/T) times the law's pressure.
+
+    Parameters
+    ----------
+    law : FlowLaw
+    spool : Spool
+    smoothing : Smoothing
+    """
+
+    law: FlowLaw = Iso6358()
+    spool: Spool = Spool.SECOND_ORDER
+    smoothing: Smoothing = Smoothing()
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """Spool [1] and spool_rate [1/s], as far as the spool lags."""
+        lagging = (Quantity("spool", "1", nominal=0.3), Quantity("spool_rate", "1/s", nominal=50.0))
+        return lagging[: self.spool.value]
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Conductance and critical_ratio of a fully open edge, the spool's geometry and speed, the command's span."""
+        own = {
+            "conductance": Parameter(2e-8, "m^3/(s*Pa)", 1e-12, 1e-4, log=True),
+            "critical_ratio": Parameter(0.3, "1", 0.05, 0.6),
+            "dead_zone": Parameter(0.0, "1", -0.5, 0.5),
+            "rounding": Parameter(0.04, "1", 1e-6, 0.5, log=True),
+            "leak": Parameter(0.0, "1", 0.0, 0.2),
+            "span": Parameter(5.0, "V", 0.1, 100.0),
+            "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True),
+            "damping": Parameter(0.7, "1", 0.1, 5.0, log=True),
+        }
+        unused = {Spool.RIGID: ("bandwidth", "damping"), Spool.FIRST_ORDER: ("damping",), Spool.SECOND_ORDER: ()}
+        return ParameterSet({n: p for n, p in own.items() if n not in unused[self.spool]})
+
+    def position(self, voltage: ca.SX, z: Symbols, p: Symbols) -> ca.SX:
+        """The spool's position [1] at a command [V] and the states z."""
+        return self._command(voltage, p) if self.spool is Spool.RIGID else z["spool"]
+
+    def rates(self, voltage: ca.SX, z: Symbols, p: Symbols) -> dict[str, ca.SX]:
+        """Rates of the spool's states: a lag of first or second order, cut-off frequency `bandwidth`."""
+        if self.spool is Spool.RIGID:
+            return {}
+        w = 2 * pi * p["bandwidth"]
+        error = self._command(voltage, p) - z["spool"]
+        if self.spool is Spool.FIRST_ORDER:
+            return {"spool": w * error}
+        return {"spool": z["spool_rate"], "spool_rate": w**2 * error - 2 * p["damping"] * w * z["spool_rate"]}
+
+    def flows(
+        self, spool: ca.SX, supply: ca.SX, exhaust: ca.SX, a: ca.SX, b: ca.SX, temperature: ca.SX, p: Symbols
+    ) -> Flows:
+        """Mass flows [kg/s] at a spool position and the absolute pressures of the four ports [Pa]; upstream at T [K]."""
+        scale = p["conductance"] * REFERENCE_DENSITY * ca.sqrt(REFERENCE_TEMPERATURE / temperature)
+
+        def edge(upstream: ca.SX, downstream: ca.SX, x: ca.SX) -> ca.SX:
+            return scale * opening(x, p) * self.law.flow(upstream, downstream, p["critical_ratio"], self.smoothing)
+
+        return Flows(edge(supply, a, spool), edge(a, exhaust, -spool), edge(supply, b, -spool), edge(b, exhaust, spool))
+
+    @staticmethod
+    def _command(voltage: ca.SX, p: Symbols) -> ca.SX:
+        return ca.fmax(-1, ca.fmin(1, voltage / p["span"]))
+
+
+def opening(x: ca.SX, p: Symbols) -> ca.SX:
+    """Opening of one edge as a fraction of the full one; see `ProportionalValve`."""
+    beyond = x - p["dead_zone"]
+    return (beyond + ca.sqrt(beyond**2 + p["rounding"] ** 2)) / 2 + p["leak"]

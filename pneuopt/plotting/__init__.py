@@ -1,0 +1,20 @@
+"""Results as matplotlib figures: a fit beside its logs, a friction map, step responses, a Bode plot with its margins.
+
+No window is opened and no global state is touched: each function returns a `Figure`, `save_figure` writes it.
+"""
+
+from pneuopt.plotting.canvas import check_figure_path, save_figure
+from pneuopt.plotting.fits import has_friction_map, plot_fit, plot_friction, plot_prediction
+from pneuopt.plotting.loops import Response, plot_bode, plot_steps
+
+__all__ = [
+    "Response",
+    "check_figure_path",
+    "has_friction_map",
+    "plot_bode",
+    "plot_fit",
+    "plot_friction",
+    "plot_prediction",
+    "plot_steps",
+    "save_figure",
+]

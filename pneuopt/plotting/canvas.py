@@ -1,0 +1,79 @@
+"""What every figure shares: axes, colours, a legend outside, and the way to a file."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pneuopt.errors import require
+from pneuopt.output import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES = ("png", "pdf", "svg")
+GREY, BLUE, ORANGE, RED = "0.55", "#1f6fb2", "#e07b00", "#c0392b"
+MOST_COLUMNS = 3  # that can still be read at 1000 pixels
+
+
+def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
+    """Write a figure whole or not at all, in the format of the file's suffix.
+
+    Parameters
+    ----------
+    figure : Figure
+    path : str or Path
+        Ends in .png, .pdf or .svg.
+    dpi : int
+        Pixels an inch of a .png.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one, or the file cannot be written.
+    """
+    check_figure_path(path)
+    content = io.BytesIO()
+    figure.savefig(content, format=Path(path).suffix.lower().removeprefix("."), dpi=dpi)
+    write_bytes(path, content.getvalue())
+
+
+def check_figure_path(path: str | Path) -> None:
+    """Raise `InputError` unless the file's suffix is one that a figure can be written as."""
+    suffix = Path(path).suffix.lower().removeprefix(".")
+    require(suffix in SUFFIXES, f"{path}: a figure is written as {', '.join('.' + s for s in SUFFIXES)}; name it so")
+
+
+def axes_grid(
+    rows: int, columns: int, heights: Sequence[float], *, sharex: Literal["col"] | bool = False, width: float = 10.0
+) -> tuple["Figure", list[list["Axes"]]]:
+    """A figure of so many inches, and its axes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, 0.9 + sum(heights)), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=sharex, squeeze=False, height_ratios=heights)
+    for axes in grid.flat:
+        axes.grid(True, alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure, [list(row) for row in grid]
+
+
+def legend_above(figure: "Figure", *sources: "Axes") -> None:
+    """One legend for all axes, outside of them: it hides nothing."""
+    from matplotlib.lines import Line2D
+
+    pairs = [pair for axes in sources for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    if not pairs:
+        return
+    handles, labels = zip(*pairs, strict=True)
+    legend = figure.legend(handles, labels, loc="outside upper center", ncols=min(4, len(labels)), frameon=False)
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D):  # a cloud's faint dots would not be seen
+            handle.set(alpha=1.0, markersize=5)
+
+
+def shown_of(figure: "Figure", shown: int, available: int, what: str) -> None:
+    """Say so where a figure leaves some out."""
+    if shown < available:
+        figure.text(0.995, 0.005, f"{shown} of {available} {what}", ha="right", fontsize=8, color=GREY)

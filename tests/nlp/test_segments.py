@@ -1,0 +1,151 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pneuopt.errors import ModelError
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import Coulomb, FrictionModel, LuGre
+from pneuopt.models.load import Load
+from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for, tightness
+from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.system import System, discretise
+
+FREE = ("friction.coulomb", "load.mass")
+
+
+def phase(name: str, n: int, **fields: object) -> Phase:
+    rng = np.random.default_rng(n)
+    guess = 0.1 * rng.standard_normal((n, 2))
+    made = Phase(
+        name, 1e-3 * np.arange(n), np.full(n, 1e-3), 30 * rng.standard_normal((n, 1)), every(n, 4), guess=guess
+    )
+    return replace(made, **fields)  # type: ignore[arg-type]
+
+
+def posed(
+    *phases: Phase, system: System | None = None, free: tuple[str, ...] = FREE, outputs: tuple[str, ...] = ("position",)
+) -> Transcription:
+    system = system or ForceDrive(Coulomb()).system()
+    parameters = system.parameters.freed(*free) | ParameterSet({"load.mass[b]": Parameter(2.0, "kg", free=True)})
+    residuals = tuple(
+        Residuals(i, outputs, np.full((p.n, len(outputs)), float(i)), np.full(len(outputs), 0.1 + i))
+        for i, p in enumerate(phases)
+    )
+    return Transcription(discretise(system, 3), parameters, phases, residuals)
+
+
+def both() -> Segments:
+    return segment(posed(phase("a", 10), phase("b", 7)))
+
+
+def test_phases_are_cut_padded_and_linked() -> None:
+    segments = both()
+    assert segments.count == 5
+    assert segments.lengths.tolist() == [4, 4, 2, 4, 3]
+    assert segments.phase.tolist() == [0, 0, 0, 1, 1]
+    assert segments.linked.tolist() == [True, True, False, True, False]
+    assert segments.h[2].tolist() == [1e-3, 1e-3, 0, 0]
+    assert np.isnan(segments.measured[2, 2:]).all()
+    assert segments.measured[4, :3, 0].tolist() == [1, 1, 1]
+    assert np.isnan(segments.measured[:, :, 1]).all()  # the speed was not logged
+    assert (segments.noise[3:, :, 0] == 1.1).all()
+    assert segments.t[4].tolist() == pytest.approx([4e-3, 5e-3, 6e-3, 6e-3])
+
+
+def test_each_segment_knows_its_parameters() -> None:
+    segments = both()
+    names = [list(segments.system.parameters)[i] for i in segments.columns]
+    assert set(names) == set(FREE)
+    free = segments.transcription.parameters.free_names
+    found = [[free[i] for i in row] for row in segments.unknowns]
+    assert found[0] == names
+    assert found[4] == [n if n != "load.mass" else "load.mass[b]" for n in names]
+
+
+def test_segments_from_one_trajectory_join_to_it() -> None:
+    """From the states of one long run, the segments give that run again: gaps of zero, the same outputs."""
+    whole = segment(posed(phase("a", 21, nodes=every(21, 21))))
+    q = np.array([p.value for p in whole.transcription.parameters.values()])
+    (run,) = whole.trajectories(start_nodes(whole), q, 5)
+    states = run.matrix(["position", "speed"])
+    parts = segment(posed(phase("a", 21, guess=states)))
+    nodes = start_nodes(parts)
+    pieces = parts.run(nodes, q, 5, sensitivities=True)
+    assert_allclose(pieces.x_end[:-1], nodes[1:], rtol=1e-12)
+    (again,) = parts.trajectories(nodes, q, 5)
+    assert_allclose(again["speed"], run["speed"], rtol=1e-12)
+    assert_array_equal(again.t, run.t)
+
+
+def test_a_following_phase_is_linked_and_a_known_start_is_kept() -> None:
+    segments = segment(posed(phase("a", 8, start=np.array([0.5, 0.0])), phase("b", 8, follows=True)))
+    assert segments.linked.tolist() == [True, True, True, False]
+    assert segments.fixed_start[0].tolist() == [0.5, 0.0]
+    assert np.isnan(segments.fixed_start[1:]).all()
+    assert start_nodes(segments)[0].tolist() == [0.5, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("load", "outputs", "held"),
+    [
+        (Load(), ("speed",), [True, False]),
+        (Load(), ("position",), [False, False]),
+        (Load(spring=True), ("speed",), [False, False]),
+        (Load(), (), [True, True]),
+    ],
+)
+def test_a_state_that_no_output_feels_is_held(load: Load, outputs: tuple[str, ...], held: list[bool]) -> None:
+    run = phase("a", 8)
+    segments = segment(posed(run, system=ForceDrive(Coulomb(), load).system(), outputs=outputs))
+    assert np.isfinite(segments.fixed_start[0]).tolist() == held
+    assert np.isnan(segments.fixed_start[1:]).all()
+    assert run.guess is not None
+    assert segments.fixed_start[0][held].tolist() == run.guess[0][held].tolist()
+
+
+def test_a_state_is_felt_through_a_phase_that_follows() -> None:
+    problem = posed(phase("a", 8), phase("b", 8, follows=True), outputs=("speed",))
+    position = Residuals(1, ("position",), np.zeros((8, 1)), np.ones(1))
+    segments = segment(replace(problem, residuals=(problem.residuals[0], position)))
+    assert np.isnan(segments.fixed_start).all()
+
+
+def test_a_free_duration_is_refused() -> None:
+    with pytest.raises(ModelError, match="a: a free duration needs another method"):
+        segment(posed(phase("a", 8, duration="load.mass")))
+
+
+def test_kinematic_states_are_kept_tighter() -> None:
+    assert tightness(both(), 0.01).tolist() == [0.01, 1.0]
+    assert tightness(segment(posed(phase("a", 8), free=("load.force",))), 0.1).tolist() == [0.1, 1.0]
+
+
+@pytest.mark.parametrize("friction", [Coulomb(), LuGre()])
+def test_substeps_follow_the_stiffness(friction: FrictionModel) -> None:
+    system = ForceDrive(friction).system()
+    n = len(system.states)
+    guess = np.zeros((8, n))
+    guess[:, 1] = 0.4
+    problem = posed(phase("a", 8, guess=guess), system=system)
+    segments = segment(problem)
+    p = {name: q.value for name, q in problem.parameters.items()}
+    p |= {"load.mass": 1.0, "friction.coulomb": 50.0, "friction.viscous": 0.0}
+    if isinstance(friction, LuGre):
+        fastest = p["bristle"] = p["friction.bristle_stiffness"] * 0.4 / 50.0  # sliding: sigma_0 v / F_c
+    else:
+        fastest = 50.0 / p["friction.smoothing"]  # at rest
+    q = np.array([p[name] for name in problem.parameters])
+    assert substeps_for(segments, start_nodes(segments), q) == pytest.approx(1e-3 * fastest / 1.4, abs=1.01)
+
+
+def test_a_static_map_needs_one_step_and_has_no_states() -> None:
+    system = MotionDrive(Coulomb(), chamber=False).system()
+    made = Phase("a", np.arange(5.0), np.ones(5), np.ones((5, 1)), every(5, 2))
+    problem = Transcription(discretise(system), system.parameters.freed("friction.coulomb"), (made,))
+    segments = segment(problem)
+    assert substeps_for(segments, start_nodes(segments), np.zeros(len(problem.parameters))) == 1
+    assert tightness(segments, 0.01).shape == (0,)
+    assert segments.nominal.shape == (0,)

@@ -1,0 +1,77 @@
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from pneuopt.errors import ModelError, UnknownNameError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb
+from pneuopt.nlp.transcription import Cost, Phase, Residuals, Transcription, Where, every, phases_of
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.system import discretise
+
+DRIVE = ForceDrive(Coulomb()).system()
+
+
+def phase(name: str = "run", n: int = 10) -> Phase:
+    return Phase(name, np.linspace(0, 0.1 * n, n, endpoint=False), np.full(n, 0.1), np.zeros((n, 1)), every(n, 4))
+
+
+def problem(*phases: Phase, parameters: ParameterSet = DRIVE.parameters, **fields: object) -> Transcription:
+    return Transcription(discretise(DRIVE), parameters, phases or (phase(),), **fields)  # type: ignore[arg-type]
+
+
+def test_nodes_at_every_so_many_samples() -> None:
+    assert every(10, 3).tolist() == [0, 3, 6, 9]
+    assert every(10, 100).tolist() == [0]
+    assert every(3, 0).tolist() == [0, 1, 2]
+    assert phase().n == 10
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"h": np.ones(9)}, "run: t, h and inputs differ in length"),
+        ({"inputs": np.zeros((9, 1))}, "run: t, h and inputs differ in length"),
+        ({"nodes": np.array([1, 4])}, "nodes must begin at 0 and increase below 10"),
+        ({"nodes": np.array([0, 4, 4])}, "nodes must begin at 0"),
+        ({"nodes": np.array([0, 10])}, "nodes must begin at 0"),
+        ({"nodes": np.array([], dtype=int)}, "nodes must begin at 0"),
+        ({"follows": True, "start": np.zeros(2)}, "it follows a phase, so no start"),
+    ],
+)
+def test_a_bad_phase_is_refused_by_name(changed: dict[str, object], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        replace(phase(), **changed)  # type: ignore[arg-type]
+
+
+def test_a_bad_problem_is_refused() -> None:
+    with pytest.raises(ModelError, match="at least one phase"):
+        Transcription(discretise(DRIVE), DRIVE.parameters, ())
+    with pytest.raises(ModelError, match="first phase cannot follow"):
+        problem(replace(phase(), follows=True))
+    with pytest.raises(UnknownNameError, match=r"unknown parameter 'load\.mass'"):
+        problem(parameters=ParameterSet({n: p for n, p in DRIVE.parameters.items() if n != "load.mass"}))
+    with pytest.raises(UnknownNameError, match="run: unknown parameter 'Ts'"):
+        problem(replace(phase(), duration="Ts"))
+    residuals = Residuals(0, ("positon",), np.zeros((10, 1)), np.ones(1))
+    with pytest.raises(UnknownNameError, match="run: unknown output 'positon'; did you mean 'position'"):
+        problem(residuals=(residuals,))
+
+
+def test_a_phase_takes_its_own_value_where_there_is_one() -> None:
+    own = {"load.mass[b]": Parameter(7.0, "kg", free=True)}
+    posed = problem(phase("a"), phase("b"), parameters=DRIVE.parameters | ParameterSet(own))
+    values = np.array([p.value for p in posed.parameters.values()])
+    mass = list(DRIVE.parameters).index("load.mass")
+    assert values[posed.gather(posed.phases[0])][mass] == DRIVE.parameters.value("load.mass")
+    assert values[posed.gather(posed.phases[1])][mass] == 7.0
+    assert posed.free.tolist() == [len(DRIVE.parameters)]
+
+
+def test_a_term_without_phases_holds_in_all() -> None:
+    posed = problem(phase("a"), phase("b"))
+    cost = Cost("nothing", ca.Function("f", [ca.SX.sym("q")], [0]), Where.PARAMETERS)
+    assert list(phases_of(cost, posed)) == [0, 1]
+    assert list(phases_of(replace(cost, phases=(1,)), posed)) == [1]

@@ -1,0 +1,368 @@
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from pneuopt import commands
+from pneuopt.cli import app
+from pneuopt.experiments import read_log
+from pneuopt.files import read_drive, read_status
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb
+from pneuopt.nlp.least_squares import LeastSquares
+from pneuopt.nlp.status import Code, Status
+from pneuopt.simulate import simulate
+from pneuopt.tomlfile import read_toml
+from pneuopt.trajectories import Trajectory
+from pneuopt.tuningfile import read_tuning
+
+TRUTH = {"load.mass": 6.0, "friction.coulomb": 25.0, "friction.viscous": 40.0, "friction.smoothing": 5e-3}
+DRIVE = """# my axis
+[drive]
+kind = "force"
+[load]
+mass = { value = "5 kg", lower = "1 kg", upper = "20 kg", free = true }   # weighed
+[friction]
+model = "coulomb"
+coulomb = { value = "40 N", free = true }
+viscous = { value = "10 N*s/m", free = true }
+smoothing = "5 mm/s"
+"""
+TUNING = """# my speed loop
+[pid]
+sample_time = "2 ms"
+Kp = { value = "100 N*s/m", lower = "10 N*s/m", upper = "600 N*s/m", free = true }   # by hand
+Ki = "4000 N/m"
+limits = ["-200 N", "200 N"]
+[[reference]]
+step = "0.2 m/s"
+horizon = "0.3 s"
+[minimise]
+settling_time = { band = "5 %" }
+[limits]
+overshoot = "10 %"
+"""
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Two generated logs (ForceDrive with Coulomb friction, 20 um of noise) as text, by name."""
+    system = ForceDrive(Coulomb()).system()
+    texts = {}
+    for seed, name in enumerate(("run_01", "run_02")):
+        t = np.arange(0, 1.0, 2e-3)
+        force = 60 * np.sin(2 * np.pi * 1.7 * t) + 30 * np.sin(2 * np.pi * 3.1 * t + seed)
+        run = simulate(system, Trajectory(t, {"force": force}), system.parameters.with_values(TRUTH), rtol=1e-6)
+        position = 1e3 * (run["position"] + 2e-5 * np.random.default_rng(seed).standard_normal(len(t)))
+        rows = [f"{a:.4f},{b:.5f},{c:.5f}" for a, b, c in zip(t, force, position, strict=True)]
+        texts[name] = "\n".join(["time [s],force [N],position [mm]", *rows]) + "\n"
+    return texts
+
+
+@pytest.fixture
+def folder(tmp_path: Path, logs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name, text in logs.items():
+        (tmp_path / f"{name}.csv").write_text(text, encoding="utf-8")
+    (tmp_path / "drive.toml").write_text(DRIVE, encoding="utf-8")
+    (tmp_path / "tuning.toml").write_text(TUNING, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    return tmp_path
+
+
+def run(line: str) -> Result:
+    return CliRunner().invoke(app, line.split(), catch_exceptions=False)
+
+
+def test_identify_recovers_what_made_the_logs_and_says_so(folder: Path) -> None:
+    result = run("identify drive.toml run_*.csv -o fit.toml --json fit.json --plot fit.png --quiet")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("converged: ")
+    assert result.stderr == ""
+    assert max(map(len, result.stdout.splitlines())) <= 80
+    drive, found = read_drive("fit.toml")
+    assert drive == ForceDrive(Coulomb())
+    said = json.loads(Path("fit.json").read_text(encoding="utf-8"))
+    assert said["status"]["code"] == "converged"
+    assert {row["log"] for row in said["fit"]} == {"run_01", "run_02"}
+    for row in said["estimates"]:
+        assert abs(row["value"] - TRUTH[row["name"]]) < 5 * row["stderr"]
+        assert found.value(row["name"]) == pytest.approx(row["value"], rel=1e-8)
+        assert row["name"] in result.stdout
+    assert "# weighed" in Path("fit.toml").read_text(encoding="utf-8")
+    assert Path("fit.png").stat().st_size > 10_000
+    assert Path("fit_friction.png").stat().st_size > 10_000
+
+
+def test_many_windows_are_shown_in_short(folder: Path) -> None:
+    result = run("identify drive.toml run_01.csv run_02.csv --window 0.1")
+    assert result.exit_code == 0
+    assert "NRMSE [%]: median" in result.stdout
+    assert result.stdout.count("@") == 1
+
+
+def test_tune_certifies_and_its_file_simulates_to_the_same_figures(folder: Path) -> None:
+    result = run("tune drive.toml tuning.toml -o tuned.toml --json tuned.json --plot tuned.svg")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("converged: ")
+    assert "standard form: Kp" in result.stdout
+    said = json.loads(Path("tuned.json").read_text(encoding="utf-8"))
+    certified = said["certified"][0]
+    assert certified["Overshoot"] <= 10.0
+    tuned = read_toml("tuned.toml").unwrap()
+    assert tuned["status"]["code"] == "converged"
+    assert tuned["certified"]["0 to 0.2"]["SettlingTime"] == certified["SettlingTime"]
+    assert {"sha256[drive.toml]", "sha256[tuning.toml]"} <= tuned["provenance"].keys()
+    assert "# by hand" in Path("tuned.toml").read_text(encoding="utf-8")
+    again = run("simulate drive.toml tuned.toml --json again.json -o run.csv --plot run.pdf")
+    assert again.exit_code == 0
+    assert json.loads(Path("again.json").read_text(encoding="utf-8"))["certified"][0]["SettlingTime"] == pytest.approx(
+        certified["SettlingTime"]
+    )
+    response = read_log("run.csv").trajectory
+    assert {"speed_reference", "speed", "force"} <= set(response.names)
+    assert response["speed"][-1] == pytest.approx(0.2, rel=0.05)
+    assert all(Path(f).exists() for f in ("tuned.svg", "tuned_bode.svg", "run.pdf", "run_bode.pdf"))
+
+
+def test_a_tuning_that_fails_says_so_first_and_keeps_the_gains(folder: Path) -> None:
+    Path("tuning.toml").write_text(TUNING + 'settling_time = { max = "3 ms", band = "5 %" }\n', encoding="utf-8")
+    result = run("tune drive.toml tuning.toml -o tuned.toml")
+    assert result.exit_code == 1
+    assert result.stdout.startswith("NOT converged (the limits contradict each other): ")
+    assert "the gains of tuning.toml stand; rejected: pid.Kp" in result.stdout
+    status = read_status("tuned.toml")
+    assert status is not None
+    assert status.code is Code.INFEASIBLE
+    plant = read_drive("drive.toml")[0].system()
+    assert read_tuning("tuned.toml", plant).parameters.value("pid.Kp") == 100.0
+    assert "certified" not in read_toml("tuned.toml")
+
+
+def test_a_log_is_predicted_in_open_loop(folder: Path) -> None:
+    drive = DRIVE.replace("5 kg", "6 kg", 1).replace("40 N", "25 N").replace("10 N*s/m", "40 N*s/m")
+    Path("drive.toml").write_text(drive, encoding="utf-8")
+    result = run("simulate drive.toml --log run_02.csv --json p.json -o p.csv --plot p.png")
+    assert result.exit_code == 0
+    (row,) = json.loads(Path("p.json").read_text(encoding="utf-8"))["fit"]
+    assert (row["log"], row["channel"]) == ("run_02", "position")
+    assert row["nrmse"] < 0.01
+    assert read_log("p.csv").trajectory["position"] == pytest.approx(
+        read_log("run_02.csv").trajectory["position"], abs=2e-4
+    )
+
+
+def test_several_references_make_several_files(folder: Path) -> None:
+    more = '[[reference]]\nstep = "0.1 m/s"\nhorizon = "0.3 s"\n'
+    Path("tuning.toml").write_text(TUNING + more, encoding="utf-8")
+    assert run("simulate drive.toml tuning.toml -o run.csv").exit_code == 0
+    assert Path("run_1.csv").exists()
+    assert Path("run_2.csv").exists()
+    Path("tuning.toml").rename("run_2.csv")
+    taken = run("simulate drive.toml run_2.csv -o run.csv")
+    assert (taken.exit_code, "run_2.csv: is an input" in taken.stderr) == (2, True)
+
+
+def rewrite(folder: Path, name: str, text: str) -> None:
+    (folder / name).write_text(text, encoding="utf-8")
+
+
+def edit(name: str, old: str, new: str) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        text = (folder / name).read_text(encoding="utf-8")
+        assert old in text
+        rewrite(folder, name, text.replace(old, new, 1))
+
+    return apply
+
+
+def cut(folder: Path) -> None:
+    rows = (folder / "run_01.csv").read_text(encoding="utf-8").splitlines()
+    rewrite(folder, "run_01.csv", "\n".join(rows[:8]) + "\n")
+
+
+IDENTIFY = "identify drive.toml run_01.csv -o fit.toml --json fit.json --plot fit.png"
+TUNE = "tune drive.toml tuning.toml -o tuned.toml --json tuned.json --plot tuned.png"
+PRESSURE = 'pressure_dependent = true\n[ambient]\npressure = "1 bar"\n'
+BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
+    "unit missing": (
+        IDENTIFY,
+        edit("drive.toml", '"40 N"', '"40"'),
+        "drive.toml: [friction] coulomb: '40' has no unit",
+    ),
+    "unit wrong": (
+        TUNE,
+        edit("tuning.toml", '"4000 N/m"', '"4000 N*s/m"'),
+        "tuning.toml: [pid] Ki: unit 'N*s/m' does not",
+    ),
+    "bare bar": (
+        IDENTIFY,
+        lambda folder: rewrite(folder, "drive.toml", DRIVE + PRESSURE),
+        "drive.toml: [ambient] pressure: a pressure level in 'bar' may be absolute or gauge; write \"bar(a)\" or",
+    ),
+    "unknown key": (
+        TUNE,
+        edit("tuning.toml", "horizon", "horison"),
+        "[[reference]] 1: unknown key 'horison'; did you mean 'horizon'?",
+    ),
+    "unknown channel": (
+        IDENTIFY,
+        edit("run_01.csv", "position [mm]", "positoin [mm]"),
+        "run_01.csv: column 'positoin [mm]' looks like the channel 'position'",
+    ),
+    "not a number": (
+        IDENTIFY,
+        edit("run_01.csv", "\n0.0020,", "\n0.0020,NaN"),
+        "run_01.csv: row 3, column 'force [N]': 'NaN",
+    ),
+    "time backwards": (IDENTIFY, edit("run_01.csv", "\n0.0080", "\n0.0030"), "run_01.csv: row 6: time runs backwards"),
+    "useless channel": (
+        IDENTIFY,
+        edit("run_01.csv", "position [mm]", "pressure_a [bar(a)]"),
+        "run_01: the model cannot use channel 'pressure_a', it reads force, position, speed",
+    ),
+    "start out of bounds": (
+        IDENTIFY,
+        edit("drive.toml", '"5 kg"', '"50 kg"'),
+        "drive.toml: [load] mass: value 50 kg lies outside its bounds [1, 20]; move the value or the bounds",
+    ),
+    "too short": (IDENTIFY, cut, "run_01.csv: 7 samples are too few; at least 10 are needed"),
+    "missing file": (
+        IDENTIFY.replace("run_01", "run_99"),
+        None,
+        "run_99.csv: cannot be read (No such file or directory)",
+    ),
+    "no match": (IDENTIFY.replace("run_01", "x*"), None, "x*.csv: no file matches"),
+    "output is input": (IDENTIFY.replace("fit.toml", "drive.toml"), None, "drive.toml: is an input of this command"),
+    "output is the sidecar": (IDENTIFY.replace("fit.toml", "run_01.toml"), None, "run_01.toml: is an input"),
+    "folder missing": (TUNE.replace("tuned.json", "out/tuned.json"), None, "out/tuned.json: the folder does not exist"),
+    "figure's format": (
+        TUNE.replace("tuned.png", "tuned.gif"),
+        None,
+        "tuned.gif: a figure is written as .png, .pdf, .svg",
+    ),
+    "nothing free": (
+        IDENTIFY,
+        lambda folder: rewrite(folder, "drive.toml", DRIVE.replace(", free = true", "")),
+        "drive.toml: no parameter is free; mark what to identify",
+    ),
+    "nothing to tune": (TUNE, edit("tuning.toml", ", free = true", ""), "tuning.toml: no gain is free"),
+    "nothing to minimise": (
+        TUNE,
+        edit("tuning.toml", '[minimise]\nsettling_time = { band = "5 %" }\n', ""),
+        "tuning.toml: says nothing to minimise",
+    ),
+    "window": (IDENTIFY + " --window 0.001", None, "windows of 0.001 s hold 0 samples of run_01"),
+    "what to simulate": ("simulate drive.toml -o x.csv", None, "give either a tuning file or --log"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gets_one_message_and_writes_nothing(folder: Path, case: str) -> None:
+    line, spoil, said = BAD[case]
+    if spoil is not None:
+        spoil(folder)
+    before = {p: p.read_bytes() for p in folder.iterdir()}
+    result = run(line)
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert result.stderr.startswith("error: ")
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stdout == ""
+    assert {p: p.read_bytes() for p in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "line", ["identfy", "identify drive.toml", "tune --jsn x", "identify drive.toml x.csv --window two"]
+)
+def test_wrong_usage_is_bad_input(line: str) -> None:
+    result = run(line)
+    assert result.exit_code == 2
+    assert "Error" in result.stderr
+
+
+def test_an_interrupted_fit_is_written_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupting(**_: object) -> LeastSquares:
+        seen: list[str] = []
+
+        def stop(line: str) -> None:
+            seen.append(line)
+            if len(seen) == 4:
+                raise KeyboardInterrupt
+
+        return LeastSquares(progress=stop)
+
+    monkeypatch.setattr(commands, "LeastSquares", interrupting)
+    result = run("identify drive.toml run_01.csv -o fit.toml")
+    assert result.exit_code == 130
+    assert result.stdout.startswith("NOT converged (interrupted): the best iterate so far")
+    status = read_status("fit.toml")
+    assert status is not None
+    assert status.code is Code.INTERRUPTED
+    warned = run("simulate fit.toml --log run_02.csv")
+    assert warned.stderr.startswith("warning: fit.toml: its fit is NOT converged (interrupted)")
+
+
+def test_an_interruption_elsewhere_writes_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "tune", interrupt)
+    before = set(folder.iterdir())
+    result = run("tune drive.toml tuning.toml -o tuned.toml")
+    assert result.exit_code == 130
+    assert result.stderr == "interrupted: no file was left half-written\n"
+    assert set(folder.iterdir()) == before
+
+
+def test_a_fit_that_fails_is_written_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = LeastSquares().stages[:1]
+    monkeypatch.setattr(commands, "LeastSquares", lambda **_: LeastSquares(stages=few, tolerance=1e-9))
+    result = run("identify drive.toml run_01.csv -o fit.toml")
+    assert result.exit_code == 1
+    assert result.stdout.startswith("NOT converged")
+    assert read_status("fit.toml") != Status(Code.CONVERGED)
+
+
+def test_version_and_info() -> None:
+    assert run("--version").stdout.startswith("pneuopt 0.")
+    said = run("info").stdout
+    for word in ("casadi", "compiler", "cache", sys.version.split()[0]):
+        assert word in said
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "sys.argv = ['pneuopt', '--help']\n"
+        "from pneuopt.cli import main\n"
+        "try: main()\n"
+        "except SystemExit as stop: assert stop.code == 0, stop.code\n"
+        "heavy = {'pandas', 'matplotlib', 'scipy', 'casadi', 'numpy', 'pint'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for command in ("identify", "tune", "simulate", "info"):
+        assert f"\n  {command} " in done.stdout
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Ctrl-C cannot be sent to another process there")
+def test_ctrl_c_ends_a_real_process_with_130(folder: Path) -> None:
+    code = (
+        "import os, signal\n"
+        "from pneuopt import commands\n"
+        "commands.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
+        "from pneuopt.cli import main\n"
+        "main()\n"
+    )
+    arguments = [sys.executable, "-c", code, "tune", "drive.toml", "tuning.toml", "-o", "tuned.toml"]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "interrupted: no file was left half-written\n")
+    assert not Path("tuned.toml").exists()

@@ -1,0 +1,322 @@
+import logging
+import os
+import re
+import shutil
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pneuopt import codegen
+from pneuopt.codegen import Pieces, Rollout, compiled
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.errors import ModelError
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
+from pneuopt.system import DiscreteSystem, discretise, vector
+from pneuopt.trajectories import Array
+
+needs_compiler = pytest.mark.skipif(codegen.compiler() is None, reason="no C compiler")
+CACHES = (codegen._build, codegen._say_once, codegen._compiler_version, codegen._temporary_folder)
+
+
+def forget() -> None:
+    for cache in CACHES:
+        cache.cache_clear()
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """Nothing is remembered of what was built or said, before and after."""
+    forget()
+    yield monkeypatch
+    monkeypatch.undo()
+    forget()
+
+
+def loop() -> DiscreteSystem:
+    plant = ForceDrive(Stribeck()).system()
+    return ClosedLoop(plant, PID(sample_time=2e-3), Dither(frequency=100.0)).discrete(4)
+
+
+SYSTEMS: dict[str, Callable[[], DiscreteSystem]] = {
+    "stribeck": lambda: discretise(ForceDrive(Stribeck()).system(), 5),
+    "lugre": lambda: discretise(ForceDrive(LuGre()).system(), 4),
+    "pressure": lambda: discretise(MotionDrive(PressureDependent(Coulomb())).system()),
+    "sampled loop": loop,
+}
+
+
+class Case:
+    """A system with segments of made-up data."""
+
+    def __init__(self, name: str, m: int = 5, n: int = 6) -> None:
+        self.system = SYSTEMS[name]()
+        rng = np.random.default_rng(3)
+        nominal = np.array([q.nominal for q in self.system.states])
+        self.x0 = 0.2 * nominal * rng.standard_normal((m, len(nominal)))
+        self.u = 0.3 * rng.standard_normal((m, n, len(self.system.inputs)))
+        self.u *= np.array([q.nominal for q in self.system.inputs])
+        p = vector(self.system.parameters, self.system.parameters)
+        if name == "sampled loop":
+            set_to = {"pid.Kp": 50.0, "pid.Ki": 100.0, "pid.Kd": 0.5, "pid.Tf": 0.01, "dither.amplitude": 5.0}
+            set_to |= {"pid.lower": -400.0, "pid.upper": 400.0, "pid.Tt": 0.5}
+            p = vector(self.system.parameters, self.system.parameters.with_values(set_to))
+        self.p = p * (1 + 0.1 * rng.random((m, len(p))))
+        self.h = np.full((m, n), 2e-3)
+        self.h[1, 4:] = 0  # a short segment, padded
+        self.t = 0.7 + 2e-3 * np.tile(np.arange(n), (m, 1))
+
+    def rollout(self, wrt: tuple[int, ...] = (), start: bool = False, threads: int | None = 1) -> Rollout:
+        return Rollout(Pieces(self.system.step, self.system.update), wrt, start, threads)
+
+    def run(self, rollout: Rollout, **changed: Array) -> codegen.Run:
+        given = {"x0": self.x0, "u": self.u, "p": self.p, "t": self.t, "h": self.h, **changed}
+        return rollout.run(**given, substeps=self.system.substeps, states=True)
+
+
+def by_hand(case: Case) -> tuple[Array, Array]:
+    """The same run, one CasADi call after another."""
+    ys, ends = [], []
+    for x, u, p, t, h in zip(case.x0, case.u, case.p, case.t, case.h, strict=True):
+        y = []
+        for tj, hj, uj in zip(t, h, u, strict=True):
+            x = x if case.system.update is None else np.array(case.system.update(tj, x, uj, p)).ravel()  # noqa: PLW2901
+            y.append(np.array(case.system.step(tj, 0, x, uj, p)[1]).ravel())
+            for k in range(case.system.substeps):
+                dt = hj / case.system.substeps
+                x = np.array(case.system.step(tj + k * dt, dt, x, uj, p)[0]).ravel()  # noqa: PLW2901
+        ys.append(y)
+        ends.append(x)
+    return np.array(ys), np.array(ends)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_run_is_what_the_steps_give_one_by_one(name: str) -> None:
+    case = Case(name)
+    run, (y, x_end) = case.run(case.rollout()), by_hand(case)
+    assert_allclose(run.y, y, rtol=1e-9, atol=1e-12)
+    assert_allclose(run.x_end, x_end, rtol=1e-9, atol=1e-12)
+    assert run.x is not None
+    assert_array_equal(run.x[:, 0], case.x0)
+    assert run.dy is None
+    assert run.dx_end is None
+
+
+def differences(case: Case, name: str, index: int, step: float) -> tuple[Array, Array]:
+    """Central differences of outputs and end state to one entry of x0 or p, whose size is `step`."""
+    rollout, base = case.rollout(), getattr(case, name)
+    up, down = base.copy(), base.copy()
+    up[:, index] += step
+    down[:, index] -= step
+    high, low = case.run(rollout, **{name: up}), case.run(rollout, **{name: down})
+    return (high.y - low.y) / (2 * step), (high.x_end - low.x_end) / (2 * step)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_sensitivities_are_the_central_differences(name: str) -> None:
+    case = Case(name)
+    nx, wrt = case.x0.shape[1], tuple(range(case.p.shape[1]))
+    run = case.run(case.rollout(wrt, start=True))
+    assert run.dy is not None
+    assert run.dx_end is not None
+    assert run.dy.shape[-1] == run.dx_end.shape[-1] == nx + len(wrt)
+    steps = [("x0", i, 1e-6 * q.nominal) for i, q in enumerate(case.system.states)]
+    steps += [("p", i, 1e-6 * max(abs(case.p[:, i]).max(), 1e-2)) for i in wrt]
+    for column, (which, index, step) in enumerate(steps):
+        dy, dx_end = differences(case, which, index, step)
+        for exact, found in ((dy, run.dy[..., column]), (dx_end, run.dx_end[..., column])):
+            size = np.abs(exact).max(initial=0.0)
+            # differences of 1e-6 lose half the digits, and tanh friction is sharply curved
+            assert_allclose(found, exact, rtol=2e-4, atol=2e-4 * size + 1e-7, err_msg=f"{which}[{index}]")
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_machine_code_and_the_casadi_vm_agree_to_rounding(name: str, fresh: pytest.MonkeyPatch) -> None:
+    case = Case(name)
+    wrt = (0, 2, case.p.shape[1] - 1)
+    fast = case.rollout(wrt, start=True)
+    assert fast.is_compiled
+    forget()
+    fresh.setenv("PNEUOPT_CC", "")
+    slow = case.rollout(wrt, start=True)
+    assert not slow.is_compiled
+    a, b = case.run(fast), case.run(slow)
+    for field in ("y", "x_end", "x", "dy", "dx_end"):
+        left, right = getattr(a, field), getattr(b, field)
+        assert left.shape == right.shape, field
+        assert_allclose(left, right, rtol=1e-9, atol=1e-9 * np.abs(right).max(initial=1e-3), err_msg=field)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 16])
+def test_threads_change_nothing(threads: int) -> None:
+    case = Case("lugre")
+    one, many = (case.run(case.rollout((1,), start=True, threads=k)) for k in (1, threads))
+    for field in ("y", "x_end", "dy", "dx_end"):
+        assert_array_equal(getattr(one, field), getattr(many, field))
+
+
+@pytest.mark.parametrize("cc", [None, ""])
+def test_one_parameter_vector_serves_all_segments(cc: str | None, fresh: pytest.MonkeyPatch) -> None:
+    if cc is not None:
+        fresh.setenv("PNEUOPT_CC", cc)
+    case = Case("stribeck")
+    rollout = case.rollout((0,))
+    shared = case.run(rollout, p=case.p[0])
+    repeated = case.run(rollout, p=np.tile(case.p[0], (5, 1)))
+    assert_array_equal(shared.y, repeated.y)
+
+
+def test_padding_freezes_the_state() -> None:
+    case = Case("stribeck")
+    full, short = case.run(case.rollout()), Case("stribeck")
+    for field in ("u", "t", "h"):
+        setattr(short, field, getattr(case, field)[:, :4])
+    assert_array_equal(full.x_end[1], short.run(short.rollout()).x_end[1])
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"x0": np.zeros((4, 2))}, r"x0: \(4, 2\), expected \(5, 2\)"),
+        ({"u": np.zeros((5, 6, 3))}, r"u: \(5, 6, 3\), expected \(5, 6, 1\)"),
+        ({"p": np.zeros(3)}, r"p has shape \(3,\)"),
+        ({"h": np.zeros((5, 5))}, r"t and h must have shape"),
+    ],
+)
+def test_wrong_shapes_are_refused(changed: dict[str, Array], message: str) -> None:
+    case = Case("stribeck")
+    with pytest.raises(ModelError, match=message):
+        case.run(case.rollout(), **changed)
+
+
+def test_no_substeps_are_refused() -> None:
+    case = Case("stribeck")
+    with pytest.raises(ModelError, match="substeps must be at least 1, got 0"):
+        case.rollout().run(case.x0, case.u, case.p, case.t, case.h, substeps=0)
+
+
+def mixed() -> ca.Function:
+    a, B, c = ca.SX.sym("a"), ca.SX.sym("B", 2, 3), ca.SX.sym("c", 3)
+    sparse = ca.SX(2, 2)
+    sparse[0, 1] = a
+    return ca.Function("f", [a, B, c], [a * B @ c, B.T * a, sparse, ca.SX(0, 1)])
+
+
+@pytest.mark.parametrize("cc", [None, ""])
+def test_compiled_takes_scalars_vectors_and_matrices(cc: str | None, fresh: pytest.MonkeyPatch) -> None:
+    if cc is not None:
+        fresh.setenv("PNEUOPT_CC", cc)
+    B, c = np.arange(6.0).reshape(2, 3), np.array([1.0, -1.0, 2.0])
+    product, turned, sparse, nothing = compiled(mixed())(2.0, B, c)
+    assert_allclose(product, 2 * B @ c)
+    assert_allclose(turned, 2 * B.T)
+    assert_allclose(sparse, [[0, 2], [0, 0]])
+    assert nothing.shape == (0,)
+
+
+def test_results_are_the_callers_own() -> None:
+    f = compiled(mixed())
+    first = f(1.0, np.ones((2, 3)), np.ones(3))[0]
+    f(5.0, np.ones((2, 3)), np.ones(3))
+    assert_array_equal(first, [3.0, 3.0])
+
+
+@needs_compiler
+def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers() -> None:
+    with pytest.raises(ModelError, match="argument 2 has 2 numbers, expected 3"):
+        compiled(mixed())(1.0, np.ones((2, 3)), np.ones(2))
+
+
+def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [r.getMessage() for r in caplog.records if r.name == "pneuopt" and r.levelno >= logging.WARNING]
+
+
+def test_without_a_compiler_one_line_says_so(fresh: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    fresh.setenv("PNEUOPT_CC", "")
+    for name in ("stribeck", "lugre"):
+        assert not Case(name).rollout().is_compiled
+    compiled(mixed())
+    assert len(warnings_in(caplog)) == 1
+    assert "no C compiler found" in warnings_in(caplog)[0]
+
+
+def script(folder: Path, text: str) -> str:
+    path = folder / "cc"
+    path.write_text(text)
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the broken compilers here are shell scripts")
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("#!/bin/sh\necho 'model.c: no licence' >&2; exit 1\n", "no licence"),
+        ("#!/bin/sh\nexit 0\n", "No such file"),
+        ("not a program", "Exec format error"),
+        (
+            '#!/bin/sh\nwhile [ "$1" != -o ]; do shift || exit 0; done; echo junk > "$2"\n',
+            "invalid ELF header|too short",
+        ),
+    ],
+)
+def test_a_broken_compiler_is_a_warning_not_a_crash(
+    text: str, reason: str, fresh: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fresh.setenv("PNEUOPT_CC", script(tmp_path, text))
+    fresh.setenv("PNEUOPT_CACHE", str(tmp_path / "cache"))
+    case = Case("stribeck")
+    slow, again = case.rollout(), case.rollout()
+    assert not slow.is_compiled
+    assert not again.is_compiled
+    assert_allclose(case.run(slow).y, by_hand(case)[0])
+    (warning,) = warnings_in(caplog)
+    assert "failed, the CasADi VM runs instead" in warning
+    assert re.search(reason, warning), warning
+
+
+def test_a_compiler_that_is_not_there_counts_as_none(fresh: pytest.MonkeyPatch) -> None:
+    fresh.setenv("PNEUOPT_CC", "no-such-compiler")
+    assert codegen.compiler() is None
+
+
+@needs_compiler
+def test_an_unwritable_cache_is_a_warning(
+    fresh: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    fresh.setenv("PNEUOPT_CACHE", str(blocked / "cache"))
+    case = Case("stribeck")
+    assert case.rollout().is_compiled
+    assert case.rollout((0,)).is_compiled
+    assert len(warnings_in(caplog)) == 1
+    assert "cannot be written" in warnings_in(caplog)[0]
+    shutil.rmtree(codegen.cache_directory())
+
+
+@needs_compiler
+def test_a_cached_binary_is_loaded_and_a_damaged_one_built_anew(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    fresh.setenv("PNEUOPT_CACHE", str(tmp_path))
+    assert Case("stribeck").rollout().is_compiled
+    (binary,) = tmp_path.iterdir()
+    built = binary.stat().st_mtime_ns
+    forget()
+    assert Case("stribeck").rollout().is_compiled
+    assert binary.stat().st_mtime_ns == built
+    forget()
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    shutil.copy(binary, damaged / binary.name)  # the loaded one must not be touched
+    (damaged / binary.name).write_bytes(b"junk")
+    fresh.setenv("PNEUOPT_CACHE", str(damaged))
+    assert Case("stribeck").rollout().is_compiled
+    assert (damaged / binary.name).stat().st_size > 1000

@@ -1,0 +1,47 @@
+import pytest
+
+from pneuopt.errors import (
+    ConvergenceError,
+    InputError,
+    LogError,
+    ModelError,
+    PneuoptError,
+    UnitError,
+    UnknownNameError,
+    check_known,
+    require,
+)
+
+
+@pytest.mark.parametrize("error", [UnitError, UnknownNameError, LogError, ModelError])
+def test_all_that_the_user_can_mend_is_an_input_error_and_a_value_error(error: type[Exception]) -> None:
+    assert issubclass(error, InputError)
+    assert issubclass(error, ValueError)
+
+
+def test_a_solver_failure_is_no_input_error() -> None:
+    assert issubclass(ConvergenceError, PneuoptError)
+    assert not issubclass(ConvergenceError, InputError)
+
+
+def test_an_unknown_name_offers_the_nearest() -> None:
+    with pytest.raises(UnknownNameError, match=r"run_01: unknown channel 'postion'; did you mean 'position'\?"):
+        check_known("channel", ["speed", "postion"], {"speed", "position"}, "run_01")
+
+
+def test_without_a_near_name_all_are_listed() -> None:
+    with pytest.raises(UnknownNameError, match="unknown channel 'xyz'; known: position, speed"):
+        check_known("channel", ["xyz"], ["speed", "position"])
+    with pytest.raises(UnknownNameError, match="known: none"):
+        check_known("channel", ["xyz"], [])
+
+
+def test_convergence_error_carries_the_solution() -> None:
+    assert ConvergenceError("stopped", {"x": 1}).solution == {"x": 1}
+    assert ConvergenceError("stopped").solution is None
+
+
+def test_require_raises_what_it_is_told() -> None:
+    require(True, "never seen")
+    with pytest.raises(LogError, match="too short"):
+        require(False, "too short", LogError)

@@ -1,0 +1,196 @@
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pneuopt.control.margins import margins
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+from pneuopt.experiments import Experiment, split
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import Coulomb, LuGre
+from pneuopt.models.linear import FirstOrder
+from pneuopt.parameters import ParameterSet
+from pneuopt.plotting import (
+    Response,
+    has_friction_map,
+    plot_bode,
+    plot_fit,
+    plot_friction,
+    plot_prediction,
+    plot_steps,
+    save_figure,
+)
+from pneuopt.simulate import simulate
+from pneuopt.system import Linearisation
+from pneuopt.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DRIVE = ForceDrive(Coulomb())
+TRUTH = DRIVE.parameters.with_values(
+    {"load.mass": 6.0, "load.force": 4.0, "friction.coulomb": 25.0, "friction.viscous": 40.0}
+)
+TRIPLE = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class Fit:
+    parameters: ParameterSet
+    trajectories: Mapping[str, Trajectory]
+
+
+def fitted(seed: int = 0) -> tuple[Experiment, Trajectory]:
+    t = np.arange(0, 1.0, 2e-3)
+    force = 80 * np.sin(2 * np.pi * 1.5 * t + seed)
+    run = simulate(DRIVE.system(), Trajectory(t, {"force": force}), TRUTH, rtol=1e-6)
+    return Experiment(Trajectory(t, {"force": force, "position": run["position"]}), name=f"run_{seed}"), run
+
+
+def texts(axes: "Axes") -> str:
+    return f"{axes.get_xlabel()}|{axes.get_ylabel()}|{axes.get_title()}"
+
+
+def line(axes: "Axes", label: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    (found,) = [q for q in axes.lines if q.get_label() == label]
+    return np.asarray(found.get_xdata(), dtype=float), np.asarray(found.get_ydata(), dtype=float)
+
+
+def lag(gain: float) -> Linearisation:
+    A, B, C, D = (np.array([[v]]) for v in (-1.0, gain, 1.0, 0.0))
+    return Linearisation(A, B, C, D, ("x",), ("u",), ("y",))
+
+
+def test_a_fit_stands_beside_its_log_with_units() -> None:
+    pairs = [fitted(seed) for seed in range(2)]
+    figure = plot_fit(Fit(TRUTH, {e.name: run for e, run in pairs}), [e for e, _ in pairs])
+    assert len(figure.axes) == 4
+    assert [texts(a) for a in figure.axes[:2]] == ["|position [mm]|run_0", "||run_1"]
+    assert figure.axes[3].get_xlabel() == "time [s]"
+    y = line(figure.axes[0], "fitted")[1]
+    assert np.allclose(y, 1e3 * pairs[0][1]["position"])
+    residual = np.asarray(figure.axes[2].lines[0].get_ydata(), dtype=float)
+    assert np.abs(residual).max() < 1e-9
+    assert [q.get_text() for q in figure.legends[0].get_texts()] == ["measured", "fitted"]
+    assert all(a.get_legend() is None for a in figure.axes)
+
+
+def test_windows_of_a_log_share_its_axes_and_many_logs_are_spread() -> None:
+    experiment, run = fitted()
+    windows = split(experiment, 0.25)
+    runs = [run.rows(125 * k, 125 * (k + 1)) for k in range(len(windows))]
+    assert len(plot_prediction(runs, windows, label="predicted").axes) == 2
+    several = [Experiment(experiment.trajectory, name=f"log {k}") for k in range(7)]
+    figure = plot_prediction([run] * 7, several, label="predicted")
+    assert [a.get_title() for a in figure.axes[:3]] == ["log 0", "log 3", "log 6"]
+    assert "3 of 7 logs" in [q.get_text() for q in figure.texts]
+    with pytest.raises(InputError, match="2 runs do not match 1 experiments"):
+        plot_prediction([run, run], [experiment], label="fitted")
+
+
+def test_the_friction_map_is_that_of_the_equations() -> None:
+    experiment, run = fitted()
+    figure = plot_friction(DRIVE.system(), Fit(TRUTH, {"run_0": run}), [experiment])
+    speed, force = line(figure.axes[0], "fitted")
+    smoothing = TRUTH.value("friction.smoothing")
+    assert np.allclose(force, 25 * np.tanh(speed / smoothing) + 40 * speed)
+    v, implied = line(figure.axes[0], "from the logs")
+    good = np.isfinite(implied) & (np.abs(v) > 0.1)
+    assert good.sum() > 100
+    error = np.abs(implied - (25 * np.sign(v) + 40 * v))[good]
+    assert np.median(error) < 0.7
+    assert error.max() < 5.0
+    assert texts(figure.axes[0]) == "speed [m/s]|friction force [N]|"
+
+
+def test_a_rig_shows_its_measured_force() -> None:
+    rig = MotionDrive(Coulomb(), chamber=False)
+    t = np.linspace(0, 1, 50)
+    speed = 0.1 * np.sin(6 * t)
+    measured = 12 * np.sign(speed)
+    experiment = Experiment(Trajectory(t, {"speed": speed, "force": measured}))
+    figure = plot_friction(
+        rig.system(), Fit(rig.parameters, {"": Trajectory(t, {"force": measured + 1})}), [experiment]
+    )
+    assert np.array_equal(line(figure.axes[0], "from the logs")[1], measured)
+    assert np.array_equal(line(figure.axes[0], "fitted")[1], measured + 1)
+    assert figure.axes[0].get_ylabel() == "force [N]"
+    assert not has_friction_map(ForceDrive(LuGre()).system())
+    assert not has_friction_map(FirstOrder().system())
+    with pytest.raises(InputError, match="a friction map is drawn for"):
+        plot_friction(FirstOrder().system(), Fit(rig.parameters, {}), [experiment])
+
+
+def test_steps_show_band_reference_and_command() -> None:
+    t = np.linspace(0, 1, 101)
+    run = Trajectory(t, {"speed": 0.2 * (1 - np.exp(-t / 0.1)), "control": 3 * np.exp(-t)})
+    wild = Trajectory(t, {"speed": 1e6 * t, "control": 1e6 * t})
+    step = Step(0.2, at=0.0, horizon=1.0)
+    figure = plot_steps([Response(run, step, "speed", ("m/s", "V"), wild)], band=0.05)
+    top, bottom = figure.axes
+    assert texts(top) == "|speed [m/s]|0 to 0.2 m/s"
+    assert texts(bottom) == "time [s]|command [V]|"
+    (band,) = top.collections
+    assert band.get_datalim(top.transData).intervaly.tolist() == pytest.approx([0.19, 0.21])
+    assert top.get_ylim()[1] < 0.5
+    assert [q.get_text() for q in figure.legends[0].get_texts()] == [
+        "± 5 % of the step",
+        "reference",
+        "before",
+        "tuned",
+    ]
+    alone = plot_steps([Response(run, step, "speed", ("m/s", "V"))] * 4)
+    assert [a.get_title() for a in alone.axes[:3]] == ["0 to 0.2 m/s"] * 3
+    assert "3 of 4 steps" in [q.get_text() for q in alone.texts]
+    with pytest.raises(InputError, match="no response"):
+        plot_steps([])
+
+
+def test_under_dither_the_average_is_drawn_that_the_metrics_read() -> None:
+    t = np.linspace(0, 1, 1001)
+    run = Trajectory(t, {"speed": 0.2 + 0.05 * np.sin(2 * np.pi * 50 * t), "control": t})
+    figure = plot_steps([Response(run, Step(0.2), "speed", ("m/s", "V"), dither_period=0.02)])
+    at, mean = line(figure.axes[0], "simulated, averaged")
+    assert np.allclose(mean, 0.2, atol=1e-12)
+    assert (at[0], at[-1]) == pytest.approx((0.0095, 0.9905))
+
+
+@pytest.mark.parametrize("gain", [1.0, 4.0])
+def test_bode_marks_the_margins(gain: float) -> None:
+    A, B, C, D = TRIPLE, np.array([[0.0], [0.0], [gain]]), np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1))
+    loop = Linearisation(A, B, C, D, ("x", "v", "a"), ("u",), ("x",))
+    m, figure = margins(loop), plot_bode(loop)
+    top, bottom = figure.axes
+    labels = [q.get_text() for q in figure.legends[0].get_texts()]
+    assert labels == [
+        f"gain margin {20 * np.log10(m.gain_margin):.1f} dB at {m.phase_crossover:.3g} rad/s",
+        f"phase margin {m.phase_margin:.1f}° at {m.gain_crossover:.3g} rad/s",
+    ]
+    ends = line(bottom, labels[1])[1]
+    assert ends[0] == pytest.approx(-180)
+    assert ends[1] - ends[0] == pytest.approx(m.phase_margin, abs=0.05)
+    assert line(top, labels[0])[1][1] == pytest.approx(-20 * np.log10(m.gain_margin))
+    assert ("UNSTABLE" in top.get_title()) == (gain > 2)
+    assert texts(bottom).startswith("frequency [rad/s]|phase [deg]")
+
+
+def test_a_loop_without_crossings_has_no_marks() -> None:
+    figure = plot_bode(lag(0.5))
+    assert figure.legends == []
+    assert "Ms = 1" in figure.axes[0].get_title()
+
+
+@pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("SVG", b"<?xml")])
+def test_a_figure_is_written_by_its_suffix(tmp_path: Path, suffix: str, start: bytes) -> None:
+    save_figure(plot_bode(lag(5.0)), tmp_path / f"bode.{suffix}")
+    assert (tmp_path / f"bode.{suffix}").read_bytes().startswith(start)
+    with pytest.raises(InputError, match=r"bode\.jpg: a figure is written as \.png, \.pdf, \.svg; name it so"):
+        save_figure(plot_bode(lag(5.0)), tmp_path / "bode.jpg")
+    with pytest.raises(InputError, match="the folder does not exist"):
+        save_figure(plot_bode(lag(5.0)), tmp_path / "none" / "bode.png")
+    assert len(list(tmp_path.iterdir())) == 1

@@ -1,0 +1,262 @@
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import ConvergenceError, InputError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck, Viscous
+from pneuopt.models.linear import FirstOrder
+from pneuopt.models.paper2015 import paper_plant
+from pneuopt.nlp.status import Code
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
+from pneuopt.tune import TuningResult, evaluate, tune
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.two_phase import TwoPhase, is_linear
+
+STEP = Step(1.0)
+LIMITS: list[Requirement] = [Overshoot(2e-4), PeakControl(1.225), MaxSensitivity(1.2)]
+GAINS = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.Tf")
+
+
+def benchmark() -> tuple[ClosedLoop, ParameterSet]:
+    """The paper's loop at half gain, with the paper's PID."""
+    plant, printed = paper_plant(0.5)
+    loop = ClosedLoop(plant, PID(limits=False), Dither())
+    given = {"pid.Kp": 0.225, "pid.Ki": 1.23, "pid.Kd": 0.01, "pid.Tf": 0.01}
+    bounds = {"pid.Kp": (0.0, 1.0), "pid.Ki": (0.0, 5.0), "pid.Kd": (0.0, 0.05), "pid.Tf": (0.005, 0.05)}
+    return loop, (loop.parameters | printed).with_values(given).with_bounds(bounds).freed(*bounds)
+
+
+def settled(parameters: ParameterSet, band: float, horizon: float = 1.0) -> float:
+    """Settling time of the benchmark by the matrix exponential, which shares nothing with pneuopt."""
+    Kp, Ki, Kd, Tf = (parameters.value(n) for n in GAINS)
+    u = np.array([-Kp - Kd / Tf, 0.0, 1.0, -Kd / Tf, Kp + Kd / Tf])
+    A = np.zeros((5, 5))
+    A[0, 1], A[2], A[3] = 1.0, [-Ki, 0, 0, 0, Ki], np.array([-1, 0, 0, -1, 1]) / Tf
+    A[1] = 635.06 * u + np.array([-86.34, -17.5, 0, 0, 0])
+    h, x, t = 1e-4, np.array([0.0, 0, 0, 0, 1.0]), 0.0
+    step, last = expm(A * h), 0.0
+    while t < horizon:
+        last = t if abs(x[0] - 1) > band else last
+        x, t = step @ x, t + h
+    return last
+
+
+@cache
+def tuned() -> TuningResult:
+    loop, parameters = benchmark()
+    given = parameters.with_bounds({"dither.amplitude": (0.0, 0.1)}).freed("dither.amplitude")
+    return tune(loop, STEP, given, minimise=SettlingTime(0.001), subject_to=LIMITS, method=TwoPhase(starts=1))
+
+
+def test_the_benchmark_reaches_its_optimum_as_printed() -> None:
+    best = tuned()
+    assert best.status.converged
+    certified = best.certified["0 to 1"]
+    assert certified["SettlingTime"] == pytest.approx(0.203, abs=0.004)
+    assert certified["Overshoot"] <= 0.02
+    assert certified["PeakControl"] <= 1.225
+    assert certified["MaxSensitivity"] <= 1.2
+    for n in GAINS:
+        assert float(f"{best.parameters.value(n):.4g}") == best.parameters.value(n)
+    assert settled(best.parameters, 0.001) == pytest.approx(certified["SettlingTime"], abs=2e-4)
+
+
+def test_claim_and_certificate_agree() -> None:
+    best = tuned()
+    assert best.stats["deviation.SettlingTime"] < 1e-3
+    assert best.claimed["0 to 1"]["Overshoot"] == pytest.approx(best.certified["0 to 1"]["Overshoot"], abs=1e-3)
+
+
+def test_what_holds_the_optimum_is_named() -> None:
+    assert {"settling band", "Overshoot", "PeakControl"} <= set(tuned().active)
+    assert "MaxSensitivity" not in tuned().active
+
+
+def test_dither_without_effect_stays_and_is_said() -> None:
+    assert tuned().parameters.value("dither.amplitude") == 0.0
+    assert "dither.amplitude left as given" in str(tuned().status)
+
+
+def test_only_the_free_gains_change() -> None:
+    parameters = benchmark()[1]
+    for n in parameters:
+        if n not in GAINS:
+            assert tuned().parameters.value(n) == parameters.value(n)
+    assert repr(tuned()).startswith("TuningResult converged")
+
+
+def test_a_first_order_plant_has_a_known_answer() -> None:
+    """P control of y' = -y + u: the settling time falls with the gain, which the peak of the command bounds."""
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    given = loop.parameters.with_values({"plant.time_constant": 1.0, "pid.b": 1.0}).with_bounds(
+        {"pid.Kp": (1.0, 500.0)}
+    )
+    best = tune(
+        loop,
+        Step(2.0),
+        given.freed("pid.Kp"),
+        minimise={SettlingTime(0.05): 1.0},
+        subject_to=[PeakControl(100.0)],
+        method=TwoPhase(starts=2, digits=None),
+    )
+    kp, share = best.parameters.value("pid.Kp"), 1 / 51
+    assert kp == pytest.approx(50.0, rel=1e-3)
+    assert best.certified["0 to 2"]["SettlingTime"] == pytest.approx(-math.log((0.05 - share) * 51 / 50) / 51, rel=0.01)
+    assert "PeakControl" in best.active
+
+
+def test_weighted_terms_trade_off() -> None:
+    loop, parameters = benchmark()
+    limits: list[Requirement] = [PeakControl(1.225), MaxSensitivity(1.4)]
+    terms: list[dict[Requirement, float]] = [{SettlingTime(0.02): 1.0, MaxSensitivity(): w} for w in (1e-3, 1.0)]
+    fast, calm = (
+        tune(loop, STEP, parameters, minimise=m, subject_to=limits, method=TwoPhase((20, 25), starts=1)).certified[
+            "0 to 1"
+        ]
+        for m in terms
+    )
+    assert fast["SettlingTime"] < calm["SettlingTime"]
+    assert fast["MaxSensitivity"] > calm["MaxSensitivity"]
+
+
+def test_impossible_limits_keep_the_given_gains() -> None:
+    loop, parameters = benchmark()
+    with pytest.raises(ConvergenceError, match="given gains stand") as caught:
+        tune(
+            loop,
+            STEP,
+            parameters,
+            minimise=SettlingTime(0.001, max=0.05),
+            subject_to=LIMITS,
+            method=TwoPhase(starts=1),
+        )
+    result = caught.value.solution
+    assert result.status.code in {Code.INFEASIBLE, Code.ITERATION_LIMIT, Code.NOT_CONVERGED}
+    assert [result.parameters.value(n) for n in GAINS] == [parameters.value(n) for n in GAINS]
+    assert "limit" in result.status.message
+
+
+def test_an_optimum_that_grazes_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a margin and without digits to spare, two printed digits cannot keep a band of 0.1 %."""
+    loop, parameters = benchmark()
+    method = TwoPhase(starts=1, margin=0.0, digits=2)
+    result = tune(loop, STEP, parameters, minimise=SettlingTime(0.001), subject_to=LIMITS, method=method, throw=False)
+    assert result.status.code is Code.NOT_CERTIFIED
+    assert [result.parameters.value(n) for n in GAINS] == [parameters.value(n) for n in GAINS]
+    assert result.stats["rejected.pid.Kp"] != parameters.value("pid.Kp")
+
+
+def friction_loop(sample_time: float | None = 1e-3) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=sample_time), Dither(80.0))
+    values = {"friction.coulomb": 40.0, "friction.static": 70.0, "friction.stribeck_velocity": 0.02}
+    values |= {"friction.viscous": 80.0, "pid.Kp": 200.0, "pid.Ki": 500.0, "pid.lower": -300.0, "pid.upper": 300.0}
+    bounds = {"pid.Kp": (10.0, 1000.0), "pid.Ki": (1.0, 10000.0), "dither.amplitude": (0.0, 50.0)}
+    bounds |= {"dither.offset": (-100.0, 100.0)}
+    return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
+
+
+def test_a_drive_with_friction_is_tuned_by_screening() -> None:
+    loop, parameters = friction_loop()
+    assert not is_linear(loop)
+    references = [Step(0.1, horizon=0.5), Step(0.25, horizon=0.5)]
+    limits: list[Requirement] = [Overshoot(0.05), MaxSensitivity(1.6)]
+    method = Screening(members=20, generations=4, refinements=60)
+    best = tune(loop, references, parameters, minimise=SettlingTime(), subject_to=limits, method=method)
+    before = evaluate(loop, references, parameters)
+    assert list(best.certified) == ["0 to 0.1", "0 to 0.25"]
+    assert bool((best.certified.loc["SettlingTime"] < 0.06).all())
+    assert not bool((before.loc["SettlingTime"] < 0.06).all())
+    assert bool((best.certified.loc["Overshoot"] <= 5.0).all())
+    assert bool((best.certified.loc["PeakControl"] <= 300.0).all())
+    assert best.stats["deviation.SettlingTime"] < 2e-3
+
+
+def test_linear_is_decided_by_structure() -> None:
+    assert is_linear(ClosedLoop(ForceDrive(Viscous()).system(), PID()))
+    assert not is_linear(friction_loop(None)[0])
+    assert not is_linear(ClosedLoop(ForceDrive(Viscous()).system(), PID(sample_time=1e-3)))
+
+
+def test_evaluate_agrees_with_the_matrix_exponential() -> None:
+    loop, parameters = benchmark()
+    found = evaluate(loop, STEP, parameters, band=0.001)["0 to 1"]
+    assert found["SettlingTime"] == pytest.approx(settled(parameters, 0.001), abs=2e-4)
+    assert found["SettlingTime"] == pytest.approx(0.503, abs=1e-3)
+    assert found["MaxSensitivity"] == pytest.approx(1.0643, abs=1e-4)
+
+
+def test_a_sampled_derivative_without_a_filter_has_margins() -> None:
+    plant, printed = paper_plant(0.5)
+    loop = ClosedLoop(plant, PID(sample_time=1e-3))
+    gains = {"pid.Kp": 0.225, "pid.Ki": 1.23, "pid.Kd": 0.001}
+    filtered, bare = (
+        evaluate(loop, STEP, (loop.parameters | printed).with_values({**gains, "pid.Tf": Tf}))["0 to 1"]
+        for Tf in (1e-4, 0.0)
+    )
+    assert bare["MaxSensitivity"] == pytest.approx(filtered["MaxSensitivity"], rel=1e-2)
+
+
+def test_a_step_that_comes_later_settles_as_long() -> None:
+    loop, parameters = benchmark()
+    late = evaluate(loop, Step(1.0, at=0.25, horizon=1.25), parameters, band=0.001)["0 to 1"]
+    assert late["SettlingTime"] == pytest.approx(0.503, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda p: p.fixed(*GAINS), "nothing is free"),
+        (lambda p: p.freed("plant.gain"), "plant.gain is free"),
+        (lambda p: p.with_bounds({"pid.Kd": (0.0, math.inf)}), "pid.Kd is free .* finite bounds"),
+        (
+            lambda p: p.fixed(*GAINS).with_bounds({"dither.amplitude": (0, 1)}).freed("dither.amplitude"),
+            "no effect|without effect",
+        ),
+    ],
+)
+def test_bad_parameters_are_refused(edit, words: str) -> None:  # type: ignore[no-untyped-def]
+    loop, parameters = benchmark()
+    with pytest.raises(InputError, match=words):
+        tune(loop, STEP, edit(parameters), minimise=SettlingTime())
+
+
+def test_no_reference_is_refused() -> None:
+    loop, parameters = benchmark()
+    with pytest.raises(InputError, match="no reference"):
+        tune(loop, [], parameters, minimise=SettlingTime())
+
+
+def test_two_phase_refuses_friction() -> None:
+    loop, parameters = friction_loop(None)
+    with pytest.raises(InputError, match="Screening"):
+        tune(loop, STEP, parameters, minimise=SettlingTime(), method=TwoPhase())
+
+
+def test_steady_state_error_can_be_a_limit() -> None:
+    """Without integral action the error 1/(1 + K) is a lower bound on the gain."""
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    given = loop.parameters.with_bounds({"pid.Kp": (1.0, 100.0)}).freed("pid.Kp")
+    best = tune(
+        loop,
+        Step(1.0),
+        given,
+        minimise=PeakControl(),
+        subject_to=[SteadyStateError(0.1)],
+        method=TwoPhase((20, 25), starts=1),
+    )
+    assert best.parameters.value("pid.Kp") == pytest.approx(1 / 0.097 - 1, rel=1e-3)
+
+
+def test_modes_too_fast_for_the_grid_are_refused() -> None:
+    loop, parameters = benchmark()
+    with pytest.raises(InputError, match=r"raise the lower one of pid\.Tf"):
+        tune(loop, STEP, parameters.with_bounds({"pid.Tf": (1e-5, 0.05)}), minimise=SettlingTime())

@@ -1,0 +1,257 @@
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+from pneuopt.files import read_status
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb, PressureDependent
+from pneuopt.models.linear import SecondOrder
+from pneuopt.nlp.status import Code, Status
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.tomlfile import read_toml
+from pneuopt.tuningfile import Tuning, read_tuning, write_tuned
+
+PLANT = SecondOrder().system()
+TUNING = """# my loop, 2024
+[pid]
+form = "parallel"          # | standard
+sample_time = "1 ms"       # leave out: continuous
+Kp = { value = "2 V*s/m", lower = "0.2 V*s/m", upper = "60 V*s/m", free = true }   # by hand
+Ki = { value = "5 V/m", lower = "0 V/m", upper = "100 V/m", free = true }
+Tf = "2 ms"
+limits = ["-5 V", "5 V"]
+
+[dither]
+waveform = "sine"
+frequency = "160 Hz"
+amplitude = { value = "0 V", lower = "0 V", upper = "2 V", free = true }
+offset = "0 V"
+
+[[reference]]
+step = "0.2 m/s"
+horizon = "1 s"
+
+[[reference]]   # the way back
+step = "-100 mm/s"
+initial = "0.2 m/s"
+at = "50 ms"
+horizon = "1 s"
+
+[minimise]
+settling_time = { band = "2 %", weight = 1.0 }
+overshoot = { weight = 2 }
+
+[limits]
+overshoot = "5 %"
+steady_state_error = 0.01
+settling_time = { max = "500 ms", band = 0.02 }
+max_sensitivity = 1.6
+peak_control = "4500 mV"
+"""
+
+
+@dataclass(frozen=True)
+class Tuned:
+    parameters: ParameterSet
+    certified: pd.DataFrame = field(
+        default_factory=lambda: pd.DataFrame({"0 to 0.2": {"SettlingTime": np.float64(0.25)}})
+    )
+    status: Status = field(default_factory=lambda: Status(Code.CONVERGED, "certified"))
+    provenance: Mapping[str, Any] = field(default_factory=lambda: {"pneuopt": "0.1"})
+
+
+def written(folder: Path, text: str, name: str = "tuning.toml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_reads_what_design_draws(tmp_path: Path) -> None:
+    tuning = read_tuning(written(tmp_path, TUNING), PLANT)
+    assert tuning.loop.plant is PLANT
+    assert (tuning.loop.pid, tuning.loop.dither) == (PID(sample_time=1e-3), Dither(160.0))
+    assert tuning.references == (Step(0.2, horizon=1.0), Step(-0.1, at=0.05, initial=0.2, horizon=1.0))
+    assert tuning.minimise == {SettlingTime(0.02): 1.0, Overshoot(): 2.0}
+    limits = {Overshoot(0.05), SteadyStateError(0.01), SettlingTime(0.02, 0.5), MaxSensitivity(1.6), PeakControl(4.5)}
+    assert set(tuning.subject_to) == limits
+    given = tuning.parameters
+    assert given.free_names == ("pid.Kp", "pid.Ki", "dither.amplitude")
+    assert (given["pid.Kp"].value, given["pid.Kp"].lower, given["pid.Kp"].upper) == (2.0, 0.2, 60.0)
+    assert [given.value(f"pid.{n}") for n in ("Kd", "Tf", "b", "c", "lower", "upper")] == [
+        0.0,
+        2e-3,
+        1.0,
+        1.0,
+        -5.0,
+        5.0,
+    ]
+    assert all(n.startswith(("pid.", "dither.")) for n in given)
+
+
+def test_a_short_file_describes_a_continuous_loop_without_limits(tmp_path: Path) -> None:
+    text = '[pid]\nKp = "2 V*s/m"\n[[reference]]\nstep = "0.1 m/s"\nhorizon = "1 s"\n'
+    tuning = read_tuning(written(tmp_path, text), PLANT)
+    assert (tuning.loop.pid, tuning.loop.dither) == (PID(limits=False), None)
+    assert (tuning.minimise, tuning.subject_to, tuning.parameters.free_names) == ({}, (), ())
+
+
+def test_the_standard_form_is_converted(tmp_path: Path) -> None:
+    gains = '[pid]\nform = "standard"\nKp = "2 V*s/m"\nTi = "500 ms"\nTd = "250 ms"\nN = 10\nb = 0.5\n'
+    text = gains + '[[reference]]\nstep = "0.1 m/s"\nhorizon = "1 s"\n'
+    given = read_tuning(written(tmp_path, text), PLANT).parameters
+    assert [given.value(f"pid.{n}") for n in ("Kp", "Ki", "Kd", "Tf", "b")] == pytest.approx(
+        [2.0, 4.0, 0.5, 0.025, 0.5]
+    )
+    with pytest.raises(
+        InputError, match=r"\[pid\] Kp: the standard form takes values only; tune in form = \"parallel\""
+    ):
+        read_tuning(written(tmp_path, text.replace('"2 V*s/m"', '{ value = "2 V*s/m", free = true }')), PLANT)
+    with pytest.raises(InputError, match=r"\[pid\] Ki does not belong to the standard form, which has Kp, Ti, Td, N"):
+        read_tuning(written(tmp_path, text.replace("Ti", "Ki")), PLANT)
+
+
+def test_the_loop_says_which_signals_where_the_plant_has_several(tmp_path: Path) -> None:
+    plant = ForceDrive(PressureDependent(Coulomb())).system()
+    text = '[pid]\nKp = "200 N/m"\n[[reference]]\nstep = "10 mm"\nhorizon = "1 s"\n[loop]\n'
+    signals = 'actuated = "force"\nmeasured = "position"\n'
+    tuning = read_tuning(written(tmp_path, text + signals), plant)
+    assert (tuning.loop.command.name, tuning.loop.feedback.name) == ("force", "position")
+    assert tuning.references == (Step(0.01),)
+    with pytest.raises(
+        InputError, match=r"tuning\.toml: the plant has the inputs force, pressure_a, pressure_b; choose"
+    ):
+        read_tuning(written(tmp_path, text), plant)
+    with pytest.raises(InputError, match=r"unknown output 'positon'; did you mean 'position'"):
+        read_tuning(written(tmp_path, text + signals.replace("position", "positon")), plant)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[pid]", "[pd]", ": unknown section 'pd'; did you mean 'pid'?"),
+        ("[minimise]", "[scenarios]", ": unknown section 'scenarios'"),
+        ('"parallel"', '"paralel"', "[pid]: unknown form 'paralel'; did you mean 'parallel'?"),
+        ("Tf = ", "Tff = ", "[pid]: unknown key 'Tff'; did you mean 'Tf'?"),
+        ("Tf = ", "Td = ", "[pid] Td does not belong to the parallel form, which has Kp, Ki, Kd, Tf, b, c, Tt"),
+        ('"1 ms"', '"1"', "[pid] sample_time: '1' has no unit"),
+        ('"1 ms"', '"0 ms"', "[pid]: PID: sample_time must be positive"),
+        ('"1 ms"', '"10 ms"', "dither.frequency 160 Hz cannot be sampled every 10 ms"),
+        ('"2 V*s/m", lower', '"2 V", lower', "[pid] Kp: unit 'V' does not measure 'V*s/m'"),
+        ('"2 V*s/m", lower', '"99 V*s/m", lower', "[pid] Kp: value 99 V*s/m lies outside its bounds [0.2, 60]"),
+        (', upper = "60 V*s/m"', "", "[pid] Kp is free, so it needs both bounds: lower and upper"),
+        ("upper = ", "uper = ", "[pid] Kp: unknown key 'uper'; did you mean 'upper'?"),
+        ('["-5 V", "5 V"]', '"5 V"', '[pid] limits must be a pair: ["-5 V", "5 V"]'),
+        ('["-5 V", "5 V"]', '["5 V", "-5 V"]', "[pid] limits: 5 V is not below -5 V"),
+        ('limits = ["-5 V", "5 V"]', 'Tt = "1 s"', "[pid] Tt unwinds the integral at limits; write limits, too"),
+        ('"sine"', '"square"', "[dither]: unknown waveform 'square'"),
+        ('frequency = "160 Hz"', "", '[dither] says no frequency; write frequency = "160 Hz"'),
+        ('"160 Hz"', '"1000 rad/s"', "[dither] frequency: unit 'rad/s' does not measure 'Hz'; write it in Hz"),
+        ("offset = ", "ofset = ", "[dither]: unknown key 'ofset'; did you mean 'offset'?"),
+        ('waveform = "sine"', "analogue = 1", "[dither] analogue must be true or false"),
+        ("horizon", "horizn", "[[reference]] 1: unknown key 'horizn'; did you mean 'horizon'?"),
+        ('horizon = "1 s"\n\n[[ref', "\n[[ref", "[[reference]] 1 says no horizon"),
+        ('"0.2 m/s"\nhorizon', '"0 m/s"\nhorizon', "[[reference]] 1: Step: size must not be zero"),
+        ('step = "-100 mm/s"\ninitial = "0.2 m/s"', 'step = "0.2 m/s"', "two references step between the same values"),
+        ("[[reference]]   #", "[reference2]   #", ": unknown section 'reference2'; did you mean 'reference'?"),
+        ("overshoot = {", "overshot = {", "[minimise]: unknown requirement 'overshot'; did you mean 'overshoot'?"),
+        (
+            "{ weight = 2 }",
+            "2",
+            "[minimise] overshoot: write overshoot = { weight = 1.0 }; a limit belongs under [limits]",
+        ),
+        ("{ weight = 2 }", "{ weight = 0 }", "[minimise] overshoot: weight must be positive, got 0"),
+        ("{ weight = 2 }", "{ band = 0.1 }", "[minimise] overshoot: unknown key 'band'"),
+        ('band = "2 %"', 'band = "3 %"', "[minimise] and [limits]: settling bands differ: [0.02, 0.03]"),
+        ('"5 %"', '"5 mm"', "[limits] overshoot: unit 'mm' does not measure '1'"),
+        ('"5 %"', '"500 %"', "[limits] overshoot: Overshoot: max is a fraction below 1"),
+        ("= 1.6", "= 0.9", "[limits] max_sensitivity: MaxSensitivity: max must be above 1"),
+        ('max = "500 ms", ', "", "[limits] settling_time says no max"),
+        ('"4500 mV"', "4.5", '[limits] peak_control: 4.5 has no unit; write "4.5 V"'),
+        ("[limits]\n", "[[limits]]\n", ": limits must be a section, [limits]"),
+    ],
+)
+def test_refuses_a_tuning_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in TUNING
+    path = written(tmp_path, TUNING.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        read_tuning(path, PLANT)
+    assert str(error.value).startswith(f"{path}: ")
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("# nothing\n", "no controller; add a section [pid]"),
+        ('[pid]\nKi = "1 V/m"\n', "[pid] says no gain; write at least Kp"),
+        ('[pid]\nKp = "2 V*s/m"\n', "no reference; add [[reference]]"),
+        ('[pid]\nKp = "2 V*s/m"\n[reference]\nstep = "1 m/s"\n', "write each reference as a section of its own, [[ref"),
+    ],
+)
+def test_refuses_what_is_missing(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError) as error:
+        read_tuning(written(tmp_path, text), PLANT)
+    assert said in str(error.value)
+
+
+def read_all(folder: Path, tuned: Mapping[str, float]) -> tuple[Tuning, ParameterSet]:
+    given = read_tuning(written(folder, TUNING), PLANT)
+    return given, given.parameters.with_values(tuned)
+
+
+def test_a_tuned_file_keeps_the_users_text_and_adds_the_results(tmp_path: Path) -> None:
+    given, found = read_all(tmp_path, {"pid.Kp": 12.34, "pid.Ki": 56.78, "dither.amplitude": 0.5})
+    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", Tuned(PLANT.parameters | found))
+    text = (tmp_path / "tuned.toml").read_text(encoding="utf-8")
+    for kept in (
+        "# my loop, 2024",
+        "# by hand",
+        "# the way back",
+        'lower = "0.2 V*s/m"',
+        '"12.34 V*s/m"',
+        '"56.78 V/m"',
+    ):
+        assert kept in text
+    again = read_tuning(tmp_path / "tuned.toml", PLANT)
+    assert again.parameters == found
+    assert (again.references, again.minimise, again.subject_to) == (given.references, given.minimise, given.subject_to)
+    said = read_toml(tmp_path / "tuned.toml").unwrap()
+    assert said["certified"] == {"0 to 0.2": {"SettlingTime": 0.25}}
+    assert said["provenance"] == {"pneuopt": "0.1"}
+    assert read_status(tmp_path / "tuned.toml") == Status(Code.CONVERGED, "certified")
+
+
+def test_a_failed_tuning_keeps_the_old_gains_and_no_old_certificate(tmp_path: Path) -> None:
+    _, found = read_all(tmp_path, {"pid.Kp": 12.34})
+    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", Tuned(found))
+    failed = Tuned(found.with_values({"pid.Kp": 50.0}), status=Status(Code.NOT_CERTIFIED, "grazes the band"))
+    write_tuned(tmp_path / "again.toml", tmp_path / "tuned.toml", failed)
+    assert read_tuning(tmp_path / "again.toml", PLANT).parameters.value("pid.Kp") == 12.34
+    said = read_toml(tmp_path / "again.toml").unwrap()
+    assert "certified" not in said
+    assert said["status"]["gains"] == "as in tuned.toml: not tuned"
+    assert read_status(tmp_path / "again.toml") == failed.status
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.2, 60.0), st.floats(0.0, 100.0), st.floats(0.0, 2.0))
+def test_any_gains_read_back(tmp_path_factory: pytest.TempPathFactory, Kp: float, Ki: float, amplitude: float) -> None:
+    folder = tmp_path_factory.mktemp("tuned")
+    _, found = read_all(folder, {"pid.Kp": Kp, "pid.Ki": Ki, "dither.amplitude": amplitude})
+    write_tuned(folder / "tuned.toml", folder / "tuning.toml", Tuned(found))
+    again = read_tuning(folder / "tuned.toml", PLANT).parameters
+    assert again.free_names == found.free_names
+    for name, parameter in found.items():
+        assert again.value(name) == pytest.approx(parameter.value, rel=1e-8)
