@@ -10,7 +10,7 @@ PY := $(BIN)/python
 .PHONY: demo test test-slow lint format clean
 
 demo: .venv/installed
-	$(PY) problems/rig_demo.py --out out/rig_demo
+	$(PY) problems/rig_demo.py --out out
 
 test: .venv/installed lint
 	$(PY) -m pytest --cov --cov-report=term

@@ -37,10 +37,21 @@ _HOME = {
     "pneuopt.nlp.full_space": ("FullSpace",),
     "pneuopt.experiments": ("Experiment", "differentiate", "read_log", "resample", "split"),
     "pneuopt.simulate": ("simulate",),
-    "pneuopt.identify": ("IdentificationResult", "identify", "validate"),
+    "pneuopt.identify": ("IdentificationResult", "identify", "predict", "validate"),
     "pneuopt.requirements": ("MaxSensitivity", "Overshoot", "PeakControl", "SettlingTime", "SteadyStateError"),
-    "pneuopt.tune": ("TuningResult", "evaluate", "tune"),
+    "pneuopt.tuning.screening": ("Screening",),
+    "pneuopt.tuning.two_phase": ("TwoPhase",),
+    "pneuopt.tune": ("TuningResult", "evaluate", "respond", "tune"),
     "pneuopt.files": ("read_drive", "write_fit"),
+    "pneuopt.tuningfile": ("read_tuning", "write_tuned"),
+    "pneuopt.plotting": (
+        "plot_bode",
+        "plot_fit",
+        "plot_friction",
+        "plot_prediction",
+        "plot_steps",
+        "save_figure",
+    ),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __version__ = "0.1.0"

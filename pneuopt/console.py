@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from pneuopt.control.loop import ClosedLoop
@@ -49,7 +49,8 @@ def progress(label: str, *, quiet: bool) -> Iterator[Tell]:
     """
     console = screen(error=True)
     silent = quiet or not console.is_terminal
-    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    clock = TimeElapsedColumn(table_column=Column(min_width=7))
+    columns = SpinnerColumn(), clock, TextColumn("{task.description}", markup=False)
     with Progress(*columns, console=console, transient=True, disable=silent) as bar:
         task = bar.add_task(label, total=None)
         yield lambda text: bar.update(task, description=f"{label}: {text}")
@@ -97,11 +98,12 @@ def show_fit(console: Console, fit: "pd.DataFrame") -> None:
 
 def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> None:
     """Each free parameter before and after tuning, within its bounds."""
-    table = _table("parameter", "before", "tuned", "bounds")
+    table = _table("parameter", "before", "tuned", "bounds", "")
     for n in after.free_names:
         p, unit = after[n], after[n].unit
         bounds = f"{_figure(p.lower, 4)} to {_figure(p.upper, 4)}"
-        table.add_row(n, write_value(before.value(n), unit), write_value(p.value, unit), bounds)
+        mark = "at its bound" if p.value in (p.lower, p.upper) else ""
+        table.add_row(n, write_value(before.value(n), unit), write_value(p.value, unit), bounds, mark)
     console.print(table)
     console.print(_standard_form(after), soft_wrap=True)
 

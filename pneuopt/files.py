@@ -11,9 +11,9 @@ import tomlkit
 
 from pneuopt.errors import InputError, UnknownNameError, check_known, require
 from pneuopt.experiments import CHANNELS
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
+from pneuopt.models.linear import SPEED, VALVE_VOLTAGE, FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
 from pneuopt.nlp.status import Code, Status
 from pneuopt.output import plain, write_text
@@ -190,7 +190,8 @@ def _linear(sections: Sections, path: str | Path) -> Drive:
     model = _choice(sections, "plant", "model", PLANTS, path)
     signals = [plant.get("input", "valve_voltage"), plant.get("output", "speed")]
     check_known("channel", signals, CHANNELS, f"{path}: [plant]")
-    u, y = (Quantity(name, CHANNELS[name]) for name in signals)
+    known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
+    u, y = (known.get(name, Quantity(name, CHANNELS[name])) for name in signals)
     # Order 3 follows a delay up to 4.6 rad of phase and adds three states; 0 leaves the dead time out.
     order = plant.get("pade_order", 3 if "dead_time" in plant else 0)
     if model == "second_order":

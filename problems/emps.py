@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 WINDOW = 0.25  # [s]
 SMOOTHING = 1e-3  # [m/s] over which Coulomb friction turns round
-COLUMNS = {
+COLUMNS: dict[str, str | dict[str, str | float]] = {
     "time": "time_s",
     "position": "position_m",
     "force": {"column": "drive_voltage_V", "unit": "V", "scale": "35.15065 N/V"},
@@ -82,7 +82,7 @@ def _tuned(drive: po.ForceDrive, fitted: po.ParameterSet) -> list[Claim]:
     loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3), po.Dither(frequency=100.0))
     own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
     given = (fitted.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
-    limits = [po.Overshoot(0.02), po.MaxSensitivity(1.4)]
+    limits = (po.Overshoot(0.02), po.MaxSensitivity(1.4))
     best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=limits)
     rows = design("hand", given, po.evaluate(loop, STEPS, given))
     return rows + design("tuned", best.parameters, best.certified, LIMITS)

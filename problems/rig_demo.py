@@ -41,7 +41,7 @@ RANGES = {
     "dither.amplitude": (0.0, 60.0),
     "dither.offset": (-60.0, 60.0),
 }
-LIMITS = [po.Overshoot(0.02), po.MaxSensitivity(1.4), po.PeakControl(150.0)]
+LIMITS = (po.Overshoot(0.02), po.MaxSensitivity(1.4), po.PeakControl(150.0))
 BOUNDS = {"settling_time": "<= 0.1", "overshoot": "<= 2", "peak_control": "<= 150", "max_sensitivity": "<= 1.4"}
 
 

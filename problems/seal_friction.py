@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PUBLISHED = {"oring_1bar": 3.92, "oring_3bar": 5.44, "oring_5bar": 6.92, "oring_7bar": 7.81}  # [N]
-COLUMNS = {
+COLUMNS: dict[str, str | dict[str, str | float]] = {
     "time": "time_s",
     "position": "position_m",
     "pressure_a": {"column": "pressure_gauge_Pa", "unit": "Pa(g)"},
@@ -65,8 +65,8 @@ def fit(logs: list[po.Experiment]) -> po.IdentificationResult:
 
 
 def _slope(result: po.IdentificationResult) -> list[Claim]:
-    row = result.estimates.loc[SLOPE]
-    return [Claim(f"slope.{name}", float(row[name]) * 1e5, "N/bar") for name in ("value", "ci_low", "ci_high")]
+    figures = {name: 1e5 * result.estimates[name][SLOPE] for name in ("value", "ci_low", "ci_high")}
+    return [Claim(f"slope.{name}", figure, "N/bar") for name, figure in figures.items()]
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ def tuned(plant: po.System, fitted: po.ParameterSet) -> "tuple[tuple[po.Paramete
     loop = po.ClosedLoop(plant, po.PID(sample_time=0.002), po.Dither(frequency=100.0))
     own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
     given = (fitted.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
-    limits = [po.Overshoot(0.02), po.MaxSensitivity(1.6)]
+    limits = (po.Overshoot(0.02), po.MaxSensitivity(1.6))
     best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=limits)
     return (given, po.evaluate(loop, STEPS, given)), best
 

@@ -14,16 +14,50 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, c
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+ROUNDING = 1e-14  # relative errors of a Schur complement, from long chains of tight gaps: 1 to 5e-16 measured
 STATE_FLOOR = 1e-6  # on D's diagonal (scaled states): a state that no data reach stays put, the optimum does not move
 
 
 class Step(NamedTuple):
-    """A Gauss-Newton step: nodes (m, n) scaled, parameters (k,), D^-1 B (m, n, k), Schur complement (k, k)."""
+    """A Gauss-Newton step: nodes (m, n) scaled, parameters (k,)."""
 
     nodes: Array
     parameters: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """The normal equations with the nodes eliminated.
+
+    Attributes
+    ----------
+    nodes : ndarray, shape (m, n)
+        The nodes' own step, with the parameters at rest: - D^-1 g_s.
+    eliminated : ndarray, shape (m, n, k)
+        D^-1 B: what the nodes do when the parameters move, with the opposite sign.
+    schur : ndarray, shape (k, k)
+    gradient : ndarray, shape (k,)
+        Of the parameters, with the nodes following.
+    """
+
+    nodes: Array
     eliminated: Array
     schur: Array
+    gradient: Array
+
+    def step(self, keep: Mask) -> Step | None:
+        """Gauss-Newton step of the parameters that may move, shape (k,); None if those are not positive definite."""
+        moved = np.zeros(len(keep))
+        try:
+            if keep.any():
+                moved[keep] = _solve_scaled(self.schur[np.ix_(keep, keep)], -self.gradient[keep])
+        except LinAlgError:
+            return None
+        return Step(self.following(moved), moved)
+
+    def following(self, moved: Array) -> Array:
+        """The nodes' step when the parameters move by `moved`, shape (k,)."""
+        return np.asarray(self.nodes - self.eliminated @ moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,36 +82,33 @@ class Arrow:
     node_gradient: Array
     gradient: Array
 
-    def solve(self, damping: float, keep: Mask) -> Step | None:
-        """Gauss-Newton step with Marquardt's multiplicative damping of the diagonal.
+    def eliminate(self, damping: float) -> Reduced | None:
+        """Solve for the nodes, with Marquardt's multiplicative damping of the diagonal.
 
         Parameters
         ----------
         damping : float
-        keep : ndarray of bool, shape (k,)
-            Parameters that may move; the others stay at their bounds.
 
         Returns
         -------
-        Step or None
-            None where a matrix is not positive definite.
+        Reduced or None
+            None where the nodes' matrix is not positive definite.
         """
         m, n, k = self.border.shape
-        corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-300)
-        right = np.concatenate([self.border.reshape(m * n, k), self.node_gradient.reshape(m * n, 1)], axis=1)
+        flat = self.border.reshape(m * n, k)
+        right = np.concatenate([flat, self.node_gradient.reshape(m * n, 1)], axis=1)
         try:
             solved = self._solve_nodes(right, damping) if m * n else right
-            eliminated, node_part = solved[:, :k], solved[:, k]
-            flat = self.border.reshape(m * n, k)
-            schur = corner - flat.T @ eliminated
-            step = np.zeros(k)
-            if keep.any():
-                reduced = -(self.gradient - flat.T @ node_part)[keep]
-                step[keep] = _solve_scaled(schur[np.ix_(keep, keep)], reduced)
         except LinAlgError:
             return None
-        nodes = -node_part - eliminated @ step
-        return Step(nodes.reshape(m, n), step, eliminated.reshape(m, n, k), schur)
+        corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-300)
+        eliminated, node_part = solved[:, :k], solved[:, k]
+        return Reduced(
+            -node_part.reshape(m, n),
+            eliminated.reshape(m, n, k),
+            corner - flat.T @ eliminated,
+            self.gradient - flat.T @ node_part,
+        )
 
     def _solve_nodes(self, right: Array, damping: float) -> Array:
         factor = cholesky_banded(self._banded(damping), overwrite_ab=True, check_finite=False)
@@ -104,22 +135,35 @@ def _solve_scaled(matrix: Array, right: Array) -> Array:
     return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
 
 
-def scaled_inverse(matrix: Array) -> Array | None:
-    """Inverse of a positive definite matrix, or None where it is singular to working precision."""
-    if not matrix.size:
-        return matrix
+def scaled_inverse(matrix: Array) -> Array:
+    """Inverse of a positive definite matrix, whatever the units of its rows."""
     scaled, scale = _unit_diagonal(matrix)
-    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] < 1e-12:
-        return None
     return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))
 
 
-def indistinct(matrix: Array) -> Indices:
-    """Positions that make up the weakest direction of a matrix scaled to a unit diagonal."""
-    scaled, _ = _unit_diagonal(matrix)
-    if not np.all(np.isfinite(scaled)):
-        return np.arange(len(matrix))
-    weakest = np.abs(np.linalg.eigh(scaled)[1][:, 0])
+def indistinct(schur: Array, corner: Array) -> Indices:
+    """Positions of parameters that only count together: the weakest direction, if it is no more than rounding.
+
+    Parameters
+    ----------
+    schur, corner : ndarray, shape (k, k)
+        The corner's diagonal, of which the Schur complement is what is left, says how many digits that has.
+
+    Returns
+    -------
+    ndarray of int
+        Empty if each parameter counts.
+    """
+    if not schur.size:
+        return np.arange(0)
+    left = np.diag(schur) / np.maximum(np.diag(corner), 1e-300)
+    lost = np.flatnonzero(~(left > ROUNDING))
+    if lost.size or not np.isfinite(schur).all():
+        return lost if lost.size else np.arange(len(schur))
+    values, vectors = np.linalg.eigh(_unit_diagonal(schur)[0])
+    if values[0] > max(1e-12, ROUNDING / float(left.min())):
+        return np.arange(0)
+    weakest = np.abs(vectors[:, 0])
     return np.flatnonzero(weakest > 0.1 * weakest.max())
 
 

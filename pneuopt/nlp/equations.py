@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.nlp.arrow import Arrow, scaled_inverse
+from pneuopt.nlp.arrow import Arrow, Reduced, indistinct, scaled_inverse
 from pneuopt.nlp.segments import Segments
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,19 +54,22 @@ class Equations:
         """Part of the cost that the gaps carry, 0 to 1."""
         return 1 - self.chi_square / (2 * self.cost) if 0 < self.cost < math.inf else 0.0
 
+    def undetermined(self, reduced: Reduced, keep: Mask) -> Indices:
+        """Positions, among the kept parameters, of those that the data do not tell apart; empty if they do."""
+        square = np.ix_(keep, keep)
+        return indistinct(reduced.schur[square], self.arrow.corner[square])
+
     def covariance(self, keep: Mask) -> Array | None:
         """Covariance of the parameters (own units, unit noise): the sandwich over true data noise only.
 
         The gaps carry no noise, so the plain inverse is too wide (NUMERICS section 3, step 7). Rows of parameters that
         are not kept are NaN; None where the data do not determine the kept ones.
         """
-        solved = self.arrow.solve(0.0, keep)
-        if solved is None:
+        reduced = self.arrow.eliminate(0.0)
+        if reduced is None or self.undetermined(reduced, keep).size:
             return None
-        bread = scaled_inverse(solved.schur[np.ix_(keep, keep)])
-        if bread is None:
-            return None
-        E = np.concatenate([-solved.eliminated, self.selection], axis=1)[:, :, keep]
+        bread = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
+        E = np.concatenate([-reduced.eliminated, self.selection], axis=1)[:, :, keep]
         meat = np.einsum("mak,mab,mbl->kl", E, self.grams, E, optimize=True)
         out = np.full((len(keep), len(keep)), np.nan)
         out[np.ix_(keep, keep)] = bread @ meat @ bread

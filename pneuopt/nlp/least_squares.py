@@ -7,12 +7,12 @@ record's length. The gaps are tightened in stages, so that a bad start is never 
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.nlp.arrow import Step, indistinct, scaled_inverse
+from pneuopt.nlp.arrow import Reduced, Step, scaled_inverse
 from pneuopt.nlp.equations import Equations, normal_equations, reconnected
 from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for, tightness
 from pneuopt.nlp.status import Code, Solution, Status
@@ -79,7 +79,7 @@ class LeastSquares:
     substeps: int | None = None
     tolerance: float = 0.1
     kinematic: float = 0.01
-    progress: Progress | None = None
+    progress: Progress | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,22 +207,21 @@ class _Search:
 
     def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
         """Shorten the step until the cost falls; None where ten tries do not help."""
-        keep = self._movable(current)
         for _ in range(10):
-            solved = current.equations.arrow.solve(damping, keep)
-            if solved is not None and np.max(np.abs(solved.parameters[self.log]), initial=0.0) <= 2:
-                for trial in self._trials(current, solved):
+            reduced = current.equations.arrow.eliminate(damping)
+            step = None if reduced is None else reduced.step(self._movable(current, reduced))
+            if reduced and step and np.max(np.abs(step.parameters[self.log]), initial=0.0) <= 2:
+                for trial in self._trials(current, reduced, step):
                     if trial.cost < current.cost:
                         return trial, damping * 0.1 if damping > 1e-9 else 0.0
             damping = max(damping * 10, 1e-9)
         return None, damping
 
-    def _trials(self, current: _Iterate, step: Step) -> Iterator[_Iterate]:
+    def _trials(self, current: _Iterate, reduced: Reduced, step: Step) -> Iterator[_Iterate]:
         """The step with its gaps corrected to second order (curved valleys of tight gaps), then the step as it is."""
         z = np.clip(current.z + step.parameters, self.lower, self.upper)
         moved = z - current.z
-        # where a bound cuts the parameters' step short, the nodes follow the shorter one
-        shift = step.nodes + step.eliminated @ (step.parameters - moved)
+        shift = reduced.following(moved)  # a bound may have cut the parameters' step short
         nodes = current.nodes + shift * self.segments.nominal
         if self.segments.linked.any():
             end = self.segments.run(nodes, self._values(z), self.substeps, sensitivities=False).x_end
@@ -239,12 +238,11 @@ class _Search:
             equations = normal_equations(self.segments, nodes, self._values(z), chain, sigma, self.substeps)
         return _Iterate(nodes, z, equations)
 
-    def _movable(self, current: _Iterate) -> Mask:
+    def _movable(self, current: _Iterate, reduced: Reduced) -> Mask:
         """Parameters that are neither pressed against a bound nor without any effect on the residuals here."""
-        gradient = current.equations.arrow.gradient
-        return self._felt(current) & ~(
-            ((current.z <= self.lower) & (gradient > 0)) | ((current.z >= self.upper) & (gradient < 0))
-        )
+        below = (current.z <= self.lower) & (reduced.gradient > 0)
+        above = (current.z >= self.upper) & (reduced.gradient < 0)
+        return self._felt(current) & ~(below | above)
 
     def _felt(self, current: _Iterate) -> Mask:
         """Parameters that have an effect on the residuals here."""
@@ -256,18 +254,20 @@ class _Search:
     def _judge(self, current: _Iterate) -> Status:
         """Converged means that a full undamped step would move nothing that the data can tell apart."""
         names = np.array(self.segments.transcription.parameters.free_names, dtype=object)
-        keep, equations = self._movable(current), current.equations
+        equations = current.equations
         idle = ~self._felt(current) & ~self._at_bound(current)
         if idle.any():
             told = f"the data do not feel {' and '.join(names[idle])}; fix it, or log a run that does"
             return Status(Code.NOT_CONVERGED, told)
-        solved = equations.arrow.solve(0.0, keep)
-        schur = None if solved is None else solved.schur[np.ix_(keep, keep)]
-        inverse = None if schur is None else scaled_inverse(schur)
-        if solved is None or inverse is None:
-            alike = names[keep] if schur is None else names[keep][indistinct(schur)]
+        reduced = equations.arrow.eliminate(0.0)
+        if reduced is None:
+            return Status(Code.NOT_CONVERGED, "the data do not determine the states; log another output")
+        keep = self._movable(current, reduced)
+        alike, solved = names[keep][equations.undetermined(reduced, keep)], reduced.step(keep)
+        if alike.size or solved is None:
             told = f"the data do not determine {' and '.join(alike)}; fix one, or log a run that tells them apart"
             return Status(Code.NOT_CONVERGED, told)
+        inverse = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
         step = np.abs(solved.parameters[keep]) / np.sqrt(np.diag(inverse))
         noise = max(1.0, math.sqrt(equations.chi_square / max(1, equations.count)))
         if np.max(step, initial=0.0) > self.method.tolerance * noise:
@@ -327,5 +327,9 @@ class _Search:
         q = self.q.copy()
         own = np.where(self.log, np.exp(np.where(self.log, z, 0.0)), z)
         free = [p for p in self.segments.transcription.parameters.values() if p.free]
+        # at a bound exactly the bound, which a logarithm there and back would miss by a rounding
+        own = np.where(
+            z <= self.lower, [p.lower for p in free], np.where(z >= self.upper, [p.upper for p in free], own)
+        )
         q[self.segments.transcription.free] = [min(max(v, p.lower), p.upper) for v, p in zip(own, free, strict=True)]
         return q

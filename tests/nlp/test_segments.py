@@ -18,7 +18,7 @@ FREE = ("friction.coulomb", "load.mass")
 
 def phase(name: str, n: int, **fields: object) -> Phase:
     rng = np.random.default_rng(n)
-    guess = 0.1 * rng.standard_normal((n, 2))
+    t, guess = np.array([1e-3 * i for i in range(n)]), 0.1 * rng.standard_normal((n, 2))
     made = Phase(
         name, 1e-3 * np.arange(n), np.full(n, 1e-3), 30 * rng.standard_normal((n, 1)), every(n, 4), guess=guess
     )

@@ -1,0 +1,94 @@
+"""Types of the names that `__init__.py` loads lazily."""
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import margins
+from pneuopt.control.metrics import step_metrics
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import ConvergenceError, InputError, PneuoptError
+from pneuopt.experiments import Experiment, differentiate, read_log, resample, split
+from pneuopt.files import read_drive, write_fit
+from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
+from pneuopt.models.load import Load
+from pneuopt.nlp.full_space import FullSpace
+from pneuopt.nlp.least_squares import LeastSquares
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.plotting import plot_bode, plot_fit, plot_friction, plot_prediction, plot_steps, save_figure
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.simulate import simulate
+from pneuopt.system import DiscreteSystem, System, define, discretise
+from pneuopt.trajectories import Trajectory
+from pneuopt.tune import TuningResult, evaluate, respond, tune
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.two_phase import TwoPhase
+from pneuopt.tuningfile import read_tuning, write_tuned
+
+__version__: str
+__all__ = [
+    "PID",
+    "Asymmetric",
+    "ClosedLoop",
+    "ConvergenceError",
+    "Coulomb",
+    "DiscreteSystem",
+    "Dither",
+    "Experiment",
+    "FirstOrder",
+    "ForceDrive",
+    "FullSpace",
+    "IdentificationResult",
+    "InputError",
+    "Integrator",
+    "LeastSquares",
+    "Load",
+    "LuGre",
+    "MaxSensitivity",
+    "MotionDrive",
+    "Overshoot",
+    "Parameter",
+    "ParameterSet",
+    "PeakControl",
+    "PneuoptError",
+    "PressureDependent",
+    "Quantity",
+    "Screening",
+    "SecondOrder",
+    "SettlingTime",
+    "SteadyStateError",
+    "Step",
+    "Stribeck",
+    "System",
+    "Trajectory",
+    "TuningResult",
+    "TwoPhase",
+    "Viscous",
+    "define",
+    "differentiate",
+    "discretise",
+    "evaluate",
+    "identify",
+    "margins",
+    "plot_bode",
+    "plot_fit",
+    "plot_friction",
+    "plot_prediction",
+    "plot_steps",
+    "predict",
+    "read_drive",
+    "read_log",
+    "read_tuning",
+    "resample",
+    "respond",
+    "save_figure",
+    "simulate",
+    "split",
+    "step_metrics",
+    "tune",
+    "validate",
+    "write_fit",
+    "write_tuned",
+]

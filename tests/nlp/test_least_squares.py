@@ -1,0 +1,239 @@
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import OptimizeResult, least_squares
+
+from pneuopt.nlp.full_space import solve_full_space
+from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.nlp.status import Code
+from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.system import DiscreteSystem, Symbols, define, discretise
+from pneuopt.trajectories import Array
+
+H = 0.02
+NOISE = 1e-3
+TRUTH = {"stiffness": 30.0, "damping": 2.0, "bias[a]": 0.5, "bias[b]": -1.0}
+
+
+def spring_mass(extra: bool = False) -> DiscreteSystem:
+    """A mass of 1 kg on a spring and a damper, RK4 with two steps a sample."""
+    parameters = {
+        "stiffness": Parameter(20.0, "N/m", 1.0, 200.0, log=True, free=True),
+        "damping": Parameter(3.0, "N*s/m", 0.0, 20.0, free=True),
+        "bias": Parameter(0.0, "N", -5.0, 5.0),
+    }
+    more = {"factor": Parameter(1.0, "1", 0.1, 10.0, free=True), "idle": Parameter(1.0, "1", free=False)}
+
+    def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
+        damping = p["damping"] * p["factor"] if extra else p["damping"]
+        force = u["force"] + p["bias"] - p["stiffness"] * x["position"] - damping * x["speed"]
+        return {"position": x["speed"], "speed": force}, {"position": x["position"]}
+
+    states = [Quantity("position", "m", 0.1), Quantity("speed", "m/s", 0.5)]
+    own = ParameterSet({**parameters, **(more if extra else {})})
+    return discretise(define(states, [Quantity("force", "N")], states[:1], own, rhs), 2)
+
+
+def propagate(stiffness: float, damping: float, x: Array, u: Array) -> Array:
+    """The same RK4 in NumPy: positions at the samples."""
+    A, y = np.array([[0, 1], [-stiffness, -damping]]), np.empty(len(u))
+    h = H / 2
+    for i, force in enumerate(u):
+        y[i], b = x[0], np.array([0, force])
+        for _ in range(2):
+            k1 = A @ x + b
+            k2 = A @ (x + h / 2 * k1) + b
+            k3 = A @ (x + h / 2 * k2) + b
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + A @ (x + h * k3) + b)
+    return y
+
+
+def two_logs(seed: int = 0, nodes: int = 7, **toy: bool) -> Transcription:
+    """Two noisy logs of 120 and 83 samples, some missing, with a bias each."""
+    system, rng = spring_mass(**toy), np.random.default_rng(seed)
+    phases, residuals = [], []
+    for i, (name, n) in enumerate({"a": 120, "b": 83}.items()):
+        force = np.repeat(rng.normal(0, 5, n // 10 + 1), 10)[:n]
+        y = propagate(30.0, 2.0, np.array([0.05, 0.0]), force + TRUTH[f"bias[{name}]"]) + rng.normal(0, NOISE, n)
+        y[[4, 5, 40]] = math.nan
+        t: Array = H * np.arange(n, dtype=float)
+        phases.append(Phase(name, t, np.full(n, H), force[:, None], every(n, nodes)))
+        residuals.append(Residuals(i, ("position",), y[:, None], np.array([NOISE])))
+    biases = {f"bias[{n}]": Parameter(0.0, "N", -5, 5, free=True) for n in "ab"}
+    return Transcription(system, system.parameters | ParameterSet(biases), tuple(phases), tuple(residuals))
+
+
+def single_shooting(problem: Transcription) -> OptimizeResult:
+    def misfit(theta: Array) -> Array:
+        pieces = []
+        for k, (phase, residual) in enumerate(zip(problem.phases, problem.residuals, strict=True)):
+            start = theta[4 + 2 * k : 6 + 2 * k]
+            y = propagate(theta[0], theta[1], start, phase.inputs[:, 0] + theta[2 + k])
+            pieces.append((y - residual.measured[:, 0]) / NOISE)
+        e = np.concatenate(pieces)
+        return e[np.isfinite(e)]
+
+    return least_squares(misfit, [20, 3, 0, 0, 0, 0, 0, 0], xtol=1e-14, ftol=1e-14, gtol=1e-10, jac="3-point")
+
+
+def found(fit: Fit) -> Array:
+    return np.array([fit.solution.parameters.value(n) for n in TRUTH])
+
+
+def test_three_solvers_find_one_optimum() -> None:
+    """Lifted (soft gaps), full-space (IPOPT, hard) and SciPy's single shooting, on the same numbers."""
+    problem = two_logs()
+    lifted, full, single = solve_least_squares(problem), solve_full_space(problem), single_shooting(problem)
+    assert lifted.solution.status.converged, lifted.solution.status
+    hard = np.array([full.parameters.value(n) for n in TRUTH])
+    assert_allclose(hard, single.x[:4], rtol=1e-6)
+    # gaps of 1e-5 nominal sizes stay open a little: the price is a small part of a standard deviation
+    assert lifted.covariance is not None
+    spread = np.sqrt(np.diag(lifted.covariance))
+    assert np.abs((found(lifted) - hard) / spread).max() < 2e-3
+    assert_allclose(found(lifted), hard, rtol=1e-5)
+    assert lifted.chi_square == pytest.approx(2 * single.cost, rel=1e-4)
+    assert lifted.count == len(single.fun)
+    assert_allclose(found(lifted), list(TRUTH.values()), atol=4 * spread.max())
+
+
+def test_tighter_gaps_come_nearer_by_their_square() -> None:
+    problem = two_logs()
+    single = single_shooting(problem)
+    off = []
+    for gap in (1e-3, 1e-4):
+        fit = solve_least_squares(problem, LeastSquares(stages=(Stage(1e-2, 20), Stage(gap, 30))))
+        off.append(abs(found(fit)[0] - single.x[0]))
+    assert off[1] < off[0] / 30
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_covariance_is_single_shootings(seed: int) -> None:
+    """The sandwich sees the data's noise only, so it is the covariance with hard gaps: (J'J)^-1, dense."""
+    problem = two_logs(seed)
+    fit, single = solve_least_squares(problem), single_shooting(problem)
+    dense = np.linalg.inv(single.jac.T @ single.jac)[:4, :4]
+    assert fit.covariance is not None
+    assert_allclose(
+        fit.covariance, dense, rtol=5e-3, atol=5e-3 * np.sqrt(np.outer(np.diag(dense), np.diag(dense))).max()
+    )
+    assert_allclose(np.diag(fit.covariance), np.diag(dense), rtol=5e-3)
+
+
+@pytest.mark.parametrize("time", [0.04, 0.3, math.inf])
+def test_the_segments_length_does_not_change_the_answer(time: float) -> None:
+    nodes = 200 if math.isinf(time) else round(time / H)
+    fit = solve_least_squares(two_logs(nodes=nodes))
+    assert fit.solution.status.converged
+    assert_allclose(found(fit), found(solve_least_squares(two_logs())), rtol=1e-5)
+
+
+def test_a_known_start_state_is_kept() -> None:
+    problem = two_logs()
+    starts = tuple(replace(p, start=np.array([0.05, 0.0])) for p in problem.phases)
+    fit = solve_least_squares(replace(problem, phases=starts))
+    assert fit.solution.status.converged
+    for run in fit.solution.trajectories:
+        assert (run["position"][0], run["speed"][0]) == pytest.approx((0.05, 0.0), abs=1e-6)
+    free = solve_least_squares(problem)
+    assert fit.covariance is not None
+    assert free.covariance is not None
+    assert (np.diag(fit.covariance) < np.diag(free.covariance)).all()
+
+
+@pytest.mark.parametrize(("bounds", "value"), [((1.0, 25.0), 25.0), ((40.0, 200.0), 40.0)])
+def test_a_bound_stops_it_and_is_marked(bounds: tuple[float, float], value: float) -> None:
+    problem = two_logs()
+    parameters = problem.parameters.with_values({"stiffness": value}).with_bounds({"stiffness": bounds})
+    fit = solve_least_squares(replace(problem, parameters=parameters))
+    assert fit.solution.status.converged, fit.solution.status
+    assert fit.solution.parameters.value("stiffness") == value
+    assert fit.at_bound.tolist() == [True, False, False, False]
+    assert fit.covariance is not None
+    assert np.isnan(fit.covariance[0]).all()
+    assert np.isfinite(fit.covariance[1:, 1:]).all()
+    full = solve_full_space(replace(problem, parameters=parameters))
+    assert_allclose(found(fit)[1:], [full.parameters.value(n) for n in list(TRUTH)[1:]], rtol=2e-4)
+
+
+def test_two_parameters_that_only_appear_as_a_product_are_named() -> None:
+    fit = solve_least_squares(two_logs(extra=True))
+    assert fit.solution.status.code is Code.NOT_CONVERGED
+    assert "do not determine damping and factor" in fit.solution.status.message
+    assert fit.covariance is None
+
+
+def test_a_parameter_without_effect_is_named() -> None:
+    problem = two_logs(extra=True)
+    parameters = problem.parameters.fixed("factor").freed("idle")
+    fit = solve_least_squares(replace(problem, parameters=parameters))
+    assert fit.solution.status.code is Code.NOT_CONVERGED
+    assert "do not feel idle" in fit.solution.status.message
+    assert fit.covariance is not None
+    position = list(fit.solution.parameters.free_names).index("idle")
+    assert np.isnan(fit.covariance[position]).all()
+    assert np.isfinite(np.diag(fit.covariance)).sum() == 4
+
+
+def test_without_free_parameters_the_states_are_fitted() -> None:
+    problem = two_logs()
+    fixed = problem.parameters.with_values(TRUTH).fixed("*")
+    fit = solve_least_squares(replace(problem, parameters=fixed))
+    assert fit.solution.status.converged
+    assert fit.solution.trajectories[0]["position"][0] == pytest.approx(0.05, abs=5 * NOISE)
+    assert fit.chi_square < 1.3 * fit.count
+
+
+def test_a_model_that_cannot_follow_does_not_converge() -> None:
+    """With a stiffness that is far off and fixed, only open gaps could follow the log."""
+    problem = two_logs(nodes=2)
+    wrong = problem.parameters.fixed("stiffness").with_values({"stiffness": 150.0})
+    fit = solve_least_squares(replace(problem, parameters=wrong), LeastSquares(stages=(Stage(1e-2, 60),)))
+    assert fit.solution.status.code is Code.NOT_CONVERGED
+    assert "gaps between segments carry" in fit.solution.status.message
+
+
+def test_too_few_iterations_are_no_convergence() -> None:
+    fit = solve_least_squares(two_logs(), LeastSquares(stages=(Stage(1e-5, 1),)))
+    assert fit.solution.status.code is Code.NOT_CONVERGED
+    assert "would still move by" in fit.solution.status.message
+
+
+def test_a_start_that_is_not_finite_is_told() -> None:
+    problem = two_logs()
+    guess = np.full((problem.phases[0].n, 2), 1e300)
+    phases = (replace(problem.phases[0], guess=guess), problem.phases[1])
+    fit = solve_least_squares(replace(problem, phases=phases))
+    assert fit.solution.status.code is Code.DIVERGED
+    assert "not finite at the start" in fit.solution.status.message
+    assert fit.covariance is None
+
+
+def test_an_interruption_hands_back_the_best_so_far() -> None:
+    lines: list[str] = []
+
+    def progress(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 3:
+            raise KeyboardInterrupt
+
+    problem = two_logs()
+    fit = solve_least_squares(problem, LeastSquares(progress=progress))
+    assert fit.solution.status.code is Code.INTERRUPTED
+    assert lines[-1].startswith("stage 1/6  iteration 3  cost ")
+    assert f"cost {fit.solution.stats['cost']:.6g} " in lines[-1]
+    assert fit.solution.stats["iterations"] == 3
+
+
+def test_explicit_substeps_are_kept_and_their_error_is_told() -> None:
+    problem = two_logs()
+    coarse = solve_least_squares(problem, LeastSquares(substeps=1, stages=(Stage(1e-3, 20), Stage(1e-5, 30))))
+    fine = solve_least_squares(problem, LeastSquares(substeps=8, stages=(Stage(1e-3, 20), Stage(1e-5, 30))))
+    assert (coarse.solution.stats["substeps"], fine.solution.stats["substeps"]) == (1, 8)
+    errors = [f.solution.stats["integration_error"] for f in (coarse, fine)]
+    assert errors[0] == pytest.approx(4096 * errors[1], rel=0.2)  # of order four
