@@ -1,0 +1,44 @@
+"""The scripts of claims: each holds what it claims. Those that take measured logs skip where the folder is missing."""
+
+from pathlib import Path
+
+import emps
+import pandas as pd
+import pytest
+import rig_demo
+import seal_friction
+import step_response
+
+DATASETS = Path(__file__).parents[3] / "shared" / "datasets"
+measured = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no measured logs in {DATASETS}")
+
+
+def failed(rows: pd.DataFrame) -> list[str]:
+    return [str(r) for r in rows.loc[~rows["holds"].astype(bool), "name"]]
+
+
+@measured
+@pytest.mark.slow
+def test_emps() -> None:
+    rows = emps.main(DATASETS / "emps" / "emps_identification_1khz.csv")
+    assert failed(rows) == []
+
+
+@measured
+def test_seal_friction() -> None:
+    rows = seal_friction.main(DATASETS / "zillen_seal_friction")
+    assert failed(rows) == []
+    assert len(rows) == 13
+
+
+@pytest.mark.slow
+def test_step_response() -> None:
+    assert failed(step_response.main(step_response.GENERATED)) == []
+
+
+@pytest.mark.slow
+def test_rig_demo(tmp_path: Path) -> None:
+    demo = rig_demo.run()
+    assert failed(rig_demo.main(demo)) == []
+    rig_demo.figure(demo).savefig(tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 10_000

@@ -1,0 +1,70 @@
+"""The package's face: lazy names, their stub, the README's code and the data's sums."""
+
+import ast
+import hashlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pneuopt
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_stub_names_what_the_package_offers() -> None:
+    tree = ast.parse((ROOT / "pneuopt" / "__init__.pyi").read_text(encoding="utf-8"))
+    homes = {a.name: node.module for node in tree.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    offered = {name: module for module, names in pneuopt._HOME.items() for name in names}  # type: ignore[attr-defined]
+    assert homes == offered
+    assert sorted(homes) == sorted(pneuopt.__all__)
+
+
+@pytest.mark.parametrize("name", sorted(pneuopt.__all__))
+def test_every_name_loads_and_is_no_module(name: str) -> None:
+    assert callable(getattr(pneuopt, name))
+
+
+def test_a_submodule_does_not_hide_the_verb_of_its_name() -> None:
+    code = "import pneuopt.identify, pneuopt.tune, pneuopt.simulate; import pneuopt; print(pneuopt.identify.__name__)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "identify"
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="idenfity"):
+        pneuopt.idenfity  # type: ignore[attr-defined]  # noqa: B018 - the access is what is tested
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    heavy = "numpy scipy pandas casadi matplotlib pint typer"
+    code = f"import sys, pneuopt; print([m for m in {heavy.split()} if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_the_data_are_those_that_the_readme_lists() -> None:
+    text = (ROOT / "data" / "README.md").read_text(encoding="utf-8")
+    listed = {path: digest for digest, path in re.findall(r"^([0-9a-f]{64})  (\S+)$", text, re.MULTILINE)}
+    logs = sorted(p.relative_to(ROOT / "data").as_posix() for p in (ROOT / "data").glob("*/*.csv"))
+    assert sorted(listed) == logs
+    for path, digest in listed.items():
+        assert hashlib.sha256((ROOT / "data" / path).read_bytes()).hexdigest() == digest
+
+
+def test_the_readme_names_scripts_that_exist() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"problems/(\w+\.py)", text))
+    assert named == {p.name for p in (ROOT / "problems").glob("*.py")} - {"claims.py"}
+
+
+@pytest.mark.slow
+def test_the_readmes_code_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(ROOT)
+    exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
+    printed = capsys.readouterr().out
+    assert "friction.coulomb" in printed
+    assert "SettlingTime" in printed
