@@ -3,6 +3,7 @@
 Truth is integrated by `pneuopt.simulate` (LSODA, 1e-8); a delay is exact, the sensors add noise and are quantised.
 """
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,6 @@ Array = NDArray[np.float64]
 HERE = Path(__file__).parent
 SEED = 20151107
 
-STEP_RIG = {
-    "plant.gain": 0.12,
-    "plant.natural_frequency": 22.0,
-    "plant.damping": 0.6,
-    "friction.coulomb": 0.35,
-    "friction.viscous": 0.0,
-    "friction.smoothing": 2e-3,
-}
-DEAD_TIME = 0.012  # [s] a whole number of samples
 STEP_RUNS = {
     "step_up_and_back": ((0.1, 2.0), (0.9, 4.0), (1.7, 0.0)),
     "step_through_zero": ((0.1, -3.0), (0.9, 2.5), (1.7, 1.0)),
@@ -30,21 +22,17 @@ STEP_RUNS = {
 }
 SPEED_NOISE, SPEED_STEP = 1e-3, 5e-4  # [m/s]
 
-FORCE_RIG = {
-    "load.mass": 5.0,
-    "load.force": 3.0,
-    "friction.coulomb": 40.0,
-    "friction.static": 65.0,
-    "friction.stribeck_velocity": 0.02,
-    "friction.viscous": 80.0,
-    "friction.smoothing": 1e-3,
-}
 POSITION_LOOP = {"pid.Kp": 12000.0, "pid.Ki": 20000.0, "pid.Kd": 250.0, "pid.Tf": 0.002}
 FORCE_RUNS = {
     "run_01": (0.15, 0.05, 0.12, 0.04, 0.16, 0.10, 0.06, 0.14),
     "run_02": (0.12, 0.10, 0.06, 0.13, 0.125, 0.07, 0.15, 0.09),
 }
 POSITION_NOISE, POSITION_STEP, FORCE_STEP = 5e-6, 1e-5, 1e-3  # [m], [m], [N]
+
+
+def truth(rig: str) -> dict[str, float]:
+    """The generating values of a rig [SI], by parameter."""
+    return dict(tomllib.loads((HERE / rig / "truth.toml").read_text(encoding="utf-8")))
 
 
 def main() -> None:
@@ -62,9 +50,10 @@ def step_run(steps: tuple[tuple[float, float], ...], rng: np.random.Generator) -
     voltage = np.zeros_like(t)
     for at, level in steps:
         voltage[t >= at - 1e-9] = level
-    late = np.concatenate([np.zeros(round(DEAD_TIME / 0.002)), voltage])[: len(t)]
-    truth = po.simulate(plant, po.Trajectory(t, {"valve_voltage": late}), plant.parameters.with_values(STEP_RIG))
-    noisy = truth["speed"] + SPEED_NOISE * rng.standard_normal(len(t))
+    values = truth("step_rig") | {"friction.viscous": 0.0, "friction.smoothing": 2e-3}
+    late = np.concatenate([np.zeros(round(values.pop("plant.dead_time") / 0.002)), voltage])[: len(t)]
+    run = po.simulate(plant, po.Trajectory(t, {"valve_voltage": late}), plant.parameters.with_values(values))
+    noisy = run["speed"] + SPEED_NOISE * rng.standard_normal(len(t))
     return {"time [s]": t, "valve_voltage [V]": voltage, "speed [m/s]": quantised(noisy, SPEED_STEP)}
 
 
@@ -72,7 +61,8 @@ def force_run(levels: tuple[float, ...], rng: np.random.Generator) -> dict[str, 
     """Position of a cylinder's load that a known force pushes, under a sampled position loop: 6 s at 1 kHz."""
     drive = po.ForceDrive(po.Stribeck())
     loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3), measured="position")
-    p = loop.parameters.with_values({**FORCE_RIG, **POSITION_LOOP, "pid.lower": -300.0, "pid.upper": 300.0})
+    limits = {"pid.lower": -300.0, "pid.upper": 300.0}
+    p = loop.parameters.with_values({**truth("force_rig"), "friction.smoothing": 1e-3, **POSITION_LOOP, **limits})
     t = np.round(np.arange(6000) * 1e-3, 6)
     held = np.repeat(levels, len(t) // 2 // len(levels))
     slow = 0.1 + 0.02 * np.abs((np.arange(len(t) - len(held)) * 1e-3 / 0.75 + 0.5) % 2 - 1) - 0.01

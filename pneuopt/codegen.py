@@ -229,11 +229,11 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
 
     def evaluate(*inputs: ArrayLike) -> tuple[Array, ...]:
-        for buffer, value in zip(buffers, inputs, strict=True):
-            try:
-                buffer[...] = value
-            except ValueError as error:
-                raise ModelError(f"an argument does not fit: {error}") from None
+        for i, (buffer, value) in enumerate(zip(buffers, inputs, strict=True)):
+            size = value.size if isinstance(value, np.ndarray) else np.size(value)
+            if size != buffer.size:
+                raise ModelError(f"argument {i} has {size} numbers, expected {buffer.size}")
+            buffer[...] = value
         call(*pointers)
         return tuple([result.copy() for result in results])
 

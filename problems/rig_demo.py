@@ -8,6 +8,7 @@ steps, beside a plain hand setting. Certified figures come from an integration t
 """
 
 import sys
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,14 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DATA = Path(__file__).parents[1] / "data" / "force_rig"
-TRUTH = {  # of data/generate.py
-    "load.mass": 5.0,
-    "load.force": 3.0,
-    "friction.coulomb": 40.0,
-    "friction.static": 65.0,
-    "friction.stribeck_velocity": 0.02,
-    "friction.viscous": 80.0,
-}
+TRUTH = tomllib.loads((DATA / "truth.toml").read_text(encoding="utf-8"))  # the generating values [SI]
 STEPS = [po.Step(0.05, horizon=0.6), po.Step(0.25, horizon=0.6)]  # [m/s]
 HAND = {"pid.Kp": 400.0, "pid.Ki": 4000.0, "pid.Tf": 0.005, "pid.lower": -250.0, "pid.upper": 250.0}
 RANGES = {

@@ -4,12 +4,13 @@
 
 Fitted are gain, natural frequency, damping and dead time, and Coulomb friction where the log shows it: kept if it
 lowers the Bayesian information criterion. The last path is held out and only predicted. Without a path: the generated
-steps of data/step_rig, whose generating values stand in data/generate.py (exact dead time, noise 1 mm/s, quantised to
+steps of data/step_rig, whose generating values stand in its truth.toml (exact dead time, noise 1 mm/s, quantised to
 0.5 mm/s).
 """
 
 import math
 import sys
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,13 +23,7 @@ if TYPE_CHECKING:
 
 DATA = Path(__file__).parents[1] / "data" / "step_rig"
 GENERATED = [DATA / f"{name}.csv" for name in ("step_up_and_back", "step_through_zero", "step_held_out")]
-TRUTH = {  # of data/generate.py
-    "plant.gain": 0.12,
-    "plant.natural_frequency": 22.0,
-    "plant.damping": 0.6,
-    "plant.dead_time": 0.012,
-    "friction.coulomb": 0.35,
-}
+TRUTH = tomllib.loads((DATA / "truth.toml").read_text(encoding="utf-8"))  # the generating values [SI]
 SMOOTHING = 2e-3  # [m/s]
 PADE_ORDER = 3
 STEPS = [po.Step(0.1, horizon=1.0), po.Step(0.3, horizon=1.0)]  # [m/s]

@@ -12,13 +12,15 @@ from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for, t
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.system import System, discretise
+from pneuopt.trajectories import Array
 
 FREE = ("friction.coulomb", "load.mass")
 
 
 def phase(name: str, n: int, **fields: object) -> Phase:
     rng = np.random.default_rng(n)
-    t, guess = np.array([1e-3 * i for i in range(n)]), 0.1 * rng.standard_normal((n, 2))
+    t: Array = 1e-3 * np.arange(n, dtype=float)
+    guess = 0.1 * rng.standard_normal((n, 2))
     made = Phase(
         name, 1e-3 * np.arange(n), np.full(n, 1e-3), 30 * rng.standard_normal((n, 1)), every(n, 4), guess=guess
     )

@@ -1,0 +1,103 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from pneuopt.statistics import agreement, confidence_interval, correlation, correlation_time, noise_level
+
+
+def test_agreement_of_a_known_error() -> None:
+    figures = agreement([0.0, 1.0, math.nan, 2.0, 3.0], [0.0, 1.0, 99.0, 2.0, 2.0])
+    assert figures["rmse"] == pytest.approx(0.5)
+    assert figures["nrmse"] == pytest.approx(1 / math.sqrt(5))
+    assert figures["fit_percent"] == pytest.approx(100 - 100 / math.sqrt(5))
+    assert figures["samples"] == 4
+
+
+def test_agreement_where_there_is_nothing_to_explain() -> None:
+    assert math.isnan(agreement([1.0, 1.0], [1.0, 2.0])["nrmse"])
+    assert agreement([1.0, 1.0], [1.0, 2.0])["rmse"] == pytest.approx(math.sqrt(0.5))
+    assert math.isnan(agreement([math.nan], [1.0])["rmse"])
+
+
+def test_predicting_the_mean_explains_nothing() -> None:
+    y = np.random.default_rng(0).standard_normal(100)
+    assert agreement(y, np.full(100, y.mean()))["fit_percent"] == pytest.approx(0, abs=1e-9)
+    assert agreement(y, y)["fit_percent"] == 100
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-2])
+def test_noise_is_told_from_motion(noise: float) -> None:
+    rng, t = np.random.default_rng(0), np.linspace(0, 5, 5000)
+    column = np.sin(3 * t) + noise * rng.standard_normal(t.size)
+    column[rng.random(t.size) < 0.05] = math.nan
+    assert noise_level(column) == pytest.approx(noise, rel=0.1)
+
+
+def test_a_step_and_outliers_do_not_count_as_noise() -> None:
+    column = 0.01 * np.random.default_rng(0).standard_normal(4000)
+    column[2000:] += 5.0
+    column[::400] += 3.0
+    assert noise_level(column) == pytest.approx(0.01, rel=0.1)
+
+
+def test_quantisation_is_the_floor() -> None:
+    t = np.linspace(0, 5, 5000)
+    assert noise_level(np.round(np.sin(t) / 1e-3) * 1e-3) == pytest.approx(1e-3 / math.sqrt(12), rel=1e-6)
+
+
+@pytest.mark.parametrize("column", [[1.0] * 10, [math.nan] * 10, [2.0], []])
+def test_a_constant_channel_shows_no_noise(column: list[float]) -> None:
+    assert math.isnan(noise_level(column))
+
+
+@pytest.mark.parametrize(("a", "time"), [(0.0, 1.0), (0.5, 3.0), (0.8, 9.0)])
+def test_correlation_time_of_an_autoregression(a: float, time: float) -> None:
+    """An AR(1) process with coefficient a: (1 + a) / (1 - a)."""
+    rng = np.random.default_rng(1)
+    e = np.empty(20000)
+    e[0] = 0
+    for i, w in enumerate(rng.standard_normal(e.size - 1)):
+        e[i + 1] = a * e[i] + w
+    assert correlation_time(e) == pytest.approx(time, rel=0.15)
+
+
+def test_correlation_time_of_nothing_much() -> None:
+    assert correlation_time([1.0, 2.0]) == 1.0
+    assert correlation_time(np.ones(100)) == 1.0
+    assert correlation_time(np.full(50, math.nan)) == 1.0
+    assert correlation_time([1.0, -1.0] * 50) == 1.0
+
+
+@given(value=st.floats(1e-3, 1e3), ratio=st.floats(1e-6, 2.0))
+def test_intervals_hold_the_value(value: float, ratio: float) -> None:
+    low, high = confidence_interval(value, ratio * value, log=False)
+    assert (low + high) / 2 == pytest.approx(value)
+    assert high - low == pytest.approx(2 * 1.959964 * ratio * value, rel=1e-5)
+    low, high = confidence_interval(value, ratio * value, log=True)
+    assert 0 < low < value < high
+    assert low * high == pytest.approx(value**2)
+
+
+def test_small_deviations_do_not_care_for_the_logarithm() -> None:
+    assert_allclose(confidence_interval(5.0, 1e-4, log=True), confidence_interval(5.0, 1e-4, log=False), rtol=1e-8)
+
+
+def test_no_deviation_no_interval_and_a_huge_one_no_overflow() -> None:
+    for log in (False, True):
+        assert np.isnan(confidence_interval(5.0, math.nan, log=log)).all()
+    low, high = confidence_interval(1.0, 1e6, log=True)
+    assert low >= 0
+    assert high > 1e100
+
+
+def test_levels() -> None:
+    assert confidence_interval(0.0, 1.0, log=False, level=0.6827)[1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_correlation_matrix() -> None:
+    assert_allclose(correlation(np.array([[4.0, 1.0], [1.0, 1.0]])), [[1, 0.5], [0.5, 1]])
+    assert np.isnan(correlation(np.array([[0.0, 0.0], [0.0, 1.0]]))[0]).all()
