@@ -298,7 +298,7 @@ class _Search:
         point, count = screen(simulator, self.references, self.space, spec, self.method, start)
         values = simulator.values(point[None], spec)[0]
         stats = {"simulations": float(count), "optimum": spec.objective(values)}
-        return _Found(point, _screened(spec, values), _active(self.space, spec, point, values), stats)
+        return _Found(point, _screened(self.spec, values), _active(self.space, spec, point, values), stats)
 
     def _printed(self, simulator: Simulator, point: Array, margin: float) -> list[Array]:
         """Near the point, of the gains as printed, those that keep the limits, the best first."""
