@@ -9,6 +9,8 @@ The concept map, in the order in which data flow:
     ClosedLoop(system, PID, Dither)   -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
     evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser
+    record(Rig(loop, sensors), ...)   -> the log of a rig with stick-slip, hysteresis, sensors; and the truth
+    grid, sweep(fn, parameters, cases)-> a study: any function over named cases, in processes, as a table
 
 Names are loaded when first used; importing the package costs nothing.
 """
@@ -24,9 +26,15 @@ _HOME = {
     "pneuopt.trajectories": ("Trajectory",),
     "pneuopt.system": ("DiscreteSystem", "System", "define", "discretise"),
     "pneuopt.models.friction": ("Asymmetric", "Coulomb", "LuGre", "PressureDependent", "Stribeck", "Viscous"),
+    "pneuopt.models.karnopp": ("Karnopp",),
     "pneuopt.models.load": ("Load",),
     "pneuopt.models.drive": ("ForceDrive", "MotionDrive"),
     "pneuopt.models.linear": ("FirstOrder", "Integrator", "SecondOrder"),
+    "pneuopt.models.gas": ("IsentropicNozzle", "Iso6358"),
+    "pneuopt.models.valve": ("ProportionalValve", "Spool"),
+    "pneuopt.models.chamber": ("Polytropic", "Thermal"),
+    "pneuopt.models.cylinder": ("Cylinder",),
+    "pneuopt.models.pneumatic_drive": ("PneumaticDrive",),
     "pneuopt.control.pid": ("PID",),
     "pneuopt.control.dither": ("Dither",),
     "pneuopt.control.reference": ("Step",),
@@ -36,18 +44,22 @@ _HOME = {
     "pneuopt.nlp.least_squares": ("LeastSquares",),
     "pneuopt.nlp.full_space": ("FullSpace",),
     "pneuopt.experiments": ("Experiment", "differentiate", "read_log", "resample", "split"),
-    "pneuopt.simulate": ("simulate",),
+    "pneuopt.simulate": ("simulate", "simulate_stick_slip"),
+    "pneuopt.instruments": ("Actuator", "Encoder", "Sensor"),
+    "pneuopt.rig": ("Rig", "record"),
     "pneuopt.identify": ("IdentificationResult", "identify", "predict", "validate"),
     "pneuopt.requirements": ("MaxSensitivity", "Overshoot", "PeakControl", "SettlingTime", "SteadyStateError"),
     "pneuopt.tuning.screening": ("Screening",),
     "pneuopt.tuning.two_phase": ("TwoPhase",),
     "pneuopt.tune": ("TuningResult", "evaluate", "respond", "tune"),
+    "pneuopt.study": ("grid", "sweep"),
     "pneuopt.files": ("read_drive", "write_fit"),
     "pneuopt.tuningfile": ("read_tuning", "write_tuned"),
     "pneuopt.plotting": (
         "plot_bode",
         "plot_fit",
         "plot_friction",
+        "plot_map",
         "plot_prediction",
         "plot_steps",
         "save_figure",

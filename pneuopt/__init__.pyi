@@ -10,16 +10,25 @@ from pneuopt.errors import ConvergenceError, InputError, PneuoptError
 from pneuopt.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.files import read_drive, write_fit
 from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.instruments import Actuator, Encoder, Sensor
+from pneuopt.models.chamber import Polytropic, Thermal
+from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.gas import IsentropicNozzle, Iso6358
+from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.full_space import FullSpace
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.plotting import plot_bode, plot_fit, plot_friction, plot_prediction, plot_steps, save_figure
+from pneuopt.plotting import plot_bode, plot_fit, plot_friction, plot_map, plot_prediction, plot_steps, save_figure
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
-from pneuopt.simulate import simulate
+from pneuopt.rig import Rig, record
+from pneuopt.simulate import simulate, simulate_stick_slip
+from pneuopt.study import grid, sweep
 from pneuopt.system import DiscreteSystem, System, define, discretise
 from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult, evaluate, respond, tune
@@ -30,12 +39,15 @@ from pneuopt.tuningfile import read_tuning, write_tuned
 __version__: str
 __all__ = [
     "PID",
+    "Actuator",
     "Asymmetric",
     "ClosedLoop",
     "ConvergenceError",
     "Coulomb",
+    "Cylinder",
     "DiscreteSystem",
     "Dither",
+    "Encoder",
     "Experiment",
     "FirstOrder",
     "ForceDrive",
@@ -43,6 +55,9 @@ __all__ = [
     "IdentificationResult",
     "InputError",
     "Integrator",
+    "IsentropicNozzle",
+    "Iso6358",
+    "Karnopp",
     "LeastSquares",
     "Load",
     "LuGre",
@@ -52,16 +67,23 @@ __all__ = [
     "Parameter",
     "ParameterSet",
     "PeakControl",
+    "PneumaticDrive",
     "PneuoptError",
+    "Polytropic",
     "PressureDependent",
+    "ProportionalValve",
     "Quantity",
+    "Rig",
     "Screening",
     "SecondOrder",
+    "Sensor",
     "SettlingTime",
+    "Spool",
     "SteadyStateError",
     "Step",
     "Stribeck",
     "System",
+    "Thermal",
     "Trajectory",
     "TuningResult",
     "TwoPhase",
@@ -70,23 +92,28 @@ __all__ = [
     "differentiate",
     "discretise",
     "evaluate",
+    "grid",
     "identify",
     "margins",
     "plot_bode",
     "plot_fit",
     "plot_friction",
+    "plot_map",
     "plot_prediction",
     "plot_steps",
     "predict",
     "read_drive",
     "read_log",
     "read_tuning",
+    "record",
     "resample",
     "respond",
     "save_figure",
     "simulate",
+    "simulate_stick_slip",
     "split",
     "step_metrics",
+    "sweep",
     "tune",
     "validate",
     "write_fit",

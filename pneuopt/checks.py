@@ -77,7 +77,9 @@ def _with_noise(system: System, experiments: Sequence[Experiment]) -> list[Exper
     for experiment in experiments:
         for channel in measured_outputs(system, experiment):
             if channel not in experiment.noise:
-                found.setdefault(channel, {})[experiment.name] = noise_level(experiment.trajectory[channel])
+                found.setdefault(channel, {})[experiment.name] = noise_level(
+                    experiment.trajectory[channel], experiment.trajectory.t
+                )
     pooled = {}
     for channel, levels in found.items():
         shown = [level for level in levels.values() if not math.isnan(level)]

@@ -1,7 +1,7 @@
-"""The command line: `pneuopt identify | tune | simulate | info`.
+"""The command line: `pneuopt identify | tune | simulate | study | info`.
 
-Exit status: 0 good, 1 not converged or not certified, 2 bad input, 130 interrupted. Whatever is heavy is imported by
-the command that needs it, so that help is quick.
+Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 130
+interrupted. Whatever is heavy is imported by the command that needs it, so that help is quick.
 """
 
 import sys
@@ -114,6 +114,23 @@ def simulate(
             raise typer.Exit(run_simulate(fit, tuning, outputs))
         if log is not None:
             raise typer.Exit(run_predict(fit, log, outputs))
+
+
+@app.command()
+def study(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning and the axes of a grid.")
+    ],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
+    json: Json = None,
+    plot: Plot = None,
+    quiet: Quiet = False,
+) -> None:
+    """Certify a loop over loads, pressures, or any parameter; status 1 if a case fails or never settles."""
+    with _guarded():
+        from pneuopt.commands import Outputs, run_study
+
+        raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet))
 
 
 @app.command()

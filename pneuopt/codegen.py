@@ -134,9 +134,8 @@ class Rollout:
         Run
         """
         t, h, x0, u, p = (np.ascontiguousarray(a, dtype=np.float64) for a in (t, h, x0, u, p))
-        require(
-            t.ndim == 2 and h.shape == t.shape, f"t and h must have shape (m, n), got {t.shape}, {h.shape}", ModelError
-        )
+        wrong = f"t and h must have shape (m, n), got {t.shape}, {h.shape}"
+        require(t.ndim == 2 and h.shape == t.shape, wrong, ModelError)
         m, n = t.shape
         expected = {"x0": (m, self.n_states), "u": (m, n, self.n_inputs)}
         for name, array in (("x0", x0), ("u", u)):
@@ -215,9 +214,7 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     shapes = [function.size_out(i) for i in range(function.n_out())]
     library = _build(_source({"f": function}))
     if library is None:
-        return lambda *inputs: tuple(
-            _shaped(np.array(a), s) for a, s in zip(function.call(list(inputs)), shapes, strict=True)
-        )
+        return lambda *inputs: tuple(map(_shaped, map(np.array, function.call(list(inputs))), shapes))
     buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
     results = [_buffer(shape) for shape in shapes]
     work = np.zeros(max(1, function.sz_w()))
@@ -287,8 +284,8 @@ def _with_sensitivities(pieces: Pieces, wrt: tuple[int, ...], start: bool) -> di
         directions = [_directional(value, x, p, S[:, c], dp[:, c]) for c in range(ns)]
         sensitivity = ca.horzcat(*directions) if ns else ca.SX(value.numel(), 0)
         # a bare "step" would be bound to the C library's own
-        name = f"system_{name}"
-        return ca.Function(name, [*arguments, x, u, p, S], [ca.densify(value), ca.densify(sensitivity)], {"cse": True})
+        inputs, outputs = [*arguments, x, u, p, S], [ca.densify(value), ca.densify(sensitivity)]
+        return ca.Function(f"system_{name}", inputs, outputs, {"cse": True})
 
     x_next, y = pieces.step(t, h, x, u, p)
     functions = {"step": carried("step", [t, h], x_next), "output": carried("output", [t], y)}

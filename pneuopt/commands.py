@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.console import (
+    SMALLEST_IS_WORST,
+    metric_units,
     progress,
     screen,
+    show_cases,
     show_estimates,
     show_fit,
     show_gains,
@@ -23,7 +26,7 @@ from pneuopt.console import (
 )
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError, require
+from pneuopt.errors import ConvergenceError, InputError, check_known, require
 from pneuopt.experiments import Experiment, read_log, split
 from pneuopt.files import read_drive, read_status, write_fit
 from pneuopt.identify import IdentificationResult, identify, predict, validate
@@ -38,11 +41,15 @@ from pneuopt.plotting import (
     plot_bode,
     plot_fit,
     plot_friction,
+    plot_map,
     plot_prediction,
     plot_steps,
     save_figure,
 )
 from pneuopt.requirements import SettlingTime
+from pneuopt.study import INTERRUPTED as CUT_SHORT
+from pneuopt.study import grid, sweep
+from pneuopt.studyfile import Axis, read_axes, read_study
 from pneuopt.system import System
 from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult, evaluate, respond, tune
@@ -109,9 +116,15 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
     require(bool(asked.minimise), f"{tuning}: says nothing to minimise; {remedy}")
     require(len(asked.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
-    with progress("tuning", quiet=quiet):
+    with progress("tuning", quiet=quiet) as tell:
         result = tune(
-            asked.loop, asked.references, parameters, minimise=asked.minimise, subject_to=asked.subject_to, throw=False
+            asked.loop,
+            asked.references,
+            parameters,
+            minimise=asked.minimise,
+            subject_to=asked.subject_to,
+            throw=False,
+            progress=tell,
         )
     result = replace(result, provenance={**result.provenance, **_hashes(fit, tuning)})
     console = screen()
@@ -170,6 +183,41 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
     return _finish(outputs, writers, {"fit": records(table), "provenance": _hashes(fit, log)}, None)
 
 
+def run_study(file: Path, outputs: Outputs, quiet: bool) -> int:
+    """Certify a loop over a grid of parameters; returns the exit status."""
+    study = read_study(file)
+    outputs.check([file, study.drive, study.tuning])
+    count = len(study.axes)
+    require(
+        outputs.plot is None or count <= 2, f"{file}: --plot draws one or two axes, there are {count}; leave it out"
+    )
+    asked, parameters = _read_loop(study.drive, study.tuning)
+    _warn_of(study.tuning, "tuning")
+    axes, units = read_axes(study, parameters), metric_units(asked.loop)
+    check_known("metric", study.show, units, f"{file}: [metrics] show")
+    try:
+        cases = grid(parameters, {axis.name: axis.points for axis in axes})
+    except InputError as error:
+        raise InputError(f"{file}: [axes] {error}") from None
+    certify = partial(evaluate, asked.loop, asked.references, band=study.band or _band(asked))
+    with progress("certifying", quiet=quiet) as tell:
+        table = sweep(certify, parameters, cases, progress=tell)
+    verdict, status = _verdict(table, len(asked.references))
+    screen().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
+    seen = _worst_of_references(table, axes, study.show)
+    written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
+    show_cases(screen(), seen, written, metrics)
+    writers: Writers = {}
+    if outputs.output is not None:
+        text = _in_si(table, {n: parameters[n].unit for n in written}, asked.loop)
+        writers[outputs.output] = partial(write_text, outputs.output, text)
+    if outputs.plot is not None:
+        writers |= _figures(outputs.plot, {"": plot_map(seen, written, metrics)})
+    tables = {"verdict": verdict, "cases": records(table), "provenance": _hashes(file, study.drive, study.tuning)}
+    _finish(outputs, writers, tables, None)
+    return status
+
+
 def _finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status: Status | None) -> int:
     """Write everything, now that everything is computed."""
     ended = {"status": {"code": status.code.value, "message": status.message}} if status else {}
@@ -199,10 +247,10 @@ def _read_loop(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
     return asked, plant.fixed(*plant.free_names) | asked.parameters
 
 
-def _warn_of(fit: Path) -> None:
-    status = read_status(fit)
+def _warn_of(path: Path, what: str = "fit") -> None:
+    status = read_status(path)
     if status is not None and not status.converged:
-        warn(f"{fit}: its fit is {status}")
+        warn(f"{path}: its {what} is {status}")
 
 
 def warn(message: str) -> None:
@@ -291,6 +339,46 @@ def _write_csv(path: Path, run: Trajectory, columns: Columns) -> None:
     values = np.column_stack([run.t, run.matrix(columns)])
     rows = [",".join("" if math.isnan(v) else f"{v:.9g}" for v in row) for row in values.tolist()]
     write_text(path, "\n".join([header, *rows]) + "\n")
+
+
+def _verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
+    """How a study went, and the exit status."""
+    settling = table[[c for c in table if _metric_of(c) == "SettlingTime"]]
+    good = table["error"] == ""
+    counts = {
+        "interrupted": int((table["error"] == CUT_SHORT).sum()),
+        "failed": int((~good & (table["error"] != CUT_SHORT)).sum()),
+        "never settle": int((good & settling.isna().any(axis=1)).sum()),
+    }
+    parts = [f"{count} {what}" for what, count in counts.items() if count]
+    status = INTERRUPTED if counts["interrupted"] else NOT_GOOD if parts else GOOD
+    each = f", each the worst of {references} references" if references > 1 else ""
+    return f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}", status
+
+
+def _worst_of_references(table: "pd.DataFrame", axes: Sequence[Axis], metrics: Sequence[str]) -> "pd.DataFrame":
+    """What is shown of a study: the axes in the units of the file, each metric at its worst."""
+    seen = table[["error"]].copy()
+    for axis in axes:
+        seen[axis.name] = axis.shown(table[axis.name])
+    for metric in metrics:
+        own = table[[c for c in table if _metric_of(c) == metric]]
+        worst = own.min if metric in SMALLEST_IS_WORST else own.max
+        seen[metric] = worst(axis=1, skipna=False) if len(own.columns) else math.nan
+    return seen
+
+
+def _metric_of(column: Hashable) -> str:
+    """What "Overshoot[0 to 0.2]" is, as it is called where there are several references."""
+    return str(column).partition("[")[0]
+
+
+def _in_si(table: "pd.DataFrame", axes: Mapping[str, str], loop: ClosedLoop) -> str:
+    """As CSV, each column with its unit."""
+    known = {**axes, **metric_units(loop), "PeakTime": "s", "OvershootFinal": "%", "Undershoot": "%", "seconds": "s"}
+    known |= dict.fromkeys(("SettlingMin", "SettlingMax", "Peak", "SteadyStateValue"), loop.feedback.unit)
+    header = {c: f"{c} [{known[_metric_of(c)]}]" for c in table if known.get(_metric_of(c))}
+    return str(table.rename(columns=header).to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 
 def _tuning_tables(result: TuningResult) -> dict[str, Any]:

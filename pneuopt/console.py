@@ -19,6 +19,7 @@ from pneuopt.nlp.least_squares import Progress as Tell
 from pneuopt.nlp.status import Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.requirements import PERCENT, Requirement, name
+from pneuopt.study import INTERRUPTED
 from pneuopt.units import write_value
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 12  # of a table of logs
 MOST_REFERENCES = 3  # beside each other
+MOST_CASES, MOST_REASONS = 40, 5  # of a study
+SMALLEST_IS_WORST = ("GainMargin", "PhaseMargin")
 
 
 def screen(*, error: bool = False) -> Console:
@@ -163,6 +166,34 @@ def show_metrics(
     console.print(table)
 
 
+def show_cases(console: Console, table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> None:
+    """A study, a row a case; of many the worst, by the first metric; then the reasons of those that failed.
+
+    Parameters
+    ----------
+    console : Console
+    table : DataFrame
+        A column an axis and a metric, and "error".
+    axes, metrics : mapping of str to str
+        The columns, and their units.
+    """
+    first = next(iter(metrics))
+    ordered = table.sort_values(first, ascending=first in SMALLEST_IS_WORST, na_position="first", kind="stable")
+    shown = table if len(table) <= MOST_CASES else ordered.head(MOST_CASES)
+    grid = _table(*(f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items()))
+    for row in shown.to_dict(orient="records"):
+        figures = [_metric(m, row[m]) for m in metrics]
+        if row["error"]:
+            figures = ["failed" if row["error"] != INTERRUPTED else INTERRUPTED] + [""] * (len(metrics) - 1)
+        grid.add_row(*(_figure(row[n], 6) for n in axes), *figures)
+    console.print(grid)
+    if len(shown) < len(table):
+        console.print(f"the {len(shown)} worst of {len(table)} cases by {first}; -o FILE writes all")
+    reasons = table["error"][~table["error"].isin(["", INTERRUPTED])].value_counts()
+    for reason, count in list(reasons.items())[:MOST_REASONS]:
+        console.print(f"failed ({count} of {len(table)}): {reason}", soft_wrap=True)
+
+
 def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
     """The metrics that are shown, in that order, with their units."""
     return {
@@ -207,7 +238,7 @@ def _row(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float
     if frame is None or metric not in frame.index:
         return []
     values: list[float] = frame.T[metric].tolist()
-    worst = min if metric in ("GainMargin", "PhaseMargin") else max
+    worst = min if metric in SMALLEST_IS_WORST else max
     unknown = any(math.isnan(v) for v in values)
     return [math.nan if unknown else worst(values)] if several else values
 

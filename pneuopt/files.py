@@ -11,10 +11,15 @@ import tomlkit
 
 from pneuopt.errors import InputError, UnknownNameError, check_known, require
 from pneuopt.experiments import CHANNELS
+from pneuopt.models.chamber import ChamberModel, Polytropic, Thermal
+from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.gas import FlowLaw, IsentropicNozzle, Iso6358
 from pneuopt.models.linear import SPEED, VALVE_VOLTAGE, FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.status import Code, Status
 from pneuopt.output import plain, write_text
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
@@ -32,6 +37,8 @@ FRICTION: Mapping[str, Callable[[], FrictionModel]] = {
     "stribeck": Stribeck,
     "lugre": LuGre,
 }
+LAWS: Mapping[str, Callable[[], FlowLaw]] = {"iso6358": Iso6358, "isentropic": IsentropicNozzle}
+SPOOLS = {spool.name.lower(): spool for spool in Spool}
 PLANTS = ("first_order", "second_order", "integrator")
 CHAMBERS = ("pressure_a", "pressure_b")
 RESULTS = ("estimates", "status", "provenance")
@@ -40,7 +47,13 @@ RESULTS = ("estimates", "status", "provenance")
 # What a section says about the drive's structure; every other key of it is a parameter.
 _STRUCTURE: Sections = {
     "drive": {"kind": "text"},
-    "load": {"spring": "true or false"},
+    "cylinder": {"stops": "true or false"},
+    "valve": {"law": "text", "spool": "text"},
+    "supply": {},
+    "gas": {},
+    "chamber": {"model": "text", "mixed": "true or false"},
+    "ambient": {},
+    "load": {"spring": "true or false", "inclined": "true or false"},
     "friction": {"model": "text", "asymmetric": "true or false", "pressure_dependent": "true, false or a list"},
     "plant": {"model": "text", "input": "text", "output": "text", "pade_order": "a whole number"},
     "rig": {"chamber": "true or false"},
@@ -95,7 +108,7 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
 
     Returns
     -------
-    drive : ForceDrive, MotionDrive, FirstOrder, SecondOrder or Integrator
+    drive : PneumaticDrive, ForceDrive, MotionDrive, FirstOrder, SecondOrder or Integrator
         By [drive] kind and the other sections.
     parameters : ParameterSet
         All of `drive.system().parameters`; one that the file leaves out keeps the model's default.
@@ -107,12 +120,14 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
     """
     said = read_toml(path).unwrap()
     sections = {name: section for name, section in said.items() if name not in RESULTS}
-    check_known("section", sections, (*_STRUCTURE, "ambient"), str(path))
+    check_known("section", sections, _STRUCTURE, str(path))
     for name, section in sections.items():
         require(isinstance(section, dict), f"{path}: {name} must be a section, [{name}]")
     drive = _build(sections, path)
-    defaults = drive.system().parameters
-    return drive, _filled(defaults, sections, path)
+    parameters = _filled(drive.system().parameters, sections, path)
+    if isinstance(drive, PneumaticDrive):
+        _check(drive, parameters, path)
+    return drive, parameters
 
 
 def read_status(path: str | Path) -> Status | None:
@@ -177,8 +192,36 @@ def _build(sections: Sections, path: str | Path) -> Drive:
     return _KINDS[kind](sections, path)
 
 
+def _check(drive: PneumaticDrive, parameters: ParameterSet, path: str | Path) -> None:
+    try:
+        drive.check(parameters)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _pneumatic(sections: Sections, path: str | Path) -> Drive:
+    law = LAWS[_choice(sections, "valve", "law", LAWS, path, "iso6358")]()
+    spool = SPOOLS[_choice(sections, "valve", "spool", SPOOLS, path, "second_order")]
+    cylinder = Cylinder(**_said(sections, "cylinder"))
+    return PneumaticDrive(
+        ProportionalValve(law, spool), _friction(sections, path), _load(sections), _chamber(sections, path), cylinder
+    )
+
+
+def _chamber(sections: Sections, path: str | Path) -> ChamberModel:
+    said = _said(sections, "chamber")
+    if _choice(sections, "chamber", "model", ("polytropic", "thermal"), path, "polytropic") == "polytropic":
+        return Polytropic(said.get("mixed", False))
+    require("mixed" not in said, f"{path}: [chamber] mixed: a thermal chamber has no exponents; leave it out")
+    return Thermal()
+
+
 def _force(sections: Sections, path: str | Path) -> Drive:
-    return ForceDrive(_friction(sections, path), Load(spring=sections.get("load", {}).get("spring", False)))
+    return ForceDrive(_friction(sections, path), _load(sections))
+
+
+def _load(sections: Sections) -> Load:
+    return Load(**_said(sections, "load"))
 
 
 def _motion(sections: Sections, path: str | Path) -> Drive:
@@ -199,7 +242,17 @@ def _linear(sections: Sections, path: str | Path) -> Drive:
     return (FirstOrder if model == "first_order" else Integrator)(order, u, y)
 
 
-_KINDS: Mapping[str, Callable[[Sections, str | Path], Drive]] = {"force": _force, "motion": _motion, "linear": _linear}
+_KINDS: Mapping[str, Callable[[Sections, str | Path], Drive]] = {
+    "pneumatic": _pneumatic,
+    "force": _force,
+    "motion": _motion,
+    "linear": _linear,
+}
+
+
+def _said(sections: Sections, name: str) -> dict[str, Any]:
+    """What a section says of the structure."""
+    return {key: value for key, value in sections.get(name, {}).items() if key in _STRUCTURE[name]}
 
 
 def _friction(sections: Sections, path: str | Path) -> FrictionModel:
@@ -216,9 +269,14 @@ def _friction(sections: Sections, path: str | Path) -> FrictionModel:
 
 
 def _choice(
-    sections: Sections, section: str, key: str, known: Sequence[str] | Mapping[str, Any], path: str | Path
+    sections: Sections,
+    section: str,
+    key: str,
+    known: Sequence[str] | Mapping[str, Any],
+    path: str | Path,
+    usual: str | None = None,
 ) -> str:
-    value = sections.get(section, {}).get(key)
+    value = sections.get(section, {}).get(key, usual)
     if value is None:
         raise InputError(f'{path}: [{section}] says no {key}; write {key} = "...", one of: {", ".join(known)}')
     check_known(key, [value], known, f"{path}: [{section}]")

@@ -1,27 +1,43 @@
 """`simulate`: tight integration of a plant or a loop, which shares nothing with the optimiser but the equations.
 
 The ODE is integrated by LSODA to 1e-10, stiff or not; inputs are held, and the integration restarts only where one
-changes or where a sampled controller acts. The controller's exact update runs at each sample.
+changes or where a sampled controller acts. The controller's exact update runs at each sample. A plant with Karnopp's
+friction sticks and slips between events that are located (`stick_slip`).
 """
 
-import warnings
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import integrate
 
 from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import ConvergenceError, check_known, require
-from pneuopt.parameters import ParameterSet
+from pneuopt.errors import ModelError, check_known, require
+from pneuopt.integration import Run, Smooth
+from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.stick_slip import DIRECTION, Event, StickSlip
 from pneuopt.system import System, names, vector
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-MOST_STEPS = 200_000
 Update = Callable[..., tuple[Array, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class StickSlipResult:
+    """What `simulate_stick_slip` returns.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+        States and outputs, and "stuck", 1 where the piston sticks.
+    events : tuple of Event
+        Break-aways, standstills and reversals, in order; none for how the run begins.
+    """
+
+    trajectory: Trajectory
+    events: tuple[Event, ...]
 
 
 def simulate(
@@ -54,7 +70,8 @@ def simulate(
     Returns
     -------
     Trajectory
-        States and outputs; at a sample, after the controller's update; at a change of input, with the new one.
+        States and outputs; at a sample, after the controller's update; at a change of input, with the new one. With
+        Karnopp's friction also "stuck", 0 or 1.
 
     Raises
     ------
@@ -71,15 +88,64 @@ def simulate(
     >>> round(run["speed"][-1].item(), 6)
     0.632121
     """
+    return _integrated(model, inputs, parameters, initial, t_out, (rtol, atol)).trajectory()
+
+
+def simulate_stick_slip(
+    model: System | ClosedLoop,
+    inputs: Trajectory,
+    parameters: ParameterSet,
+    *,
+    initial: Mapping[str, float] | ArrayLike | None = None,
+    t_out: ArrayLike | None = None,
+    rtol: float = 1e-10,
+    atol: float = 1e-12,
+) -> StickSlipResult:
+    """Integrate a model with Karnopp's friction, and report its events; parameters and errors as for `simulate`.
+
+    Returns
+    -------
+    StickSlipResult
+
+    Examples
+    --------
+    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.friction import Coulomb
+    >>> from pneuopt.models.karnopp import Karnopp
+    >>> drive = ForceDrive(Karnopp(Coulomb())).system()
+    >>> push = Trajectory([0.0, 0.1, 0.2, 0.9], {"force": [29.0, 65.0, 29.0, 29.0]})
+    >>> run = simulate_stick_slip(drive, push, drive.parameters)
+    >>> [(round(e.t, 4), e.kind.value) for e in run.events]
+    [(0.1, 'breaks away'), (0.4364, 'sticks')]
+    """
+    run = _integrated(model, inputs, parameters, initial, t_out, (rtol, atol))
+    if not isinstance(run, StickSlip):
+        raise ModelError("the model has no Karnopp friction, say ForceDrive(Karnopp(Stribeck())); take simulate")
+    return StickSlipResult(run.trajectory(), run.events)
+
+
+def new_run(system: System, p: Array, grid: Array, rtol: float, atol: float) -> Run:
+    """The integration that a plant needs; it records at the instants of `grid` [s]."""
+    return (StickSlip if DIRECTION in system.parameters else Smooth)(system, p, grid, rtol, atol)
+
+
+def _integrated(
+    model: System | ClosedLoop,
+    inputs: Trajectory,
+    parameters: ParameterSet,
+    initial: Mapping[str, float] | ArrayLike | None,
+    t_out: ArrayLike | None,
+    tolerances: tuple[float, float],
+) -> Run:
     system, update, sample_time = _pieces(model)
-    u, grid = _held(system, inputs), _instants(t_out, inputs.t)
-    x, p = _start(model, system, parameters, initial), vector(system.parameters, parameters)
+    u, grid = held_inputs(system.inputs, inputs), _instants(t_out, inputs.t)
+    x, p = first_state(model, parameters, initial), vector(system.parameters, parameters)
     slack = _slack(inputs.t)
     breaks, is_sample = _breaks(inputs.t, u, sample_time, slack)
     rows = u[np.searchsorted(inputs.t, breaks + slack, side="right") - 1]
-    run, done = _Run(system, p, grid, rtol, atol), 0
-    for begin, end, row, acts in zip(breaks, [*breaks[1:], np.inf], rows, is_sample, strict=True):
-        run.restart(begin, update(begin, x, row, p)[0] if acts and update is not None else x, row)
+    run, done = new_run(system, p, grid, *tolerances), 0
+    for at, end, row, acts in zip(breaks, [*breaks[1:], np.inf], rows, is_sample, strict=True):
+        run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row)
         until = int(np.searchsorted(grid, end - slack))
         for t in grid[done:until]:
             run.advance(t)
@@ -87,62 +153,7 @@ def simulate(
         if until == len(grid):
             break
         x, done = run.advance(end), until
-    return run.trajectory()
-
-
-class _Run:
-    """SciPy's integrator on the compiled right-hand side (it restarts in microseconds), and what it has recorded."""
-
-    def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
-        self._system, self._p, self._grid, self._ode = system, p, grid, compiled(system.ode)
-        self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
-        self._u = np.zeros(len(system.inputs))
-        self._states, self._outputs = list[Array](), list[Array]()
-        scale = np.array([q.nominal for q in system.states])
-        options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MOST_STEPS}
-        self._integrator = integrate.ode(self._rate).set_integrator(**options)
-
-    def _rate(self, t: float, x: Array) -> Array:
-        return self._ode(self._origin + t, x, self._u, self._p)[0]
-
-    def restart(self, t: float, x: Array, u: Array) -> None:
-        """Begin anew at t from x under the input u."""
-        self._u = u
-        self._integrator.set_initial_value(x, t - self._origin)
-
-    def advance(self, t: float) -> Array:
-        """The state at t."""
-        before, start = self._integrator.t, np.array(self._integrator.y)
-        if t - self._origin <= before or not self._system.states:
-            return start
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            x = np.array(self._integrator.integrate(t - self._origin))
-        if not (self._integrator.successful() and np.all(np.isfinite(x))):
-            self._fail(self._origin + before, start)
-        return x
-
-    def record(self) -> None:
-        """Keep the state and the output where the integrator stands."""
-        x = np.array(self._integrator.y)
-        self._states.append(x)
-        self._outputs.append(self._ode(self._origin + self._integrator.t, x, self._u, self._p)[1])
-
-    def trajectory(self) -> Trajectory:
-        """What was recorded so far."""
-        n = len(self._states)
-        states, outputs = np.reshape(self._states, (n, -1)).T, np.reshape(self._outputs, (n, -1)).T
-        columns = dict(zip(names(self._system.states), states, strict=True))
-        columns |= dict(zip(names(self._system.outputs), outputs, strict=True))
-        return Trajectory(self._grid[:n], columns)
-
-    def _fail(self, t: float, x: Array) -> None:
-        state = ", ".join(f"{q.name} {v:.6g} {q.unit}" for q, v in zip(self._system.states, x, strict=True))
-        raise ConvergenceError(
-            f"the simulation stopped after t = {t:.9g} s, where {state}: the model is not defined there, escapes to "
-            "infinity or is too stiff; check the parameters, or loosen rtol",
-            self.trajectory() if self._states else None,
-        )
+    return run
 
 
 def _pieces(model: System | ClosedLoop) -> tuple[System, Update | None, float | None]:
@@ -154,9 +165,10 @@ def _pieces(model: System | ClosedLoop) -> tuple[System, Update | None, float | 
     return model.held(), compiled(model.update), model.pid.sample_time
 
 
-def _held(system: System, inputs: Trajectory) -> Array:
-    u = inputs.matrix(names(system.inputs))
-    for q, column in zip(system.inputs, u.T, strict=True):
+def held_inputs(wanted: Sequence[Quantity], inputs: Trajectory) -> Array:
+    """The inputs as rows, one an instant; a missing value is an error."""
+    u = inputs.matrix(names(wanted))
+    for q, column in zip(wanted, u.T, strict=True):
         k = int(np.argmin(np.isfinite(column)))
         good = bool(np.isfinite(column[k]))
         require(good, f"input {q.name!r} is {column[k]:g} at t = {inputs.t[k]:g} s; a simulation needs every sample")
@@ -191,23 +203,20 @@ def _breaks(t: Array, u: Array, sample_time: float | None, slack: float) -> tupl
     return np.concatenate([samples, between])[order], order < len(samples)
 
 
-def _start(
-    model: System | ClosedLoop,
-    system: System,
-    parameters: ParameterSet,
-    initial: Mapping[str, float] | ArrayLike | None,
+def first_state(
+    model: System | ClosedLoop, parameters: ParameterSet, initial: Mapping[str, float] | ArrayLike | None
 ) -> Array:
+    """The state from which `simulate` starts; one outside its physical range is an error."""
+    states = model.states
     if initial is None:
-        x = np.zeros(len(system.states)) if isinstance(model, System) else model.initial(parameters)
+        x = np.zeros(len(states)) if isinstance(model, System) else model.initial(parameters)
     elif isinstance(initial, Mapping):
-        check_known("state", initial, names(system.states), "initial")
-        x = np.array([initial.get(q.name, 0.0) for q in system.states], dtype=float)
+        check_known("state", initial, names(states), "initial")
+        x = np.array([initial.get(q.name, 0.0) for q in states], dtype=float)
     else:
         x = np.array(initial, dtype=float)
-        require(
-            x.shape == (len(system.states),), f"initial has shape {x.shape}, the model has {len(system.states)} states"
-        )
-    for q, value in zip(system.states, x, strict=True):
+        require(x.shape == (len(states),), f"initial has shape {x.shape}, the model has {len(states)} states")
+    for q, value in zip(states, x, strict=True):
         require(
             q.lower <= value <= q.upper,
             f"{q.name} starts at {value:g} {q.unit}, outside [{q.lower:g}, {q.upper:g}]; give it in `initial`",

@@ -52,6 +52,21 @@ class StartFinder(Protocol):
         ...
 
 
+class Rest(NamedTuple):
+    """A plant at rest: its states, and the inputs that keep it there; absent ones are zero."""
+
+    states: Mapping[str, float]
+    inputs: Mapping[str, float]
+
+
+class RestFinder(Protocol):
+    """What a model knows about resting where an equilibrium from zeros would not be found (a drive under pressure)."""
+
+    def __call__(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
+        """Return a rest at which the named outputs have these values, or raise `InputError`."""
+        ...
+
+
 @dataclass(frozen=True)
 class Linearisation:
     """`dx/dt = A x + B u, y = C x + D u` about an operating point; names in the order of the matrices."""
@@ -79,6 +94,8 @@ class System:
         ``(t, x, u, p) -> (xdot, y)`` in SI units, built from SX.
     start_finder : StartFinder, optional
         How this model starts from a log.
+    rest_finder : RestFinder, optional
+        How this model comes to rest.
     """
 
     states: tuple[Quantity, ...]
@@ -87,6 +104,7 @@ class System:
     parameters: ParameterSet
     ode: ca.Function
     start_finder: StartFinder | None = None
+    rest_finder: RestFinder | None = None
 
     def __repr__(self) -> str:
         return describe(self)
@@ -226,6 +244,7 @@ def define(
     parameters: ParameterSet,
     rhs: Rhs,
     start_finder: StartFinder | None = None,
+    rest_finder: RestFinder | None = None,
 ) -> System:
     """Make a `System` from a right-hand side written with names.
 
@@ -236,6 +255,7 @@ def define(
     rhs : callable
         ``rhs(t, x, u, p) -> (xdot, y)``: t an SX, the others mappings from name to SX.
     start_finder : StartFinder, optional
+    rest_finder : RestFinder, optional
 
     Returns
     -------
@@ -255,7 +275,7 @@ def define(
     xdot = _ordered("rate of state", rates, states)
     y = _ordered("output", measured, outputs)
     ode = ca.Function("ode", [t, *map(stacked, (x, u, p))], [xdot, y], ["t", "x", "u", "p"], ["xdot", "y"])
-    return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_finder)
+    return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_finder, rest_finder)
 
 
 def discretise(system: System, substeps: int = 1) -> DiscreteSystem:

@@ -22,7 +22,7 @@ from pneuopt.provenance import provenance
 from pneuopt.requirements import PeakControl, Requirement, Specification, name, read, specify
 from pneuopt.simulate import simulate
 from pneuopt.trajectories import Trajectory
-from pneuopt.tuning.candidates import Simulator, Space, cut, inputs, measure, spacing, span, worst
+from pneuopt.tuning.candidates import Simulator, Space, Tell, cut, inputs, measure, spacing, span, worst
 from pneuopt.tuning.screening import Screening, screen
 from pneuopt.tuning.two_phase import TwoPhase, is_linear, solve_two_phase
 
@@ -84,6 +84,7 @@ def tune(
     subject_to: Sequence[Requirement] = (),
     method: Method | None = None,
     throw: bool = True,
+    progress: Tell | None = None,
 ) -> TuningResult:
     """Find the free gains, and dither, that do best on the references within the limits.
 
@@ -101,6 +102,8 @@ def tune(
         By default the first for a linear loop with a continuous controller, the second for any other.
     throw : bool
         Raise if nothing could be certified; otherwise the result says so in its status.
+    progress : callable, optional
+        Receives a line of text a generation or start.
 
     Returns
     -------
@@ -140,7 +143,7 @@ def tune(
     unfelt = tuple(n for n in space.names if n in UNFELT) if isinstance(method, TwoPhase) else ()
     felt = Space(space.parameters, tuple(n for n in space.names if n not in unfelt))
     require(len(felt.names) > 0, f"{', '.join(unfelt)}: without effect on a linear loop; free a gain as well")
-    search = _Search(loop, tuple(steps), felt, spec, method)
+    search = _Search(loop, tuple(steps), felt, spec, method, progress or (lambda _: None))
     result = search.run()
     note = f"; {', '.join(unfelt)} left as given: without effect on a linear loop's average" if unfelt else ""
     result = replace(
@@ -246,6 +249,7 @@ class _Search:
     space: Space
     spec: Specification
     method: Method
+    tell: Tell
 
     def run(self) -> TuningResult:
         simulator = Simulator(self.loop, self.references, self.space)
@@ -274,7 +278,7 @@ class _Search:
         assert isinstance(self.method, TwoPhase)
         method = self.method if attempt == 0 else replace(self.method, starts=1)
         space = Space(self.space.filled(start), self.space.names)
-        optima = solve_two_phase(self.loop, self.references, space, self._tightened(margin), method)
+        optima = solve_two_phase(self.loop, self.references, space, self._tightened(margin), method, self.tell)
         best, values = optima.best, optima.best.parameters
         stats = {
             "starts": float(optima.starts),
@@ -295,7 +299,7 @@ class _Search:
     def _screen(self, simulator: Simulator, margin: float, start: Array) -> _Found:
         assert isinstance(self.method, Screening)
         spec = self._tightened(margin)
-        point, count = screen(simulator, self.references, self.space, spec, self.method, start)
+        point, count = screen(simulator, self.references, self.space, spec, self.method, start, self.tell)
         values = simulator.values(point[None], spec)[0]
         stats = {"simulations": float(count), "optimum": spec.objective(values)}
         return _Found(point, _screened(self.spec, values), _active(self.space, spec, point, values), stats)

@@ -183,6 +183,17 @@ def scale_of(unit_text: str, unit: str, *, where: str = "") -> tuple[float, floa
     return float(factor), float(offset)
 
 
+def unit_of(text: str | float, unit: str) -> str:
+    """The unit in which a value is written; `unit` where it stands alone.
+
+    Examples
+    --------
+    >>> unit_of("6 bar(g)", "Pa(a)"), unit_of(0.3, "1")
+    ('bar(g)', '1')
+    """
+    return _parts(text, "")[1] or unit
+
+
 def write_value(value: float, unit: str, digits: int = 6) -> str:
     """Write an SI number with a unit that reads well; `read_value` reads it back to the digits given.
 

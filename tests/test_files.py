@@ -12,10 +12,15 @@ from hypothesis import strategies as st
 
 from pneuopt.errors import InputError, UnitError, UnknownNameError
 from pneuopt.files import read_drive, read_status, write_fit
+from pneuopt.models.chamber import Polytropic, Thermal
+from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.gas import IsentropicNozzle
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.tomlfile import read_toml
@@ -106,7 +111,7 @@ def test_a_linear_plant_between_other_signals(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('kind = "force"', "", '[drive] says no kind; write kind = "...", one of: force, motion, linear'),
+        ('kind = "force"', "", '[drive] says no kind; write kind = "...", one of: pneumatic, force, motion, linear'),
         ('kind = "force"', 'kind = "forse"', "[drive]: unknown kind 'forse'; did you mean 'force'?"),
         ('kind = "force"', "kind = 3", "[drive] kind must be text, got 3"),
         ("[friction]", "[fricton]", ": unknown section 'fricton'; did you mean 'friction'?"),
@@ -234,3 +239,80 @@ def test_a_value_at_its_bound_reads_back(tmp_path: Path) -> None:
     found = read_drive(source)[1].with_values({"load.mass": 53.333333333333336})
     write_fit(tmp_path / "fit.toml", source, Fit(found))
     assert read_drive(tmp_path / "fit.toml")[1] == found
+
+
+CYLINDER = """[drive]
+kind = "pneumatic"
+[cylinder]
+bore = "32 mm"
+rod = "12 mm"
+stroke = "200 mm"
+dead_volume_a = "8 cm^3"
+start = "10 %"
+[valve]
+conductance = "2e-8 m^3/(s*Pa)"   # ISO 6358 C
+critical_ratio = 0.3
+bandwidth = "80 Hz"
+dead_zone = "3 %"
+[supply]
+pressure = "6 bar(g)"
+[ambient]
+temperature = "25 degC"
+[load]
+mass = { value = "5 kg", lower = "3 kg", upper = "8 kg" }
+[friction]
+model = "stribeck"
+coulomb = { value = "40 N", free = true }
+"""
+
+
+def test_reads_a_pneumatic_drive(tmp_path: Path) -> None:
+    drive, rig = read_drive(written(tmp_path, CYLINDER))
+    assert drive == PneumaticDrive()
+    expected = {
+        "cylinder.bore": 0.032, "cylinder.start": 0.1, "valve.conductance": 2e-8, "valve.dead_zone": 0.03,
+        "supply.pressure": 701325.0, "ambient.temperature": 298.15, "load.mass": 5.0,
+    }  # fmt: skip
+    assert {n: rig.value(n) for n in expected} == expected
+    assert rig.free_names == ("friction.coulomb",)
+    write_fit(tmp_path / "fit.toml", tmp_path / "drive.toml", Fit(rig.with_values({"valve.leak": 0.01})))
+    assert read_drive(tmp_path / "fit.toml")[1] == rig.with_values({"valve.leak": 0.01})
+
+
+def test_reads_a_pneumatic_drive_of_other_parts(tmp_path: Path) -> None:
+    text = CYLINDER.replace("critical_ratio = 0.3", 'law = "isentropic"\nspool = "first_order"')
+    text = text.replace("[load]", "[chamber]\nmixed = true\n[load]\ninclined = true\nspring = true")
+    drive, _ = read_drive(written(tmp_path, text.replace("[valve]", "stops = false\n[valve]")))
+    valve = ProportionalValve(IsentropicNozzle(), Spool.FIRST_ORDER)
+    assert drive == PneumaticDrive(valve, Stribeck(), Load(True, True), Polytropic(mixed=True), Cylinder(stops=False))
+    warm = CYLINDER + '[chamber]\nmodel = "thermal"\nwall_conductance = "0.3 W/K"\n[gas]\nconstant = "287 J/(kg*K)"\n'
+    drive, rig = read_drive(written(tmp_path, warm))
+    assert drive == PneumaticDrive(chamber=Thermal())
+    assert (rig.value("chamber.wall_conductance"), rig.value("gas.constant")) == (0.3, 287.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            '"12 mm"',
+            '"40 mm"',
+            r"drive.toml: cylinder.rod = 0.04 m is impossible; a rod is thinner than the bore, 0.032 m",
+        ),
+        ('"8 cm^3"', '"-8 cm^3"', r"\[cylinder\] dead_volume_a: value -8e-06 m\^3 lies outside its bounds"),
+        ("= 0.3", "= 1.2", r"\[valve\] critical_ratio: value 1.2 1 lies outside its bounds \[0.05, 0.6\]"),
+        ('"6 bar(g)"', '"0.9 bar(a)"', "supply.pressure = 90000 .* above the ambient pressure, 101325"),
+        ('"6 bar(g)"', '"6 bar"', "may be absolute or gauge"),
+        ('"10 %"', '"110 %"', r"\[cylinder\] start: value 1.1 1 lies outside its bounds \[0, 1\]"),
+        ("dead_zone", "deadzone", "unknown key 'deadzone'; did you mean 'dead_zone'"),
+        ("critical_ratio = 0.3", 'law = "iso"', "unknown law 'iso'; did you mean 'iso6358'"),
+        ("critical_ratio = 0.3", 'spool = "second order"', "unknown spool 'second order'; did you mean 'second_order'"),
+        ("[load]", '[chamber]\nmodel = "adiabatic"\n[load]', "unknown model 'adiabatic'"),
+        ("[load]", '[chamber]\nmodel = "thermal"\nmixed = true\n[load]', "a thermal chamber has no exponents"),
+        ("[cylinder]", '[cylinder]\nstops = "no"', r"\[cylinder\] stops must be true or false"),
+    ],
+)
+def test_impossible_hardware_is_refused_by_its_place(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in CYLINDER
+    with pytest.raises(InputError, match=message):
+        read_drive(written(tmp_path, CYLINDER.replace(old, new, 1)))

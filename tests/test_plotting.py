@@ -1,9 +1,11 @@
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
@@ -21,6 +23,7 @@ from pneuopt.plotting import (
     plot_bode,
     plot_fit,
     plot_friction,
+    plot_map,
     plot_prediction,
     plot_steps,
     save_figure,
@@ -183,6 +186,57 @@ def test_a_loop_without_crossings_has_no_marks() -> None:
     figure = plot_bode(lag(0.5))
     assert figure.legends == []
     assert "Ms = 1" in figure.axes[0].get_title()
+
+
+def study(masses: Sequence[float], pressures: Sequence[float], errors: Mapping[int, str] | None = None) -> pd.DataFrame:
+    rows = []
+    for k, (p, m) in enumerate(itertools.product(pressures, masses)):
+        error = (errors or {}).get(k, "")
+        rows.append((p, m, *((np.nan, np.nan) if error else (0.1 * m / p, m)), error))
+    return pd.DataFrame(rows, columns=["supply.pressure", "load.mass", "SettlingTime", "Overshoot", "error"])
+
+
+def test_a_study_over_two_axes_is_a_map_that_marks_what_failed() -> None:
+    table = study([2.0, 4.0, 9.0], [6.0, 5.0], {0: "ValueError: no", 2: "interrupted"})
+    table.loc[1, "SettlingTime"] = np.nan
+    figure = plot_map(table, {"load.mass": "kg", "supply.pressure": "bar(g)"}, {"SettlingTime": "s", "Overshoot": "%"})
+    left, right = figure.axes[:2]
+    assert texts(left) == "load.mass [kg]|supply.pressure [bar(g)]|SettlingTime [s]"
+    assert texts(right) == "load.mass [kg]||Overshoot [%]"
+    cells = [["0.04", "0.08", "0.18"], ["failed", "never", "interrupted"]]
+    for j, row in enumerate(cells):
+        for i, cell in enumerate(row):
+            assert [q.get_text() for q in left.texts if q.get_position() == (i + 0.5, j + 0.5)] == [cell]
+    assert [q.get_text() for q in left.get_xticklabels()] == ["2", "4", "9"]
+    assert [q.get_text() for q in left.get_yticklabels()] == ["5", "6"]
+    assert [q.get_text() for q in right.texts] == ["2", "4", "9", "failed", "4", "interrupted"]
+
+
+def test_a_study_of_many_cases_is_a_map_without_figures() -> None:
+    table = study(np.linspace(1, 2, 20).tolist(), [4.0, 5.0])
+    (panel, _) = plot_map(table, {"load.mass": "kg", "supply.pressure": "bar(g)"}, {"SettlingTime": "s"}).axes
+    assert (len(panel.texts), len(panel.get_xticks()), len(panel.get_yticks())) == (0, 5, 2)
+
+
+def test_a_study_over_one_axis_is_a_line_that_marks_what_failed() -> None:
+    table = study([4.0, 2.0, 6.0], [5.0], {2: "ValueError: no"})
+    figure = plot_map(table, {"load.mass": "kg"}, {"SettlingTime": "s"})
+    (panel,) = figure.axes
+    assert texts(panel) == "load.mass [kg]||SettlingTime [s]"
+    x, y = panel.lines[0].get_data()
+    assert np.array_equal(x, [2, 4, 6])
+    assert np.array_equal(y, [0.04, 0.08, np.nan], equal_nan=True)
+    assert [(q.get_text(), q.get_position()[0]) for q in panel.texts] == [("failed", 6)]
+
+
+def test_a_study_that_cannot_be_drawn_says_why() -> None:
+    table = study([2.0], [5.0])
+    with pytest.raises(InputError, match="one or two axes, this has 3"):
+        plot_map(table, {"load.mass": "kg", "supply.pressure": "bar", "Overshoot": "%"}, {"SettlingTime": "s"})
+    with pytest.raises(InputError, match="no metric"):
+        plot_map(table, {"load.mass": "kg"}, {})
+    with pytest.raises(InputError, match="unknown column 'SetlingTime'; did you mean 'SettlingTime'"):
+        plot_map(table, {"load.mass": "kg"}, {"SetlingTime": "s"})
 
 
 @pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("SVG", b"<?xml")])

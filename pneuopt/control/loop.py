@@ -187,7 +187,8 @@ class ClosedLoop:
         ----------
         parameters : ParameterSet
         x_plant : array_like, shape (n_plant_states,), optional
-            The plant's state. Without it the closed loop is solved for its equilibrium at `reference`, other inputs 0.
+            The plant's state. Without it the closed loop is solved for its equilibrium at `reference`, other inputs 0;
+            a plant that knows its rest stands there, and the controller takes over the command that holds it.
         reference : float
             The reference so far [unit of the measured signal].
         command : float
@@ -290,6 +291,10 @@ class ClosedLoop:
 
     def _rest(self, parameters: ParameterSet, reference: float) -> tuple[Array, float]:
         """Plant state and command of the closed loop in equilibrium, without dither and clip."""
+        if self.plant.rest_finder is not None:
+            rest = self.plant.rest_finder(parameters, {self.feedback.name: reference})
+            x = np.array([rest.states.get(n, 0.0) for n in names(self.plant.states)])
+            return x, rest.inputs.get(self.command.name, 0.0)
         integral = Quantity("pid.integral", self.command.unit, self.command.nominal)
         p = self.numbers(parameters)
         integrates = bool(p[list(self.parameters).index("pid.Ki")] != 0)

@@ -2,16 +2,33 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import casadi as ca
 
-from pneuopt.models.gas import GAS_CONSTANT, ISENTROPIC
+from pneuopt.models.gas import ISENTROPIC
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 TURNING_FLOW = 1e-5  # [kg/s] over which a flow's exponent or temperature changes from outflow's to inflow's
-PRESSURE = Quantity("pressure", "Pa(a)", nominal=5e5, lower=0.0)
+VACUUM = 1e3  # [Pa] below it nothing here is meant to hold
+PRESSURE = Quantity("pressure", "Pa(a)", nominal=5e5, lower=VACUUM)
+
+
+class Inflow(NamedTuple):
+    """A mass flow into the chamber [kg/s], negative outwards, and the temperature of the air it brings [K]."""
+
+    rate: ca.SX
+    temperature: ca.SX
+
+
+class Surroundings(NamedTuple):
+    """What a chamber does not determine: volume [m^3], its rate [m^3/s], temperature of supply and wall [K], R."""
+
+    volume: ca.SX
+    swept: ca.SX
+    temperature: ca.SX
+    gas_constant: ca.SX
 
 
 class ChamberModel(Protocol):
@@ -19,7 +36,7 @@ class ChamberModel(Protocol):
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """pressure, and what else the air needs."""
+        """Pressure, and what else the air needs."""
         ...
 
     @property
@@ -27,25 +44,33 @@ class ChamberModel(Protocol):
         """Shared by a drive's chambers."""
         ...
 
-    def rates(
-        self, z: Symbols, flows: Sequence[ca.SX], volume: ca.SX, swept: ca.SX, source: ca.SX, p: Symbols
-    ) -> dict[str, ca.SX]:
-        """Rates of the states under mass flows into the chamber [kg/s] from air at `source` [K].
+    def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:
+        """Temperature of the air inside [K]."""
+        ...
 
-        volume [m^3] and swept, its rate [m^3/s], are those of the chamber now.
-        """
+    def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
+        """Rates of the states."""
         ...
 
 
 @dataclass(frozen=True)
 class Polytropic:
-    r"""No temperature state: exponents between isothermal (1) and adiabatic (1.4), for inflow, outflow and volume.
+    r"""No temperature state: an exponent between isothermal (1) and adiabatic (1.4).
 
-    .. math:: \dot p = \frac{R T}{V} \sum_j \alpha(w_j) w_j - \alpha_V \frac{p \dot V}{V}
+    .. math:: \dot p = \frac{1}{V} \left( \alpha(w) R T w - \alpha_V p \dot V \right), \qquad w = \sum_j w_j
 
-    Source: Richer & Hurmuzlu, J. Dyn. Sys. Meas. Control 122(3), 2000, who found 1.4, 1 and 1.2 to agree with experiment.
-    All three 1.4 is the paper's eq. (7) and (8).
+    With all three exponents 1 mass is conserved exactly; all 1.4 is eq. (7) and (8) of Ye, Wang, Chen (IJRES 3(7),
+    2015). The exponent of inflow or outflow goes by the net flow: with one a flow, a valve that leaks at its null would
+    rest where more air leaves than enters.
+
+    Parameters
+    ----------
+    mixed : bool
+        Exponents of their own for inflow, outflow and volume; Richer & Hurmuzlu, J. Dyn. Sys. Meas. Control 122(3),
+        2000, found 1.4, 1 and 1.2 to agree with experiment.
     """
+
+    mixed: bool = False
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -54,56 +79,79 @@ class Polytropic:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Exponents [1]: inflow, outflow, volume."""
-        exponent = Parameter(1.4, "1", 0.9, 1.5)
-        volume = Parameter(1.2, "1", 0.9, 1.5)
-        outflow = Parameter(1.0, "1", 0.9, 1.5)
-        return ParameterSet({"inflow_exponent": exponent, "outflow_exponent": outflow, "volume_exponent": volume})
+        """The exponent [1]; if mixed, inflow_exponent, outflow_exponent, volume_exponent."""
+        if not self.mixed:
+            return ParameterSet({"exponent": Parameter(1.2, "1", 0.9, 1.5)})
+        values = {"inflow_exponent": 1.4, "outflow_exponent": 1.0, "volume_exponent": 1.2}
+        source = "Richer & Hurmuzlu 2000"
+        return ParameterSet({n: Parameter(v, "1", 0.9, 1.5, source=source) for n, v in values.items()})
 
-    def rates(
-        self, z: Symbols, flows: Sequence[ca.SX], volume: ca.SX, swept: ca.SX, source: ca.SX, p: Symbols
-    ) -> dict[str, ca.SX]:
-        """See `ChamberModel`."""
-        fed = sum((w * blend(w, p["inflow_exponent"], p["outflow_exponent"]) for w in flows), start=ca.SX(0))
-        return {"pressure": (GAS_CONSTANT * source * fed - p["volume_exponent"] * z["pressure"] * swept) / volume}
+    def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
+        """That of the surroundings."""
+        return outside
+
+    def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
+        """See the class."""
+        w = sum((flow.rate for flow in flows), start=ca.SX(0))
+        inward, outward, swept = (
+            p[f"{n}_exponent" if self.mixed else "exponent"] for n in ("inflow", "outflow", "volume")
+        )
+        fed = blend(w, inward, outward) * around.gas_constant * around.temperature * w
+        return {"pressure": (fed - swept * z["pressure"] * around.swept) / around.volume}
 
 
 @dataclass(frozen=True)
 class Thermal:
     r"""Energy balance with a temperature state and heat through the wall; mass and energy close exactly.
 
-    .. math:: \dot p = \frac{\kappa R}{V} \sum_j T_j w_j - \kappa \frac{p \dot V}{V} + \frac{\kappa - 1}{V} h A (T_w - T)
+    .. math::
+        \dot p = \frac{\kappa R}{V} \sum_j T_j w_j - \kappa \frac{p \dot V}{V} + \frac{\kappa - 1}{V} h A (T_w - T)
         \qquad \dot T = T \left( \frac{\dot p}{p} + \frac{\dot V}{V} - \frac{R T}{p V} \sum_j w_j \right)
 
-    T_j is the source's temperature for inflow, the chamber's for outflow; the wall keeps the source's.
+    T_j is that of the source for inflow, the chamber's for outflow; the wall keeps the surroundings' temperature.
     """
 
     @property
     def states(self) -> tuple[Quantity, ...]:
         """Pressure [Pa(a)], temperature [K]."""
-        return (PRESSURE, Quantity("temperature", "K", nominal=300.0, lower=0.0))
+        return (PRESSURE, Quantity("temperature", "K", nominal=300.0, lower=10.0))
 
     @property
     def parameters(self) -> ParameterSet:
         """wall_conductance [W/K], heat transfer coefficient times wall area."""
         return ParameterSet({"wall_conductance": Parameter(0.5, "W/K", 0.0, 1e3)})
 
-    def rates(
-        self, z: Symbols, flows: Sequence[ca.SX], volume: ca.SX, swept: ca.SX, source: ca.SX, p: Symbols
-    ) -> dict[str, ca.SX]:
-        """See `ChamberModel`."""
-        pressure, temperature = z["pressure"], z["temperature"]
-        enthalpy = sum((w * blend(w, source, temperature) for w in flows), start=ca.SX(0))
-        heat = p["wall_conductance"] * (source - temperature)
-        k = ISENTROPIC
-        rate = (k * GAS_CONSTANT * enthalpy - k * pressure * swept + (k - 1) * heat) / volume
-        mass_rate = sum(flows, start=ca.SX(0))
-        relative = rate / pressure + swept / volume - GAS_CONSTANT * temperature * mass_rate / (pressure * volume)
-        return {"pressure": rate, "temperature": temperature * relative}
+    def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
+        """Its own."""
+        return z["temperature"]
+
+    def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
+        """See the class."""
+        pressure, temperature, k = z["pressure"], z["temperature"], ISENTROPIC
+        enthalpy = sum((w * blend(w, source, temperature) for w, source in flows), start=ca.SX(0))
+        heat = p["wall_conductance"] * (around.temperature - temperature)
+        rate = (k * around.gas_constant * enthalpy - k * pressure * around.swept + (k - 1) * heat) / around.volume
+        mass = pressure * around.volume / (around.gas_constant * temperature)
+        growth = sum((flow.rate for flow in flows), start=ca.SX(0)) / mass
+        return {
+            "pressure": rate,
+            "temperature": temperature * (rate / pressure + around.swept / around.volume - growth),
+        }
 
 
 def blend(flow: ca.SX, inward: ca.SX, outward: ca.SX) -> ca.SX:
     """A property of the air that passes: `inward` for flow into the chamber, `outward` for flow out, smooth between.
+
+    Parameters
+    ----------
+    flow : SX or float
+        Mass flow into the chamber [kg/s].
+    inward, outward : SX or float
+        The property either way, in any unit.
+
+    Returns
+    -------
+    SX or float
 
     Examples
     --------

@@ -41,12 +41,12 @@ class ForceDrive:
 
     def system(self) -> System:
         """Wire the parts: states position, speed and the friction's; outputs position, speed."""
-        inner = tuple(_renamed(q, f"friction.{q.name}") for q in self.friction.states)
+        inner = tuple(renamed(q, f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             v, y = x["speed"], x["position"]
-            force = self.friction.force(v, _part(x, "friction"), _gauge(self.friction, u, p), _part(p, "friction"))
-            acceleration = self.load.acceleration(u["force"] - force.value, y, _part(p, "load"))
+            force = self.friction.force(v, part(x, "friction"), gauge(self.friction, u, p), part(p, "friction"))
+            acceleration = self.load.acceleration(u["force"] - force.value, y, part(p, "load"))
             rates = {f"friction.{n}": rate for n, rate in force.rates.items()}
             return {"position": v, "speed": acceleration, **rates}, {"position": y, "speed": v}
 
@@ -78,16 +78,16 @@ class MotionDrive:
         bias = Parameter(0.0, "1", lower=-0.5, upper=0.5)
         rig = {"rig.area": area, "rig.area_bias": bias} if self.chamber else {}
         offset = ParameterSet({**rig, "rig.force_offset": Parameter(0.0, "N", lower=-1e4, upper=1e4)})
-        ambient = _AMBIENT if self.chamber else _ambient(self.friction)
+        ambient = AMBIENT if self.chamber else _ambient(self.friction)
         return offset | self.friction.parameters.prefixed("friction") | ambient
 
     def system(self) -> System:
         """Wire the parts: no state but the friction's; output force."""
-        inner = tuple(_renamed(q, f"friction.{q.name}") for q in self.friction.states)
+        inner = tuple(renamed(q, f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             force = self.friction.force(
-                u["speed"], _part(x, "friction"), _gauge(self.friction, u, p), _part(p, "friction")
+                u["speed"], part(x, "friction"), gauge(self.friction, u, p), part(p, "friction")
             )
             push = p["rig.force_offset"] + force.value
             if self.chamber:
@@ -100,14 +100,14 @@ class MotionDrive:
         return define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, motion_starts)
 
 
-_AMBIENT = ParameterSet(
+AMBIENT = ParameterSet(
     {"ambient.pressure": Parameter(ATMOSPHERE, "Pa(a)", lower=1e4, upper=2e5, source="ISO 2533 standard atmosphere")}
 )
 _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 
 
 def _ambient(friction: FrictionModel) -> ParameterSet:
-    return _AMBIENT if friction.inputs else ParameterSet()
+    return AMBIENT if friction.inputs else ParameterSet()
 
 
 def _pressures(friction: FrictionModel) -> tuple[Quantity, ...]:
@@ -115,14 +115,16 @@ def _pressures(friction: FrictionModel) -> tuple[Quantity, ...]:
     return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs)
 
 
-def _gauge(friction: FrictionModel, u: Symbols, p: Symbols) -> Symbols:
+def gauge(friction: FrictionModel, u: Symbols, p: Symbols) -> Symbols:
+    """The gauge pressures that a friction model asks for, from the absolute ones."""
     return {q.name: u[q.name] - p["ambient.pressure"] for q in friction.inputs}
 
 
-def _part(values: Symbols, prefix: str) -> Symbols:
+def part(values: Symbols, prefix: str) -> Symbols:
     """The entries ``prefix.name`` by their own name."""
     return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
 
 
-def _renamed(quantity: Quantity, name: str) -> Quantity:
+def renamed(quantity: Quantity, name: str) -> Quantity:
+    """The same signal under another name."""
     return Quantity(name, quantity.unit, quantity.nominal, quantity.lower, quantity.upper)

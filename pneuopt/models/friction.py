@@ -86,7 +86,7 @@ class Coulomb:
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
-        return Force(p["coulomb"] * ca.tanh(v / p["smoothing"]) + p["viscous"] * v, {})
+        return Force(p["coulomb"] * turned(v, p) + p["viscous"] * v, {})
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Stribeck:
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
         g = stribeck_curve(v, p["coulomb"], p["static"], p["stribeck_velocity"])
-        return Force(g * ca.tanh(v / p["smoothing"]) + p["viscous"] * v, {})
+        return Force(g * turned(v, p) + p["viscous"] * v, {})
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class Asymmetric:
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""
-        side = ca.tanh(v / p["asymmetry_width"])
+        side = turned(v, p, "asymmetry_width")
         levels = {"coulomb": "coulomb_asymmetry", "static": "coulomb_asymmetry", "viscous": "viscous_asymmetry"}
         scaled = {n: p[n] * (1 + p[a] * side) for n, a in levels.items() if n in p}
         return self.base.force(v, z, u, {**p, **scaled})
@@ -214,6 +214,11 @@ class PressureDependent:
         rise = sum((p[f"coulomb_{name}"] * u[name] for name in self.chambers), start=ca.SX(0))
         raised = {n: p[n] + rise for n in ("coulomb", "static") if n in p}
         return self.base.force(v, z, u, {**p, **raised})
+
+
+def turned(v: ca.SX, p: Symbols, width: str = "smoothing") -> ca.SX:
+    """The sign of the speed, smooth over the parameter `width`; a `direction` among p (`Karnopp`) is taken as it is."""
+    return p["direction"] if "direction" in p else ca.tanh(v / p[width])
 
 
 def stribeck_curve(v: ca.SX, coulomb: ca.SX, static: ca.SX, stribeck_velocity: ca.SX) -> ca.SX:

@@ -22,6 +22,7 @@ STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the or
 FILTER_TIME = 0.031  # [s] window of the Savitzky-Golay filter, order 3
 SLIDING_SPEED = 4e-3  # [m/s] slower samples say nothing of sliding friction
 STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recipe
+RIDGE = 1e-2  # on columns of unit length: sliding one way only, Coulomb friction and a constant force are one
 LEAST_EXCESS = 0.03  # of static friction over Coulomb's, as a fraction of it (step 2)
 SLOW_SPEED = 1e-2  # [m/s] below it friction comes near its static level, and bristles still bend
 
@@ -41,8 +42,8 @@ def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
         if "load.stiffness" in parameters:
             inertia["load.stiffness"] = position - parameters.value("load.rest_position")
         states = {"position": position, "speed": speed}
-        rows[name] = _Rows(measured, parameters, speed, measured["force"], inertia, states)
-    return _candidates(rows)
+        rows[name] = Rows(measured, parameters, speed, measured["force"], inertia, states)
+    return candidates(rows)
 
 
 def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -54,8 +55,8 @@ def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
             push = parameters.value("rig.area") * (measured["pressure_a"] - parameters.value("ambient.pressure"))
             force = force - push
             rig["rig.area_bias"] = push
-        rows[name] = _Rows(measured, parameters, measured["speed"], force, rig, {})
-    return _candidates(rows)
+        rows[name] = Rows(measured, parameters, measured["speed"], force, rig, {})
+    return candidates(rows)
 
 
 def motion(measured: Trajectory) -> tuple[Array, Array, Array]:
@@ -65,25 +66,24 @@ def motion(measured: Trajectory) -> tuple[Array, Array, Array]:
         "the log has neither 'position' nor 'speed'; friction cannot be told without motion",
         LogError,
     )
-    step = float(np.median(np.diff(measured.t)))
-    window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
-    window = min(window, (len(measured) - 1) // 2 * 2 + 1)
-
-    def filtered(column: Array, derivative: int) -> Array:
-        return np.asarray(savgol_filter(column, window, min(3, window - 1), deriv=derivative, delta=step))
-
     if "position" in measured:
-        column = _filled(measured, "position")
-        position, acceleration = filtered(column, 0), filtered(column, 2)
-        speed = filtered(_filled(measured, "speed"), 0) if "speed" in measured else filtered(column, 1)
-        return position, speed, acceleration
-    column = _filled(measured, "speed")
-    speed, acceleration = filtered(column, 0), filtered(column, 1)
+        speed = filtered(measured, "speed", 0) if "speed" in measured else filtered(measured, "position", 1)
+        return filtered(measured, "position", 0), speed, filtered(measured, "position", 2)
+    speed, acceleration = filtered(measured, "speed", 0), filtered(measured, "speed", 1)
     return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(measured.t))]), speed, acceleration
 
 
+def filtered(measured: Trajectory, name: str, derivative: int) -> Array:
+    """A channel, or its derivative by time, by Savitzky and Golay's filter; missing samples interpolated."""
+    step = float(np.median(np.diff(measured.t)))
+    window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
+    window = min(window, (len(measured) - 1) // 2 * 2 + 1)
+    column = _filled(measured, name)
+    return np.asarray(savgol_filter(column, window, min(3, window - 1), deriv=derivative, delta=step))
+
+
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class Rows:
     """One log's part of the regression: ``force = sum(columns * parameters) + friction``."""
 
     measured: Trajectory
@@ -94,7 +94,8 @@ class _Rows:
     states: Mapping[str, Array]
 
 
-def _candidates(logs: Mapping[str, _Rows]) -> Sequence[Start]:
+def candidates(logs: Mapping[str, Rows]) -> Sequence[Start]:
+    """One start for each Stribeck velocity tried, from the rows of all logs."""
     parameters = next(iter(logs.values())).parameters
     searched = "friction.stribeck_velocity" in parameters.free_names
     given = parameters.value("friction.stribeck_velocity") if "friction.stribeck_velocity" in parameters else np.inf
@@ -113,7 +114,7 @@ def _candidates(logs: Mapping[str, _Rows]) -> Sequence[Start]:
     return starts
 
 
-def _named(name: str, value: float, logs: Mapping[str, _Rows]) -> dict[str, float]:
+def _named(name: str, value: float, logs: Mapping[str, Rows]) -> dict[str, float]:
     """A start value, for each log where the parameter is each log's own."""
     per_log = any(rows.parameters[name].per_log for rows in logs.values())
     return (
@@ -123,7 +124,7 @@ def _named(name: str, value: float, logs: Mapping[str, _Rows]) -> dict[str, floa
     )
 
 
-def _regress(logs: Mapping[str, _Rows], parameters: ParameterSet, velocity: float) -> dict[str, float]:
+def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float) -> dict[str, float]:
     """Bounded linear least squares over all logs' sliding samples, with four Cauchy reweights."""
     parts = [_log_columns(name, rows, velocity) for name, rows in logs.items()]
     free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
@@ -146,7 +147,7 @@ def _regress(logs: Mapping[str, _Rows], parameters: ParameterSet, velocity: floa
     return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}
 
 
-def _log_columns(name: str, rows: _Rows, velocity: float) -> tuple[dict[str, Array], Array]:
+def _log_columns(name: str, rows: Rows, velocity: float) -> tuple[dict[str, Array], Array]:
     """A log's free columns ("name[log]" if its own), and its force less what is known."""
     p = rows.parameters
     columns = {n: c for n, c in {**rows.columns, **_friction_columns(rows, velocity)}.items() if n in p}
@@ -163,7 +164,7 @@ def _log_columns(name: str, rows: _Rows, velocity: float) -> tuple[dict[str, Arr
     return {f"{n}[{name}]" if p[n].per_log else n: c for n, c in columns.items() if p[n].free}, target
 
 
-def _friction_columns(rows: _Rows, velocity: float) -> dict[str, Array]:
+def _friction_columns(rows: Rows, velocity: float) -> dict[str, Array]:
     """What multiplies each friction parameter in the force; static friction counts as the part above Coulomb's."""
     parameters, speed = rows.parameters, rows.speed
     smoothing = parameters.value("friction.smoothing") if "friction.smoothing" in parameters else 1e-3
@@ -178,10 +179,13 @@ def _friction_columns(rows: _Rows, velocity: float) -> dict[str, Array]:
 
 
 def _robust(A: Array, y: Array, lower: Array, upper: Array) -> Array:
+    """Bounded least squares, reweighted; what the rows do not tell apart (`RIDGE`) shares the effect."""
+    k = A.shape[1]
     scale = np.linalg.norm(A, axis=0) + 1e-300
-    weight, x = np.ones(len(A)), np.zeros(A.shape[1])
+    weight, x = np.ones(len(A)), np.zeros(k)
     for _ in range(5):
-        fit = lsq_linear(A / scale * weight[:, None], y * weight, (lower * scale, upper * scale))
+        weighted = np.concatenate([A / scale * weight[:, None], RIDGE * np.eye(k)])
+        fit = lsq_linear(weighted, np.append(y * weight, np.zeros(k)), (lower * scale, upper * scale))
         x = np.clip(np.asarray(fit.x) / scale, lower, upper)
         error = y - A @ x
         spread = 1.4826 * np.median(np.abs(error)) + 1e-12
@@ -199,7 +203,7 @@ def _bounds(bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]
     return lower, upper
 
 
-def _bristles(logs: Mapping[str, _Rows], values: dict[str, float]) -> dict[str, dict[str, Array]]:
+def _bristles(logs: Mapping[str, Rows], values: dict[str, float]) -> dict[str, dict[str, Array]]:
     """The bristle deflection along each log, and their stiffness from presliding motion (changes `values`)."""
     parameters = next(iter(logs.values())).parameters
     if "friction.bristle_stiffness" not in parameters:
@@ -222,7 +226,7 @@ def _bristles(logs: Mapping[str, _Rows], values: dict[str, float]) -> dict[str, 
     return {n: {"friction.bristle": np.clip(z, -limit, limit)} for n, z in deflections.items()}
 
 
-def _presliding_slope(logs: Mapping[str, _Rows], friction: Mapping[str, Array], level: float) -> float:
+def _presliding_slope(logs: Mapping[str, Rows], friction: Mapping[str, Array], level: float) -> float:
     """Robust slope of dF/dt over v in slow samples below the sliding level [N/m]; zero where there are none."""
     rate, speed = [], []
     for n, rows in logs.items():
@@ -234,7 +238,7 @@ def _presliding_slope(logs: Mapping[str, _Rows], friction: Mapping[str, Array], 
     return float(_robust(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0]) if v.size else 0.0
 
 
-def _friction_force(name: str, rows: _Rows, values: Mapping[str, float]) -> Array:
+def _friction_force(name: str, rows: Rows, values: Mapping[str, float]) -> Array:
     """The force less what inertia, load and offsets take [N]."""
     p = rows.parameters
     used = {n: c for n, c in rows.columns.items() if n in p}

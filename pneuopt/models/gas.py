@@ -1,22 +1,28 @@
 """Air and its flow through an orifice: one smooth kernel for ISO 6358 and for the isentropic nozzle.
 
-Both laws are a plateau (choked) and a falling branch; with z the pressure ratio measured from 1 towards the critical
-ratio, clipped smoothly at -1 and 1, flow runs through zero without a kink, in either direction. Errors of the
-smoothing, as a fraction of the choked flow, for eps = 1e-3: 5e-5 where choked, 2e-4 below a pressure ratio of 0.99, 1.1 %
-at worst (above 0.9998); for eps = 1e-2: 1.6 % below 0.99 (PHYSICS section 2).
+Both laws are a plateau (choked) and a falling branch; with z the distance of the pressure ratio from 1 in units of the
+critical one's, clipped smoothly at -1 and 1, flow runs through zero without a kink, in either direction. Errors of the
+smoothing, as a fraction of the choked flow, for zero = 1e-3: 5e-5 where choked, 2e-4 below a pressure ratio of 0.99,
+1.1 % at worst (above 0.9998); for zero = 1e-2: 1.6 % below 0.99.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 from typing import Protocol
 
 import casadi as ca
 
+from pneuopt.parameters import Parameter, ParameterSet
+
+Symbols = Mapping[str, ca.SX]
 GAS_CONSTANT = 287.05  # [J/(kg K)] dry air
 ISENTROPIC = 1.4  # [-] ratio of specific heats of air
 REFERENCE_DENSITY = 1.185  # [kg/m^3] ANR, ISO 8778: 100 kPa, 20 degC, 65 % humidity
 REFERENCE_TEMPERATURE = 293.15  # [K] ANR
+REFERENCE_PRESSURE = 1e5  # [Pa] ANR
 CRITICAL_RATIO = (2 / (ISENTROPIC + 1)) ** (ISENTROPIC / (ISENTROPIC - 1))  # 0.528282, of the isentropic nozzle
+_POWER = (ISENTROPIC - 1) / ISENTROPIC
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class Smoothing:
     corner : float
         Rounds the corner to the plateau [-].
     zero : float
-        Rounds the square root at zero flow [-]; smaller is stiffer: the decay rate of a chamber grows with its -1/2 power.
+        Rounds the square root at zero flow [-]; smaller is stiffer: a chamber's decay rate grows with its -1/2 power.
     pressure : float
         Rounds the larger of the two pressures [Pa].
     """
@@ -39,10 +45,15 @@ class Smoothing:
 
 
 class FlowLaw(Protocol):
-    """How much of the choked flow passes, as a function of the rounded, clipped pressure ratio."""
+    """How much an orifice of conductance 1 passes between two pressures."""
 
-    def flow(self, upstream: ca.SX, downstream: ca.SX, b: ca.SX, smoothing: Smoothing) -> ca.SX:
-        """Flow over conductance, density and sqrt(T0/T) [Pa]; odd in the pressures' exchange."""
+    @property
+    def parameters(self) -> ParameterSet:
+        """Numbers of the law beside the conductance."""
+        ...
+
+    def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
+        """Mass flow over conductance, reference density and sqrt(T0/T) [Pa]; odd in the pressures' exchange."""
         ...
 
 
@@ -58,9 +69,14 @@ class Iso6358:
 
     exponent: float = 0.5
 
-    def flow(self, upstream: ca.SX, downstream: ca.SX, b: ca.SX, smoothing: Smoothing) -> ca.SX:
-        """See `FlowLaw`; b is the critical pressure ratio [-]."""
-        high, z, s = clipped_ratio(upstream, downstream, b, smoothing)
+    @property
+    def parameters(self) -> ParameterSet:
+        """critical_ratio, b [1]."""
+        return ParameterSet({"critical_ratio": Parameter(0.3, "1", 0.05, 0.6)})
+
+    def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
+        """See `FlowLaw`."""
+        high, z, s = clipped_ratio(upstream, downstream, p["critical_ratio"], smoothing)
         flow: ca.SX = high * z / s * (s * (2 - s)) ** self.exponent
         return flow
 
@@ -69,16 +85,22 @@ class Iso6358:
 class IsentropicNozzle:
     """Saint-Venant and Wantzel: eq. (1) and (2) of Ye, Wang, Chen (IJRES 3(7), 2015), scaled to 1 where choked.
 
-    Its critical ratio is fixed at 0.5283, whatever b is given; ISO 6358 with b = 0.5283 differs by 0.15 % of the choked flow.
+    Its critical ratio is 0.5283; the ellipse of ISO 6358 with b = 0.5283 differs by 0.15 % of the choked flow.
     """
 
-    def flow(self, upstream: ca.SX, downstream: ca.SX, b: ca.SX, smoothing: Smoothing) -> ca.SX:  # noqa: ARG002 - protocol
+    @property
+    def parameters(self) -> ParameterSet:
+        """None."""
+        return ParameterSet()
+
+    def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
         """See `FlowLaw`."""
         high, z, s = clipped_ratio(upstream, downstream, CRITICAL_RATIO, smoothing)
-        r = 1 - (1 - CRITICAL_RATIO) * s
-        k = ISENTROPIC
-        choked = sqrt(CRITICAL_RATIO ** (2 / k) - CRITICAL_RATIO ** ((k + 1) / k))
-        return high * z / s * ca.sqrt(r ** (2 / k) - r ** ((k + 1) / k)) / choked
+        # r^(2/k) - r^((k+1)/k) with one power: k = 1.4 makes 2/(k-1) the whole number 5
+        chill = (1 - (1 - CRITICAL_RATIO) * s) ** _POWER
+        least = CRITICAL_RATIO**_POWER
+        flow: ca.SX = high * z / s * ca.sqrt(chill**5 * (1 - chill) / (least**5 * (1 - least)))
+        return flow
 
 
 def clipped_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoothing) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -96,6 +118,12 @@ def clipped_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoothing) 
     -------
     tuple of SX
         p_h [Pa], z [-], s = sqrt(z^2 + zero^2) [-].
+
+    Examples
+    --------
+    >>> high, z, s = clipped_ratio(6e5, 5e5, 0.3, Smoothing())
+    >>> round(float(high)), round(float(z), 4)
+    (600000, 0.238)
     """
     high = (p1 + p2 + ca.sqrt((p1 - p2) ** 2 + smoothing.pressure**2)) / 2
     raw = (p1 - p2) / (high * (1 - b))
@@ -147,7 +175,7 @@ def conductance_of_nominal_flow(flow: float, b: float = 0.3) -> float:
 
     Notes
     -----
-    Q = C p_1 sqrt(1 - ((r - b)/(1 - b))^2) at p_1 = 7.013 bar, r = 6.013/7.013 (PHYSICS section 2).
+    Q = C p_1 sqrt(1 - ((r - b)/(1 - b))^2) at p_1 = 7.013 bar, r = 6.013/7.013.
 
     Examples
     --------

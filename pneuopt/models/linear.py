@@ -14,7 +14,7 @@ import casadi as ca
 
 from pneuopt.errors import ModelError, check_known, require
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.linear_starts import LinearStarts, Shape
+from pneuopt.models.linear_starts import LinearStarts, Polynomials, Shape
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import DiscreteSystem, Symbols, System, define, names
 
@@ -54,7 +54,7 @@ class FirstOrder:
             return {y: (p["plant.gain"] * u - x[y]) / p["plant.time_constant"]}
 
         own = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True)}
-        shape = Shape(("plant.time_constant",), lambda tau: ([1.0], [tau, 1.0]))
+        shape = Shape(("plant.time_constant",), _lag)
         return _plant(self, (self.output,), _gain(self.input, self.output, ""), ParameterSet(own), dynamics, shape)
 
 
@@ -124,14 +124,8 @@ class SecondOrder:
         inner = friction.states if friction is not None else ()
         drive = Quantity("drive", _over(self.output, "s"), 10 * self.output.nominal)
         states = (self.output, drive, *(replace(s, name=f"friction.{s.name}") for s in inner))
-        shape = Shape(tuple(own)[:2], lambda w, zeta: ([w**2], [1.0, 2 * zeta * w, w**2]), self._resisting())
+        shape = Shape(tuple(own)[:2], _oscillation, None if friction is None else _resistance)
         return _plant(self, states, _gain(self.input, self.output, ""), own, dynamics, shape)
-
-    def _resisting(self) -> Callable[[float, float], tuple[list[float], list[float]]] | None:
-        """Response to friction, of unit gain: ``w² (s / (2 damping w) + 1)`` over the plant's denominator."""
-        if self.friction is None:
-            return None
-        return lambda w, zeta: ([w / (2 * zeta), w**2], [1.0, 2 * zeta * w, w**2])
 
 
 @dataclass(frozen=True)
@@ -162,7 +156,7 @@ class Integrator:
         def dynamics(u: ca.SX, _: Symbols, p: Symbols) -> dict[str, ca.SX]:
             return {y: p["plant.gain"] * u}
 
-        shape = Shape((), lambda: ([1.0], [1.0, 0.0]))
+        shape = Shape((), _integral)
         return _plant(self, (self.output,), _gain(self.input, self.output, "*s"), ParameterSet(), dynamics, shape)
 
 
@@ -238,6 +232,24 @@ def _plant(
     others = tuple(n for n in names(states) if n not in {plant.output.name, "drive"})
     find = LinearStarts(shape, source.name, plant.output.name, names(line), others)
     return define(states + line, (source,), (plant.output,), parameters, rhs, find)
+
+
+# A plant's polynomials are functions of the module, not lambdas: a system goes to other processes (pickle).
+def _lag(time_constant: float) -> Polynomials:
+    return [1.0], [time_constant, 1.0]
+
+
+def _oscillation(w: float, damping: float) -> Polynomials:
+    return [w**2], [1.0, 2 * damping * w, w**2]
+
+
+def _resistance(w: float, damping: float) -> Polynomials:
+    """Response to friction, of unit gain: ``w² (s / (2 damping w) + 1)`` over the plant's denominator."""
+    return [w / (2 * damping), w**2], [1.0, 2 * damping * w, w**2]
+
+
+def _integral() -> Polynomials:
+    return [1.0], [1.0, 0.0]
 
 
 def _delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:

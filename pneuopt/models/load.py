@@ -1,30 +1,37 @@
-"""The load that a drive moves: mass, a constant force, a spring."""
+"""The load that a drive moves: mass, a constant force, its weight on an incline, a spring."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import pi
 
 import casadi as ca
 
 from pneuopt.parameters import Parameter, ParameterSet
 
 Symbols = Mapping[str, ca.SX]
+GRAVITY = 9.80665  # [m/s^2] standard
 
 
 @dataclass(frozen=True)
 class Load:
-    """Mass, a constant force against positive motion, perhaps a spring: M dv/dt = F - friction - force - k (y - y_0).
+    """Mass, a constant force against positive motion, perhaps a spring and an incline.
+
+    M dv/dt = F - friction - force - k (y - y_0) - M g sin(inclination).
 
     Parameters
     ----------
     spring : bool
         Whether a spring acts; its stiffness and rest position are parameters then.
+    inclined : bool
+        Whether positive motion goes up an incline; its angle is a parameter then.
     """
 
     spring: bool = False
+    inclined: bool = False
 
     @property
     def parameters(self) -> ParameterSet:
-        """Numbers: mass [kg], force [N]; with a spring: stiffness [N/m], rest_position [m]."""
+        """Mass [kg], force [N]; with a spring stiffness [N/m], rest_position [m]; inclined: inclination [rad]."""
         own = {
             "mass": Parameter(5.0, "kg", lower=1e-3, upper=1e5, log=True),
             "force": Parameter(0.0, "N", lower=-1e5, upper=1e5),
@@ -33,9 +40,11 @@ class Load:
             "stiffness": Parameter(0.0, "N/m", lower=0.0, upper=1e8),
             "rest_position": Parameter(0.0, "m"),
         }
-        return ParameterSet({**own, **(spring if self.spring else {})})
+        incline = {"inclination": Parameter(pi / 2, "rad", lower=-pi / 2, upper=pi / 2)}
+        return ParameterSet({**own, **(spring if self.spring else {}), **(incline if self.inclined else {})})
 
     def acceleration(self, driving: ca.SX, position: ca.SX, p: Symbols) -> ca.SX:
         """Acceleration [m/s^2] under a driving force net of friction [N] at a position [m]."""
         pull = p["stiffness"] * (position - p["rest_position"]) if self.spring else 0
-        return (driving - p["force"] - pull) / p["mass"]
+        weight = GRAVITY * ca.sin(p["inclination"]) if self.inclined else 0
+        return (driving - p["force"] - pull) / p["mass"] - weight

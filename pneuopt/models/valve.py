@@ -1,7 +1,7 @@
 """A 5/3 proportional directional valve: spool, four metering edges, leak."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from math import pi
 from typing import NamedTuple
@@ -22,6 +22,13 @@ class Spool(Enum):
     SECOND_ORDER = 2
 
 
+class Port(NamedTuple):
+    """The air at one of the valve's ports: absolute pressure [Pa] and temperature [K]."""
+
+    pressure: ca.SX
+    temperature: ca.SX
+
+
 class Flows(NamedTuple):
     """Mass flows through the four edges [kg/s], each positive from the first port to the second."""
 
@@ -33,14 +40,14 @@ class Flows(NamedTuple):
 
 @dataclass(frozen=True)
 class ProportionalValve:
-    """Positive voltage opens supply to a and b to exhaust.
+    r"""Positive voltage opens supply to a and b to exhaust.
 
-    The spool's position x is a fraction of its half travel, 1 at the voltage `span`. Each edge opens by
+    The spool's position x is a fraction of its half travel, 1 at the voltage `span`, where it stops. Each edge opens by
 
-    .. math:: o(x) = \\tfrac12 \\left[(x - x_0) + \\sqrt{(x - x_0)^2 + \\delta^2}\\right] + leak
+    .. math:: o(x) = \tfrac12 \left[(x - x_0) + \sqrt{(x - x_0)^2 + \delta^2}\right] + leak
 
     with x_0 the overlap (a dead zone; negative for underlap) and delta the edge's rounding, and passes
-    C o(x) rho_0 sqrt(T_0/T) times the law's pressure.
+    C o(x) rho_0 sqrt(T_0/T) times the law's pressure. The command's stop is a hard clip, for it is one.
 
     Parameters
     ----------
@@ -49,9 +56,9 @@ class ProportionalValve:
     smoothing : Smoothing
     """
 
-    law: FlowLaw = Iso6358()
+    law: FlowLaw = field(default_factory=Iso6358)
     spool: Spool = Spool.SECOND_ORDER
-    smoothing: Smoothing = Smoothing()
+    smoothing: Smoothing = field(default_factory=Smoothing)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -61,51 +68,75 @@ class ProportionalValve:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Conductance and critical_ratio of a fully open edge, the spool's geometry and speed, the command's span."""
-        own = {
-            "conductance": Parameter(2e-8, "m^3/(s*Pa)", 1e-12, 1e-4, log=True),
-            "critical_ratio": Parameter(0.3, "1", 0.05, 0.6),
+        """Conductance of a fully open edge, the law's, the spool's geometry and speed, the command's span."""
+        lag = {
+            "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True),
+            "damping": Parameter(0.7, "1", 0.1, 5.0, log=True),
+        }
+        geometry = {
             "dead_zone": Parameter(0.0, "1", -0.5, 0.5),
             "rounding": Parameter(0.04, "1", 1e-6, 0.5, log=True),
             "leak": Parameter(0.0, "1", 0.0, 0.2),
             "span": Parameter(5.0, "V", 0.1, 100.0),
-            "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True),
-            "damping": Parameter(0.7, "1", 0.1, 5.0, log=True),
         }
-        unused = {Spool.RIGID: ("bandwidth", "damping"), Spool.FIRST_ORDER: ("damping",), Spool.SECOND_ORDER: ()}
-        return ParameterSet({n: p for n, p in own.items() if n not in unused[self.spool]})
+        conductance = ParameterSet({"conductance": Parameter(2e-8, "m^3/(s*Pa)", 1e-12, 1e-4, log=True)})
+        moving = dict(list(lag.items())[: self.spool.value])
+        return conductance | self.law.parameters | ParameterSet({**geometry, **moving})
 
     def position(self, voltage: ca.SX, z: Symbols, p: Symbols) -> ca.SX:
         """The spool's position [1] at a command [V] and the states z."""
-        return self._command(voltage, p) if self.spool is Spool.RIGID else z["spool"]
+        return _command(voltage, p) if self.spool is Spool.RIGID else z["spool"]
 
     def rates(self, voltage: ca.SX, z: Symbols, p: Symbols) -> dict[str, ca.SX]:
-        """Rates of the spool's states: a lag of first or second order, cut-off frequency `bandwidth`."""
+        """Rates of the spool's states: a lag of first or second order, corner frequency `bandwidth`."""
         if self.spool is Spool.RIGID:
             return {}
         w = 2 * pi * p["bandwidth"]
-        error = self._command(voltage, p) - z["spool"]
+        error = _command(voltage, p) - z["spool"]
         if self.spool is Spool.FIRST_ORDER:
             return {"spool": w * error}
         return {"spool": z["spool_rate"], "spool_rate": w**2 * error - 2 * p["damping"] * w * z["spool_rate"]}
 
-    def flows(
-        self, spool: ca.SX, supply: ca.SX, exhaust: ca.SX, a: ca.SX, b: ca.SX, temperature: ca.SX, p: Symbols
-    ) -> Flows:
-        """Mass flows [kg/s] at a spool position and the absolute pressures of the four ports [Pa]; upstream at T [K]."""
-        scale = p["conductance"] * REFERENCE_DENSITY * ca.sqrt(REFERENCE_TEMPERATURE / temperature)
+    def flows(self, spool: ca.SX, supply: Port, exhaust: Port, a: Port, b: Port, p: Symbols) -> Flows:
+        """Mass flows [kg/s] at a spool position [1]."""
 
-        def edge(upstream: ca.SX, downstream: ca.SX, x: ca.SX) -> ca.SX:
-            return scale * opening(x, p) * self.law.flow(upstream, downstream, p["critical_ratio"], self.smoothing)
+        def edge(upstream: Port, downstream: Port, x: ca.SX) -> ca.SX:
+            scale = p["conductance"] * REFERENCE_DENSITY * opening(x, p)
+            cooling = ca.sqrt(REFERENCE_TEMPERATURE / self._temperature(upstream, downstream))
+            return scale * cooling * self.law.flow(upstream.pressure, downstream.pressure, p, self.smoothing)
 
         return Flows(edge(supply, a, spool), edge(a, exhaust, -spool), edge(supply, b, -spool), edge(b, exhaust, spool))
 
-    @staticmethod
-    def _command(voltage: ca.SX, p: Symbols) -> ca.SX:
-        return ca.fmax(-1, ca.fmin(1, voltage / p["span"]))
+    def _temperature(self, one: Port, two: Port) -> ca.SX:
+        """The temperature of the port with the higher pressure, smooth between."""
+        fall = one.pressure - two.pressure
+        share = (1 + fall / ca.sqrt(fall**2 + self.smoothing.pressure**2)) / 2
+        return two.temperature + (one.temperature - two.temperature) * share
 
 
 def opening(x: ca.SX, p: Symbols) -> ca.SX:
-    """Opening of one edge as a fraction of the full one; see `ProportionalValve`."""
+    """Opening of one edge as a fraction of the full one; see `ProportionalValve`.
+
+    Parameters
+    ----------
+    x : SX or float
+        Spool position towards this edge's opening [1].
+    p : mapping
+        dead_zone, rounding, leak [1].
+
+    Returns
+    -------
+    SX or float
+        [1], positive.
+
+    Examples
+    --------
+    >>> round(float(opening(0.0, {"dead_zone": 0.0, "rounding": 0.04, "leak": 0.01})), 4)
+    0.03
+    """
     beyond = x - p["dead_zone"]
     return (beyond + ca.sqrt(beyond**2 + p["rounding"] ** 2)) / 2 + p["leak"]
+
+
+def _command(voltage: ca.SX, p: Symbols) -> ca.SX:
+    return ca.fmax(-1, ca.fmin(1, voltage / p["span"]))

@@ -21,6 +21,7 @@ from pneuopt.nlp.transcription import Transcription
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
+LEAST_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
 REFINEMENTS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
 MOST_REFINED = 8  # how far a stage may refine the start's integration steps
 MOST_GAP_SHARE = 0.05  # of the cost: the gaps' residuals above it mean that they take up what the model cannot
@@ -167,19 +168,20 @@ class _Search:
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, "the model is not finite at the start; check values and units")
             self._run_stage()
-        status = self._judge(self.current)
-        return status if self.method.substeps else self._refine(status)
+        return self._refine(self._judge(self.current))
 
     def _steps_of(self, stage: Stage) -> int:
         """Integration steps a sample of a stage: from the stiffness where it begins, for the start may mislead."""
         if self.method.substeps:
             return self.method.substeps * stage.refine
         needed = substeps_for(self.segments, self.current.nodes, self._values(self.current.z))
-        return min(max(self.coarsest, needed), MOST_REFINED * self.coarsest) * stage.refine
+        return min(needed, MOST_REFINED * self.coarsest) * stage.refine
 
     def _refine(self, status: Status) -> Status:
-        """Halve the integration steps until that moves no estimate."""
-        for _ in range(REFINEMENTS):
+        """Halve the integration steps until that moves no estimate, unless they were given."""
+        for _ in range(0 if self.method.substeps else REFINEMENTS):
+            if not status.converged:
+                break
             self.substeps *= 2
             finer = self._evaluate(self.current.nodes, self.current.z)
             if not math.isfinite(finer.cost) or self._judge(finer).converged:
@@ -207,14 +209,15 @@ class _Search:
 
     def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
         """Shorten the step until the cost falls; None where ten tries do not help."""
+        raise_by = 10.0
         for _ in range(10):
             reduced = current.equations.arrow.eliminate(damping)
             step = None if reduced is None else reduced.step(self._movable(current, reduced))
             if reduced and step and np.max(np.abs(step.parameters[self.log]), initial=0.0) <= 2:
                 for trial in self._trials(current, reduced, step):
                     if trial.cost < current.cost:
-                        return trial, damping * 0.1 if damping > 1e-9 else 0.0
-            damping = max(damping * 10, 1e-9)
+                        return trial, damping * 0.1 if damping > LEAST_DAMPING else 0.0
+            damping, raise_by = max(damping, LEAST_DAMPING) * raise_by, 3 * raise_by
         return None, damping
 
     def _trials(self, current: _Iterate, reduced: Reduced, step: Step) -> Iterator[_Iterate]:

@@ -18,6 +18,7 @@ from pneuopt.trajectories import Trajectory
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+MOST_SUBSTEPS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +159,10 @@ def tightness(segments: Segments, kinematic: float) -> Array:
 
 
 def substeps_for(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
-    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78."""
+    """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
+
+    No more than `MOST_SUBSTEPS`, for a start may be absurd.
+    """
     slope, s = _slope(segments.system)
     if not slope.numel():
         return 1
@@ -170,7 +174,7 @@ def substeps_for(segments: Segments, nodes: Array, q: Array, step: float = 1.4) 
     u, t = np.tile(segments.inputs[:, 0], (2, 1)), np.tile(segments.t[:, 0], 2)
     J = np.array(jacobian.map(2 * m)(t[None], points.T, u.T, p.T)).reshape(n, 2 * m, n).transpose(1, 0, 2)
     stiffness = np.abs(np.linalg.eigvals(J[np.isfinite(J).all(axis=(1, 2))])).max(initial=0.0)
-    return max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step))
+    return min(max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step)), MOST_SUBSTEPS)
 
 
 def _slope(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:

@@ -1,4 +1,4 @@
-"""Results as matplotlib figures: a fit beside its logs, a friction map, step responses, a Bode plot with its margins.
+"""Results as matplotlib figures: a fit beside its logs, friction, step responses, a Bode plot, studies.
 
 No window is opened and no global state is touched: each function returns a `Figure`, `save_figure` writes it.
 """
@@ -6,6 +6,7 @@ No window is opened and no global state is touched: each function returns a `Fig
 from pneuopt.plotting.canvas import check_figure_path, save_figure
 from pneuopt.plotting.fits import has_friction_map, plot_fit, plot_friction, plot_prediction
 from pneuopt.plotting.loops import Response, plot_bode, plot_steps
+from pneuopt.plotting.maps import plot_map
 
 __all__ = [
     "Response",
@@ -14,6 +15,7 @@ __all__ = [
     "plot_bode",
     "plot_fit",
     "plot_friction",
+    "plot_map",
     "plot_prediction",
     "plot_steps",
     "save_figure",

@@ -1,7 +1,7 @@
 """Candidates of a tuning: where they lie, what they are as printed, and how they respond, many at once and compiled."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +20,7 @@ from pneuopt.system import Linearisation, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
+Tell = Callable[[str], None]
 STABLE = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
 MOST_SUBSTEPS = 100
 MOST_NEIGHBOURS = 1000

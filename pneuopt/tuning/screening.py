@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
 from pneuopt.requirements import Specification, name
-from pneuopt.tuning.candidates import Simulator, Space
+from pneuopt.tuning.candidates import Simulator, Space, Tell
 
 Array = NDArray[np.float64]
 PENALTY = 20.0  # weight of a limit's relative violation, in units of the objective's scale
@@ -66,6 +66,7 @@ def screen(
     spec: Specification,
     method: Screening,
     start: Array,
+    tell: Tell,
 ) -> tuple[Array, int]:
     """The best point found, and how many candidates were simulated.
 
@@ -76,6 +77,8 @@ def screen(
         Already tightened.
     start : ndarray, shape (n,)
         A member of the first population.
+    tell : callable
+        Hears of each generation.
     """
     judge = _Judge(simulator, space, spec, min(r.horizon - r.at for r in references))
     rng = np.random.default_rng(method.seed)
@@ -83,8 +86,9 @@ def screen(
     for band in [*(b for b in method.bands if b > spec.band), spec.band, spec.band]:
         judge.spec = spec.with_band(band)
         merits = judge(population)
-        for _ in range(method.generations):
+        for number in range(method.generations):
             population, merits = _generation(population, merits, judge, rng)
+            tell(f"band {band:.3g}, generation {number + 1} of {method.generations}: best {merits.min():.4g}")
     best = population[np.argmin(merits)]
     return space.draw(_refined(best, judge, method.refinements) if method.refinements else best), judge.count
 

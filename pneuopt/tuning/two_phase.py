@@ -31,7 +31,7 @@ from pneuopt.requirements import (
     SteadyStateError,
 )
 from pneuopt.system import DiscreteSystem, System, discretise, names
-from pneuopt.tuning.candidates import Space, fastest, substeps
+from pneuopt.tuning.candidates import Space, Tell, fastest, substeps
 
 Array = NDArray[np.float64]
 KINDS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
@@ -98,9 +98,9 @@ def unlimited(loop: ClosedLoop) -> ClosedLoop:
 
 
 def solve_two_phase(
-    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
+    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase, tell: Tell
 ) -> Optima:
-    """Solve from every start.
+    """Solve from every start; `tell` hears of each.
 
     Raises
     ------
@@ -115,6 +115,7 @@ def solve_two_phase(
         point = space.draw(rng.random(len(space.names))) if k else space.start
         gains = dict(zip(space.names, point.tolist(), strict=True))
         found.append(solve_from(problem, parameters.with_values(gains)))
+        tell(f"start {k + 1} of {method.starts}: objective {_cost(found[-1]):.4g}, {found[-1].status.code.value}")
     good = [s for s in found if s.status.converged]
     if not good:
         return Optima(min(found, key=lambda s: s.stats.get("largest_violation", math.inf)), len(found), 0, 0)

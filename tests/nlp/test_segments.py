@@ -21,9 +21,7 @@ def phase(name: str, n: int, **fields: object) -> Phase:
     rng = np.random.default_rng(n)
     t: Array = 1e-3 * np.arange(n, dtype=float)
     guess = 0.1 * rng.standard_normal((n, 2))
-    made = Phase(
-        name, 1e-3 * np.arange(n), np.full(n, 1e-3), 30 * rng.standard_normal((n, 1)), every(n, 4), guess=guess
-    )
+    made = Phase(name, t, np.full(n, 1e-3), 30 * rng.standard_normal((n, 1)), every(n, 4), guess=guess)
     return replace(made, **fields)  # type: ignore[arg-type]
 
 

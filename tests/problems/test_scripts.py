@@ -8,6 +8,7 @@ import pytest
 import rig_demo
 import seal_friction
 import step_response
+import supply_and_load
 
 DATASETS = Path(__file__).parents[3] / "shared" / "datasets"
 measured = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no measured logs in {DATASETS}")
@@ -42,3 +43,11 @@ def test_rig_demo(tmp_path: Path) -> None:
     assert failed(rig_demo.main(demo)) == []
     rig_demo.figure(demo).savefig(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_supply_and_load(tmp_path: Path) -> None:
+    job = supply_and_load.run()
+    assert failed(supply_and_load.main(job)) == []
+    supply_and_load.figure(job).savefig(tmp_path / "map.png")
+    assert (tmp_path / "map.png").stat().st_size > 10_000

@@ -1,0 +1,105 @@
+"""What stands between a plant and its controller on a real rig: `Sensor`, `Actuator`, `Encoder`."""
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from pneuopt.errors import require
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What a channel's reading does to the truth: a lag of first order, then white noise, then rounding.
+
+    Parameters
+    ----------
+    lag : float
+        Time constant [s].
+    noise : float
+        Standard deviation [unit of the channel].
+    resolution : float
+        Step of the digital value [unit of the channel]; 0 is none.
+    """
+
+    lag: float = 0.0
+    noise: float = 0.0
+    resolution: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("lag", "noise", "resolution"):
+            value = getattr(self, name)
+            require(0 <= value < inf, f"Sensor: {name} must not be negative, got {value:g}; 0 is none")
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of noise and rounding together, the rounding taken as uniform [unit of the channel].
+
+        Examples
+        --------
+        >>> round(Sensor(noise=2e-6, resolution=12e-6).spread * 1e6, 6)
+        4.0
+        """
+        return float(np.hypot(self.noise, self.resolution / np.sqrt(12)))
+
+    def reading(self, value: float, noise: float) -> float:
+        """The digital value, `noise` being a draw of the standard normal distribution."""
+        noisy = value + self.noise * noise
+        return self.resolution * round(noisy / self.resolution) if self.resolution else noisy
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """What a valve, or an amplifier, makes of a command: hysteresis, then a dead zone.
+
+    Parameters
+    ----------
+    hysteresis : float
+        Width of the loop, as catalogues give it [unit of the command]: a play operator of half that width.
+    dead_zone : float
+        Half width of the commands around zero that do nothing [unit of the command]; beyond it the rest counts. The
+        overlap of a `ProportionalValve` has its own parameter.
+    """
+
+    hysteresis: float = 0.0
+    dead_zone: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("hysteresis", "dead_zone"):
+            value = getattr(self, name)
+            require(0 <= value < inf, f"Actuator: {name} must not be negative, got {value:g}; 0 is none")
+
+    def follow(self, command: float, before: float) -> float:
+        """The play operator: where the spool goes from `before` [unit of the command].
+
+        Examples
+        --------
+        >>> valve = Actuator(hysteresis=0.2)
+        >>> round(valve.follow(1.0, 0.0), 9), valve.follow(0.95, 0.9)
+        (0.9, 0.9)
+        """
+        half = self.hysteresis / 2
+        return min(max(before, command - half), command + half)
+
+    def passed(self, value: float) -> float:
+        """What is left beyond the dead zone [unit of the command]."""
+        return value - min(max(value, -self.dead_zone), self.dead_zone)
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A speed from a position's readings: difference over a sample, then a low-pass of first order.
+
+    Parameters
+    ----------
+    position : str
+        The channel that is differentiated.
+    filter_time : float
+        Time constant of the low-pass [s].
+    """
+
+    position: str = "position"
+    filter_time: float = 5e-3
+
+    def __post_init__(self) -> None:
+        require(0 <= self.filter_time < inf, f"Encoder: filter_time must not be negative, got {self.filter_time:g} s")

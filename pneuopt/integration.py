@@ -1,0 +1,113 @@
+"""How `simulate` integrates a smooth plant, and how it keeps what it finds; `stick_slip` holds the other integrator."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any, NoReturn, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import integrate
+
+from pneuopt.codegen import compiled
+from pneuopt.errors import ConvergenceError
+from pneuopt.system import System, names
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+MOST_STEPS = 200_000
+
+
+class Run(Protocol):
+    """An integration under way: restarted where an input jumps, advanced from instant to instant, recorded at some."""
+
+    def restart(self, t: float, x: Array, u: Array) -> None:
+        """Begin anew at t from x under the input u."""
+        ...
+
+    def advance(self, t: float) -> Array:
+        """The state at t, not before the last instant."""
+        ...
+
+    def outputs(self) -> Array:
+        """The outputs where the integration stands."""
+        ...
+
+    def record(self) -> None:
+        """Keep the states and the outputs where the integration stands."""
+        ...
+
+    def trajectory(self) -> Trajectory:
+        """What was recorded so far."""
+        ...
+
+
+class Record:
+    """States and outputs, a row an instant of the grid, and more columns if there are `flags`."""
+
+    def __init__(self, system: System, grid: Array, flags: Sequence[str] = ()) -> None:
+        self._system, self._grid, self._rows = system, grid, list[Array]()
+        self._columns = (*names(system.states), *names(system.outputs), *flags)
+
+    def add(self, x: Array, y: Array, *flags: float) -> None:
+        """Append a row."""
+        self._rows.append(np.concatenate([x, y, flags]))
+
+    def trajectory(self) -> Trajectory:
+        """The rows so far."""
+        n = len(self._rows)
+        columns = np.reshape(self._rows, (n, len(self._columns))).T
+        return Trajectory(self._grid[:n], dict(zip(self._columns, columns, strict=True)))
+
+    def fail(self, t: float, x: Array) -> NoReturn:
+        """Say that the integration stopped at t in state x."""
+        state = ", ".join(f"{q.name} {v:.6g} {q.unit}" for q, v in zip(self._system.states, x, strict=True))
+        raise ConvergenceError(
+            f"the simulation stopped after t = {t:.9g} s, where {state}: the model is not defined there, escapes to "
+            "infinity or is too stiff; check the parameters, or loosen rtol",
+            self.trajectory() if self._rows else None,
+        )
+
+
+class Smooth:
+    """SciPy's integrator on the compiled right-hand side (it restarts in microseconds), and what it has recorded."""
+
+    def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
+        self._system, self._p, self._ode = system, p, compiled(system.ode)
+        self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
+        self._u = np.zeros(len(system.inputs))
+        self._record = Record(system, grid)
+        scale = np.array([q.nominal for q in system.states])
+        options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MOST_STEPS}
+        self._integrator = integrate.ode(self._rate).set_integrator(**options)
+
+    def _rate(self, t: float, x: Array) -> Array:
+        return self._ode(self._origin + t, x, self._u, self._p)[0]
+
+    def restart(self, t: float, x: Array, u: Array) -> None:
+        """See `Run`."""
+        self._u = u
+        self._integrator.set_initial_value(x, t - self._origin)
+
+    def advance(self, t: float) -> Array:
+        """See `Run`."""
+        before, start = self._integrator.t, np.array(self._integrator.y)
+        if t - self._origin <= before or not self._system.states:
+            return start
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            x = np.array(self._integrator.integrate(t - self._origin))
+        if not (self._integrator.successful() and np.all(np.isfinite(x))):
+            self._record.fail(self._origin + before, start)
+        return x
+
+    def outputs(self) -> Array:
+        """See `Run`."""
+        return self._ode(self._origin + self._integrator.t, self._integrator.y, self._u, self._p)[1]
+
+    def record(self) -> None:
+        """See `Run`."""
+        self._record.add(np.array(self._integrator.y), self.outputs())
+
+    def trajectory(self) -> Trajectory:
+        """See `Run`."""
+        return self._record.trajectory()

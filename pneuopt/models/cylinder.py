@@ -1,0 +1,132 @@
+"""A double-acting cylinder's geometry: areas, volumes, end stops, leakage past the piston.
+
+Position counts from the end at which chamber a is smallest; the rod is on side b.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import pi
+
+import casadi as ca
+
+from pneuopt.models.gas import REFERENCE_PRESSURE
+from pneuopt.parameters import Parameter, ParameterSet
+
+Symbols = Mapping[str, ca.SX]
+STOP_ROUNDING = 1e-4  # [m] of the end stops' onset; 10 mm away a stop of 1e6 N/m still pushes with 0.25 N
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Bore, rod, stroke and what belongs to them.
+
+    Parameters
+    ----------
+    stops : bool
+        Whether the covers act; else position runs on beyond the stroke, for optimisers that bound it themselves.
+    """
+
+    stops: bool = True
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Geometry, leak; start, where a drive at rest stands; with stops their stiffness and damping."""
+        own = {
+            "bore": Parameter(0.032, "m", 1e-3, 1.0),
+            "rod": Parameter(0.012, "m", 0.0, 1.0),
+            "stroke": Parameter(0.2, "m", 1e-3, 20.0),
+            "dead_volume_a": Parameter(8e-6, "m^3", 1e-9, 1.0, log=True),
+            "dead_volume_b": Parameter(8e-6, "m^3", 1e-9, 1.0, log=True),
+            "leak": Parameter(0.0, "kg/(s*Pa)", 0.0, 1e-6),
+            "start": Parameter(0.5, "1", 0.0, 1.0),
+        }
+        stops = {
+            "stop_stiffness": Parameter(1e6, "N/m", 0.0, 1e9),
+            "stop_damping": Parameter(1.0, "s/m", 0.0, 100.0),
+        }
+        return ParameterSet({**own, **(stops if self.stops else {})})
+
+    def stop_force(self, y: ca.SX, v: ca.SX, p: Symbols) -> ca.SX:
+        r"""Force of the covers on the piston [N] at position y [m] and speed v [m/s].
+
+        .. math:: -K \sigma(y - L)(1 + c v) + K \sigma(-y)(1 - c v), \qquad
+            \sigma(d) = \tfrac12 \left( d + \sqrt{d^2 + \delta^2} \right)
+        """
+        if not self.stops:
+            return ca.SX(0)
+        front, rear = (_onset(d) for d in (y - p["stroke"], -y))
+        return p["stop_stiffness"] * (rear * (1 - p["stop_damping"] * v) - front * (1 + p["stop_damping"] * v))
+
+
+def areas(bore: ca.SX, rod: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Piston areas of chamber a and of chamber b, where the rod is.
+
+    Parameters
+    ----------
+    bore, rod : SX or float
+        Diameters [m]; rod 0 for a rodless cylinder.
+
+    Returns
+    -------
+    tuple of SX or float
+        A_a, A_b [m^2].
+
+    Examples
+    --------
+    >>> [round(float(area) * 1e6, 1) for area in areas(0.032, 0.012)]
+    [804.2, 691.2]
+    """
+    a = pi / 4 * bore**2
+    return a, a - pi / 4 * rod**2
+
+
+def volumes(y: ca.SX, p: Symbols) -> tuple[ca.SX, ca.SX]:
+    """Volumes of both chambers [m^3] at position y [m], dead volumes counted.
+
+    Parameters
+    ----------
+    y : SX or float
+        [m]
+    p : mapping
+        bore, rod, stroke [m], dead_volume_a, dead_volume_b [m^3].
+
+    Returns
+    -------
+    tuple of SX or float
+        V_a, V_b [m^3].
+
+    Examples
+    --------
+    >>> hardware = {"bore": 0.032, "rod": 0.012, "stroke": 0.2, "dead_volume_a": 8e-6, "dead_volume_b": 8e-6}
+    >>> [round(float(volume) * 1e6, 2) for volume in volumes(0.1, hardware)]
+    [88.42, 77.12]
+    """
+    a, b = areas(p["bore"], p["rod"])
+    return p["dead_volume_a"] + a * y, p["dead_volume_b"] + b * (p["stroke"] - y)
+
+
+def piston_leak(pressure_a: ca.SX, pressure_b: ca.SX, leak: ca.SX) -> ca.SX:
+    """Laminar leakage past the piston from b to a, ``G (p_b - p_a)(p_a + p_b) / (2 p_0)``.
+
+    Parameters
+    ----------
+    pressure_a, pressure_b : SX or float
+        Absolute [Pa].
+    leak : SX or float
+        G [kg/(s Pa)], at a mean pressure p_0 = 100 kPa.
+
+    Returns
+    -------
+    SX or float
+        [kg/s]
+
+    Examples
+    --------
+    >>> round(float(piston_leak(2e5, 4e5, 1e-11)) * 1e6, 6)
+    6.0
+    """
+    return leak * (pressure_b - pressure_a) * (pressure_a + pressure_b) / (2 * REFERENCE_PRESSURE)
+
+
+def _onset(d: ca.SX) -> ca.SX:
+    return (d + ca.sqrt(d**2 + STOP_ROUNDING**2)) / 2

@@ -1,0 +1,325 @@
+"""`record`: what a real rig would log, with everything in it that the models for identification and tuning leave out.
+
+Between two samples the plant is integrated as in `simulate`, event by event with Karnopp's friction. Beyond that a rig
+has a valve that lags behind its command in position (hysteresis) and ignores small ones, sensors with lag, noise and
+finite resolution, and a controller that sees only those sensors, and differentiates an encoder to get a speed.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pneuopt.codegen import compiled
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.errors import ModelError, check_known, require
+from pneuopt.experiments import CHANNELS, Experiment
+from pneuopt.instruments import Actuator, Encoder, Sensor
+from pneuopt.integration import Run
+from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.simulate import first_state, held_inputs, new_run
+from pneuopt.stick_slip import Event, StickSlip
+from pneuopt.system import Symbols, System, define, names, stacked, vector
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A plant, alone or in a sampled loop, behind real hardware.
+
+    Parameters
+    ----------
+    model : System or ClosedLoop
+        With Karnopp's friction (`ForceDrive(Karnopp(Stribeck()))`) it sticks and slips. A loop is sampled.
+    sensors : mapping of str to Sensor
+        By the plant's output: what is measured, and logged.
+    actuator : Actuator
+    encoder : Encoder
+        Where a speed loop gets its speed from, unless there is a sensor for it.
+    actuated : str, optional
+        Of a plant alone: the input that the actuator drives; by default its only one.
+
+    Raises
+    ------
+    ModelError
+        If the loop is continuous, its dither analogue, or what it feeds back not measured.
+    UnknownNameError
+        If a sensor's output or the input is unknown.
+    """
+
+    model: System | ClosedLoop
+    sensors: Mapping[str, Sensor]
+    actuator: Actuator = field(default_factory=Actuator)
+    encoder: Encoder = field(default_factory=Encoder)
+    actuated: str | None = None
+
+    def __post_init__(self) -> None:
+        check_known("output", self.sensors, names(self.plant.outputs), "Rig: sensors")
+        _ = self.command
+        if isinstance(self.model, ClosedLoop):
+            _check_loop(self.model)
+            message = f"the controller needs {self.feedback!r}, which is not measured; add it to sensors"
+            require(self.feedback in self.sensors, message, ModelError)
+
+    @property
+    def plant(self) -> System:
+        """The plant without sensors and controller."""
+        return self.model.plant if isinstance(self.model, ClosedLoop) else self.model
+
+    @cached_property
+    def command(self) -> Quantity:
+        """The plant's input behind the actuator."""
+        if isinstance(self.model, ClosedLoop):
+            return self.model.command
+        inputs = {q.name: q for q in self.plant.inputs}
+        name = self.actuated or (next(iter(inputs)) if len(inputs) == 1 else "")
+        require(bool(name), f"the plant has the inputs {', '.join(inputs) or 'none'}; choose actuated=", ModelError)
+        check_known("input", [name], inputs, "Rig: actuated")
+        return inputs[name]
+
+    @property
+    def feedback(self) -> str | None:
+        """The channel that the controller reads, the encoder's where it derives a speed; None without a controller."""
+        if not isinstance(self.model, ClosedLoop):
+            return None
+        wanted = self.model.feedback.name
+        return self.encoder.position if wanted == "speed" and "speed" not in self.sensors else wanted
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The measured outputs, in the plant's order."""
+        return tuple(n for n in names(self.plant.outputs) if n in self.sensors)
+
+    @cached_property
+    def sensed(self) -> System:
+        """The plant with an output "sensor.*" a sensor, and a state of that name where it lags."""
+        plant = self.plant
+        shown = {f"sensor.{q.name}": q for q in plant.outputs if q.name in self.channels}
+        lags = {n: self.sensors[q.name].lag for n, q in shown.items()}
+
+        def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
+            xdot, y = plant.ode(t, ca.vertcat(*(x[n] for n in names(plant.states))), stacked(u), stacked(p))
+            rates = {n: xdot[k] for k, n in enumerate(names(plant.states))}
+            outputs = {n: y[k] for k, n in enumerate(names(plant.outputs))}
+            true = {n: outputs[q.name] for n, q in shown.items()}
+            rates |= {n: (true[n] - x[n]) / lag for n, lag in lags.items() if lag > 0}
+            return rates, outputs | {n: x.get(n, true[n]) for n in shown}
+
+        sensors = {n: replace(q, name=n) for n, q in shown.items()}
+        lagging = (q for n, q in sensors.items() if lags[n] > 0)
+        states, outputs = (*plant.states, *lagging), (*plant.outputs, *sensors.values())
+        return define(states, plant.inputs, outputs, plant.parameters, rhs)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What `record` returns.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        What the rig logs at its samples: commands, references, readings with their noise; "feedback" is what the
+        controller saw.
+    truth : Trajectory
+        States and outputs of the plant at the same instants, "control" behind the actuator, with Karnopp's friction
+        "stuck".
+    events : tuple of Event
+        With Karnopp's friction: when the piston broke away, reversed or stuck.
+    parameters : ParameterSet
+        Those that generated it.
+    """
+
+    experiment: Experiment
+    truth: Trajectory
+    events: tuple[Event, ...]
+    parameters: ParameterSet
+
+
+def record(
+    rig: Rig,
+    inputs: Trajectory,
+    parameters: ParameterSet,
+    *,
+    seed: int = 0,
+    initial: Mapping[str, float] | ArrayLike | None = None,
+    name: str = "rig",
+    rtol: float = 1e-8,
+) -> Recording:
+    """Run a rig and log it.
+
+    Parameters
+    ----------
+    rig : Rig
+    inputs : Trajectory
+        Of a loop "reference", of a plant alone its actuated input; and the plant's other inputs. Each is held from an
+        instant of the log to the next: those of this trajectory for a plant alone, the controller's samples, from
+        ``inputs.t[0]`` on, for a loop.
+    parameters : ParameterSet
+        A missing one keeps the model's default.
+    seed : int
+        Of the noise: the same seed gives the same log.
+    initial : mapping of state to value, or array, optional
+        As for `simulate`, of the plant or of the loop.
+    name : str
+        Of the experiment.
+    rtol : float
+        Tolerance of a step of the integration.
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    InputError
+        If an input is missing or NaN, or a state starts outside its physical range.
+    ConvergenceError
+        If the integration stops.
+
+    Examples
+    --------
+    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.friction import Coulomb
+    >>> from pneuopt.models.karnopp import Karnopp
+    >>> rig = Rig(ForceDrive(Karnopp(Coulomb())).system(), {"position": Sensor(resolution=1e-3)})
+    >>> push = Trajectory([0.0, 0.1, 0.2, 0.3], {"force": [29.0, 65.0, 65.0, 29.0]})
+    >>> run = record(rig, push, rig.plant.parameters)
+    >>> run.experiment.trajectory["position"].round(9).tolist(), [event.t for event in run.events]
+    ([0.0, 0.0, 0.023, 0.066], [0.1])
+    """
+    fed = _at_samples(rig.model, inputs)
+    x, p = first_state(rig.model, parameters, initial), vector(rig.plant.parameters, parameters)
+    own = x[len(rig.plant.states) :]
+    source = (
+        _Controller(rig, rig.model, parameters, fed, own) if isinstance(rig.model, ClosedLoop) else _Player(rig, fed)
+    )
+    run = new_run(rig.sensed, p, fed.t, rtol, 1e-2 * rtol)
+    readings, control = _drive(rig, run, source, fed, x[: len(rig.plant.states)], p, np.random.default_rng(seed))
+    logged = {n: fed[n] for n in names(rig.plant.inputs) if n != rig.command.name} | source.columns()
+    logged |= dict(zip(rig.channels, readings.T, strict=True))
+    truth = run.trajectory().with_columns({"control": control})
+    spread = {n: s.spread for n, s in rig.sensors.items() if s.spread > 0}
+    return Recording(
+        Experiment(Trajectory(fed.t, logged), spread, name=name),
+        truth.select(n for n in truth.names if not n.startswith("sensor.")),
+        run.events if isinstance(run, StickSlip) else (),
+        parameters,
+    )
+
+
+class _Player:
+    """Commands that are given beforehand."""
+
+    def __init__(self, rig: Rig, fed: Trajectory) -> None:
+        self._name, self._commands = rig.command.name, fed[rig.command.name]
+        self.before = float(self._commands[0])
+
+    def act(self, k: int, readings: Mapping[str, float]) -> float:  # noqa: ARG002 - as `_Controller`
+        """The command at sample k."""
+        return float(self._commands[k])
+
+    def columns(self) -> dict[str, ArrayLike]:
+        """What it logs."""
+        return {self._name: self._commands}
+
+
+class _Controller:
+    """The loop's own controller, acting on a plant whose one state is what was read."""
+
+    def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, fed: Trajectory, x: Array) -> None:
+        loop.check(parameters)
+        seen = loop.feedback
+        echo = define([seen], [loop.command], [seen], loop.plant.parameters, lambda _t, y, _u, _p: (_at_rest(y), y))
+        echoing = replace(loop, plant=echo)
+        self._update, self._p = compiled(echoing.update), echoing.numbers(parameters)
+        self._rig, self._loop, self._fed, self._x = rig, loop, fed, x
+        self._command = names(echoing.states).index("pid.command")
+        self.before = float(x[self._command - 1])
+        self._seen, self._commands = list[float](), list[float]()
+        self._position: float | None = None
+
+    def act(self, k: int, readings: Mapping[str, float]) -> float:
+        """The command at sample k."""
+        self._seen.append(self._feedback(readings))
+        now, reference = self._fed.t[k], self._fed["reference"][k]
+        after = self._update(now, np.append(self._seen[-1], self._x), [reference], self._p)[0]
+        self._x = after[1:]
+        self._commands.append(float(after[self._command]))
+        return self._commands[-1]
+
+    def columns(self) -> dict[str, ArrayLike]:
+        """What it logs."""
+        name = self._loop.feedback.name
+        reference = f"{name}_reference" if f"{name}_reference" in CHANNELS else "reference"
+        return {reference: self._fed["reference"], self._loop.command.name: self._commands, "feedback": self._seen}
+
+    def _feedback(self, readings: Mapping[str, float]) -> float:
+        """What the controller takes for its measured signal."""
+        wanted, source = self._loop.feedback.name, self._rig.feedback
+        if source == wanted:
+            return readings[wanted]
+        before, self._position = self._position, readings[str(source)]
+        if before is None:
+            return 0.0
+        h = self._loop.pid.sample_time or 0.0
+        raw = (self._position - before) / h
+        return self._seen[-1] + h / (h + self._rig.encoder.filter_time) * (raw - self._seen[-1])
+
+
+def _drive(
+    rig: Rig,
+    run: Run,
+    source: _Player | _Controller,
+    fed: Trajectory,
+    x: Array,
+    p: Array,
+    random: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Run from sample to sample; the readings, a row a sample, and what gets through the actuator."""
+    inputs, column = names(rig.plant.inputs), names(rig.plant.inputs).index(rig.command.name)
+    u = np.column_stack([fed[n] if n != rig.command.name else np.zeros(len(fed)) for n in inputs])
+    spool, sensors = source.before, [rig.sensors[n] for n in rig.channels]
+    noise, readings = random.standard_normal((len(fed), len(sensors))), np.zeros((len(fed), len(sensors)))
+    u[0, column] = rig.actuator.passed(spool)
+    run.restart(fed.t[0], _settled(rig, fed.t[0], x, u[0], p), u[0])
+    for k, t in enumerate(fed.t):
+        x, shown = run.advance(t), run.outputs()[len(rig.plant.outputs) :]
+        readings[k] = [s.reading(y, z) for s, y, z in zip(sensors, shown, noise[k], strict=True)]
+        command = source.act(k, dict(zip(rig.channels, readings[k], strict=True)))
+        spool = rig.actuator.follow(command, spool)
+        u[k, column] = rig.actuator.passed(spool)
+        run.restart(t, x, u[k])
+        run.record()
+    return readings, u[:, column]
+
+
+def _settled(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
+    """The plant's state, and the sensors' at rest with it."""
+    y = dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel(), strict=True))
+    return np.append(x, [y[n] for n in rig.channels if rig.sensors[n].lag > 0])
+
+
+def _at_samples(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:
+    """The inputs of the model at the instants of the log."""
+    rows, t, slack = held_inputs(model.inputs, inputs), inputs.t, 1e-9
+    if isinstance(model, ClosedLoop):
+        h = model.pid.sample_time or 0.0
+        slack = 1e-6 * h
+        t = t[0] + h * np.arange(int((t[-1] - t[0] + slack) / h) + 1)
+    rows = rows[np.searchsorted(inputs.t, t + slack, side="right") - 1]
+    return Trajectory(t, dict(zip(names(model.inputs), rows.T, strict=True)))
+
+
+def _at_rest(x: Symbols) -> Symbols:
+    return {n: ca.SX(0) for n in x}
+
+
+def _check_loop(loop: ClosedLoop) -> None:
+    analogue = loop.dither is not None and loop.dither.analogue
+    require(loop.pid.sample_time is not None, "a rig's controller is sampled: PID(sample_time=1e-3)", ModelError)
+    require(not analogue, "a rig's dither comes from its controller: Dither(analogue=False)", ModelError)

@@ -1,0 +1,256 @@
+"""`StickSlip`: a plant under Karnopp's friction, integrated from event to event; `simulate` takes it by itself.
+
+While the piston slides, its friction keeps one sign, and the model is smooth: the standstill is a root of the speed on
+the integrator's own interpolant. While it sticks, the speed is exactly 0, the rest of the plant runs on, and what is
+watched is the acceleration that the piston would have if it slid, either way: it stays while that is <= 0 forwards and
+>= 0 backwards, which needs to know neither the masses nor the forces of the plant. An end stop is a force of the plant.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from math import inf
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy import integrate, optimize
+
+from pneuopt.codegen import compiled
+from pneuopt.errors import ConvergenceError, ModelError, require
+from pneuopt.integration import Record
+from pneuopt.system import System, names
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+DIRECTION = "friction.direction"
+MOST_EVENTS = 100_000
+LOOKS = 4  # a step
+
+
+class EventKind(Enum):
+    """What happens at an event."""
+
+    BREAK_AWAY = "breaks away"
+    STANDSTILL = "sticks"
+    REVERSAL = "reverses"
+
+
+@dataclass(frozen=True)
+class Event:
+    """A change between sticking and sliding.
+
+    Attributes
+    ----------
+    t : float
+        When [s].
+    kind : EventKind
+    direction : int
+        Of the motion afterwards: 1, -1, or 0 where the piston sticks.
+    """
+
+    t: float
+    kind: EventKind
+    direction: int
+
+
+class StickSlip:
+    """An integration (`integration.Run`) that finds its events; records a column "stuck", 0 or 1, too."""
+
+    def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
+        message = "Karnopp's friction needs a plant with a state 'speed' and a parameter 'friction.direction'"
+        require("speed" in names(system.states) and DIRECTION in system.parameters, message, ModelError)
+        self._speed, self._direction = names(system.states).index("speed"), list(system.parameters).index(DIRECTION)
+        self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
+        self._end = 1.001 * (grid[-1] - grid[0]) + 1e-3  # LSODA derives its first step from it
+        self._p = {d: self._directed(p, d) for d in (-1, 0, 1)}
+        self._ode, self._pushes = compiled(system.ode), compiled(_pushes(system, self._speed, self._direction))
+        atols = atol * np.array([q.nominal for q in system.states])
+        self._options: dict[str, Any] = {"rtol": rtol, "atol": atols}
+        self._still = 10 * atols[self._speed]  # rounding must not end a motion that has just begun
+        self._mode: int | None = None
+        self._solver: integrate.OdeSolver
+        self._event = inf
+        self._dense: Callable[[float], Array] | None = None
+        self._record = Record(system, grid, ("stuck",))
+        self._events = list[Event]()
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """Those up to now."""
+        return tuple(self._events)
+
+    def restart(self, t: float, x: Array, u: Array) -> None:
+        """See `integration.Run`."""
+        self._u = u
+        moving = int(np.sign(x[self._speed]))
+        self._begin(t - self._origin, x, moving or self._yields(t - self._origin, x))
+
+    def advance(self, t: float) -> Array:
+        """See `integration.Run`."""
+        until = t - self._origin
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            while self._event <= until or self._solver.t < until:
+                if self._event <= until:
+                    self._switch()
+                else:
+                    self._step()
+        self._now, self._x = until, self._state(until)
+        return self._x
+
+    def outputs(self) -> Array:
+        """See `integration.Run`."""
+        p = self._p[self._mode or 0]
+        if self._mode == 0:
+            p = self._directed(p, self._balance(self._now, self._x))
+        return self._ode(self._origin + self._now, self._x, self._u, p)[1]
+
+    def record(self) -> None:
+        """See `integration.Run`."""
+        self._record.add(self._x, self.outputs(), float(self._mode == 0))
+
+    def trajectory(self) -> Trajectory:
+        """See `integration.Run`."""
+        return self._record.trajectory()
+
+    def _begin(self, t: float, x: Array, mode: int) -> None:
+        """Go on from t in this mode: 0 sticks, 1 and -1 slide."""
+        before = self._mode if self._mode is not None else mode * int(x[self._speed] != 0)
+        if mode != before:
+            self._note(t, mode, before)
+        self._mode, self._event, self._dense = mode, inf, None
+        self._now, self._x = t, x
+        self._solver = integrate.LSODA(self._rate, t, x, self._end, **self._options)
+        self._edge = self._watched(t, x)
+
+    def _note(self, t: float, mode: int, before: int) -> None:
+        kind = EventKind.STANDSTILL if mode == 0 else EventKind.BREAK_AWAY if before == 0 else EventKind.REVERSAL
+        self._events.append(Event(float(self._origin + t), kind, mode))
+        require(
+            len(self._events) <= MOST_EVENTS,
+            f"the piston stuck or slipped {MOST_EVENTS} times by t = {self._origin + t:.9g} s: the loop chatters; "
+            "simulate a shorter time, or mend the gains",
+            ConvergenceError,
+        )
+
+    def _rate(self, t: float, x: Array) -> Array:
+        """Of the state; while stuck, the speed's entry is an impulse, so that the step size heeds the driving force."""
+        at_rest = x if self._mode else self._stopped(x)
+        return self._ode(self._origin + t, at_rest, self._u, self._p[self._mode or 0])[0]
+
+    def _step(self) -> None:
+        t, x = self._solver.t, np.array(self._solver.y)
+        self._solver.step()
+        self._dense = None
+        if self._solver.status == "failed" or not np.isfinite(self._solver.y).all():
+            self._record.fail(self._origin + t, x if self._mode else self._stopped(x))
+        self._event = inf if self._is_quiet() else _first_root(self._excess, self._solver.t_old, self._solver.t)
+
+    def _is_quiet(self) -> bool:
+        """Whether the mode surely lasts through the step, by what is cheap to look at."""
+        begin, end = self._solver.t_old, self._solver.t
+        before, self._edge = self._edge, self._watched(end, self._solver.y)
+        if self._mode:
+            return bool(self._mode * self._solver.y[self._speed] > 0 and not before < 0 < self._edge)
+        values = (before, self._excess((begin + end) / 2), self._edge)
+        return 2 * max(values) < min(values)
+
+    def _watched(self, t: float, x: Array) -> float:
+        """What `_is_quiet` compares at a step's ends: sliding, the gain of speed; sticking, the excess of force."""
+        return float(self._mode * self._rate(t, x)[self._speed]) if self._mode else self._excess(t)
+
+    def _excess(self, t: float) -> float:
+        """Positive where the mode has ended."""
+        x = self._state(t)
+        if self._mode:
+            return float(-self._mode * x[self._speed] - self._still)
+        forward, backward = self._push(t, x)
+        return max(forward, -backward)
+
+    def _switch(self) -> None:
+        t = self._event
+        x = self._state(t)
+        if self._mode:
+            x = self._stopped(x)
+            self._begin(t, x, self._yields(t, x))
+        else:
+            forward, backward = self._push(t, x)
+            self._begin(t, x, 1 if forward > -backward else -1)
+
+    def _yields(self, t: float, x: Array) -> int:
+        """The direction in which a piston at rest breaks away; 0 if it sticks."""
+        forward, backward = self._push(t, x)
+        message = f"the static friction is negative at t = {self._origin + t:.9g} s; check its pressure coefficients"
+        require(forward <= backward, message, ModelError)
+        return 1 if forward > 0 else -1 if backward < 0 else 0
+
+    def _balance(self, t: float, x: Array) -> float:
+        """The direction, between -1 and 1, at which the friction of a piston at rest balances the rest."""
+        forward, backward = self._push(t, x)
+        if not forward < 0 < backward:
+            return float(np.sign(forward + backward))
+
+        def push(direction: float) -> float:
+            p = self._directed(self._p[0], direction)
+            return float(self._ode(self._origin + t, x, self._u, p)[0][self._speed])
+
+        return float(optimize.brentq(push, -1.0, 1.0))
+
+    def _push(self, t: float, x: Array) -> tuple[float, float]:
+        """Accelerations that a piston at rest would have if it slid forwards, and backwards [m/s^2]."""
+        forward, backward = self._pushes(self._origin + t, x, self._u, self._p[0])[0]
+        return float(forward), float(backward)
+
+    def _state(self, t: float) -> Array:
+        """On the last step."""
+        if t >= self._solver.t:
+            x = np.array(self._solver.y)
+        else:
+            self._dense = self._dense or self._solver.dense_output()
+            x = self._dense(t)
+        return x if self._mode else self._stopped(x)
+
+    def _stopped(self, x: Array) -> Array:
+        at_rest = np.array(x)
+        at_rest[self._speed] = 0.0
+        return at_rest
+
+    def _directed(self, p: Array, direction: float) -> Array:
+        directed = np.array(p)
+        directed[self._direction] = direction
+        return directed
+
+
+def _pushes(system: System, speed: int, direction: int) -> ca.Function:
+    """``(t, x, u, p) -> (a_forward, a_backward)``: the speed's rate with either sign of the friction."""
+    t, x, u, p = (ca.SX.sym(k, system.ode.size1_in(i)) for i, k in enumerate("txup"))
+    rates = []
+    for sign in (1, -1):
+        directed = ca.SX(p)
+        directed[direction] = sign
+        rates.append(system.ode(t, x, u, directed)[0][speed])
+    return ca.Function("pushes", [t, x, u, p], [ca.vertcat(*rates)])
+
+
+def _first_root(f: Callable[[float], float], begin: float, end: float) -> float:
+    """Where f first turns positive on a step; infinity if it does not.
+
+    f is looked at a few times; where it has a hump between the looks, its top is found first.
+    """
+    t = np.linspace(begin, end, LOOKS + 1)
+    values = np.array([f(at) for at in t])
+    if not np.any(values[1:] > 0):
+        k = 1 + int(np.argmax(values[1:-1]))
+        if not values[k] > max(values[0], values[-1]) + 1e-9 * np.ptp(values):
+            return inf
+        top = optimize.minimize_scalar(lambda at: -f(at), bounds=(t[k - 1], t[k + 1]), method="bounded").x
+        t, values = np.array([t[k - 1], top]), np.array([values[k - 1], f(top)])
+        if not values[1] > 0:
+            return inf
+    k = 1 + int(np.argmax(values[1:] > 0))
+    if values[k - 1] >= 0:
+        return float(t[k - 1])
+    return float(optimize.brentq(f, t[k - 1], t[k], xtol=1e-15))

@@ -1,0 +1,168 @@
+"""study.toml: which drive and tuning, over which axes, and what to show of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pneuopt.errors import InputError, check_known, require
+from pneuopt.parameters import ParameterSet
+from pneuopt.tomlfile import read_toml
+from pneuopt.units import read_value, scale_of, unit_of
+
+_KEYS = {"study": ("drive", "tuning"), "metrics": ("band", "show")}
+_RANGE = ("from", "to", "steps")
+_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
+_SHOWN = ("SettlingTime", "Overshoot")
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a study.toml says.
+
+    Attributes
+    ----------
+    path, drive, tuning : Path
+        The file itself, and those that it names, which are relative to its folder.
+    axes : mapping of str to list, or to mapping with from, to and steps
+        As written; `read_axes` reads them.
+    band : float or None
+        Half width of the settling band, a fraction of the step; None: as the tuning says.
+    show : tuple of str
+        The metrics on screen and in the figure.
+    """
+
+    path: Path
+    drive: Path
+    tuning: Path
+    axes: Mapping[str, Any]
+    band: float | None
+    show: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A parameter and its values.
+
+    Attributes
+    ----------
+    name : str
+    points : tuple of float
+        Its values [SI]
+    unit : str
+        In which the first one is written.
+    factor, offset : float
+        ``SI = factor * number + offset``.
+    """
+
+    name: str
+    points: tuple[float, ...]
+    unit: str
+    factor: float
+    offset: float
+
+    def shown(self, values: ArrayLike) -> NDArray[np.float64]:
+        """SI values as numbers in the unit in which the axis is written."""
+        return (np.asarray(values, dtype=float) - self.offset) / self.factor
+
+
+def read_study(path: str | Path) -> Study:
+    """Read a study; the files that it names are not opened.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    InputError
+        UnitError, UnknownNameError or other; the message names file, section and key.
+    """
+    path, said = Path(path), read_toml(path).unwrap()
+    check_known("section", said, (*_KEYS, "axes"), str(path))
+    for name in said:
+        require(isinstance(said[name], dict), f"{path}: {name} must be a section, [{name}]")
+    for name, keys in _KEYS.items():
+        check_known("key", said.get(name, {}), keys, f"{path}: [{name}]")
+    axes, metrics = _axes(said.get("axes", {})), said.get("metrics", {})
+    require(bool(axes), f'{path}: no axis; add [axes] with "load.mass" = {_EXAMPLE}')
+    band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
+    require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
+    drive, tuning = (_file(said.get("study", {}), key, path) for key in _KEYS["study"])
+    return Study(path, drive, tuning, axes, band, _shown(metrics, path))
+
+
+def read_axes(study: Study, parameters: ParameterSet) -> tuple[Axis, ...]:
+    """Read a study's axes in the units of the parameters.
+
+    Parameters
+    ----------
+    study : Study
+    parameters : ParameterSet
+
+    Returns
+    -------
+    tuple of Axis
+
+    Raises
+    ------
+    InputError
+        If a parameter is unknown, or a value cannot be read.
+    """
+    check_known("parameter", study.axes, parameters, f"{study.path}: [axes]")
+    return tuple(
+        _axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}") for name, entry in study.axes.items()
+    )
+
+
+def _axes(said: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """By full name; without quotes, TOML reads `load.mass` as a table within a table."""
+    found: dict[str, Any] = {}
+    for key, entry in said.items():
+        nested = isinstance(entry, dict) and not set(_RANGE) & entry.keys()
+        found |= _axes(entry, f"{prefix}{key}.") if nested else {f"{prefix}{key}": entry}
+    return found
+
+
+def _axis(name: str, entry: Any, unit: str, where: str) -> Axis:
+    good = isinstance(entry, list | dict) and len(entry) > 0
+    require(good, f"{where}: write a list or a range, {_EXAMPLE}")
+    if isinstance(entry, list):
+        first, values = entry[0], [read_value(e, unit, where=where) for e in entry]
+    else:
+        first, values = entry.get("from"), _range(entry, unit, where)
+    written = unit_of(first, unit)
+    factor, offset = scale_of(written, unit, where=where)
+    return Axis(name, tuple(values), written, factor, offset)
+
+
+def _range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
+    check_known("key", entry, _RANGE, where)
+    for key in _RANGE:
+        require(key in entry, f"{where} says no {key}; write {_EXAMPLE}")
+    steps = entry["steps"]
+    counts = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 2
+    require(counts, f"{where} steps is the number of values, at least 2, got {steps!r}")
+    first, last = (read_value(entry[key], unit, where=f"{where} {key}") for key in _RANGE[:2])
+    return [float(v) for v in np.linspace(first, last, steps)]
+
+
+def _shown(metrics: Mapping[str, Any], path: Path) -> tuple[str, ...]:
+    show = metrics.get("show", list(_SHOWN))
+    good = isinstance(show, list) and len(show) > 0 and all(isinstance(name, str) for name in show)
+    require(good, f'{path}: [metrics] show must be a list of names, ["SettlingTime", "Overshoot"], got {show!r}')
+    return tuple(dict.fromkeys(show))
+
+
+def _file(said: Mapping[str, Any], key: str, path: Path) -> Path:
+    if key not in said:
+        raise InputError(f'{path}: [study] says no {key}; write {key} = "{key}.toml"')
+    require(isinstance(said[key], str), f"{path}: [study] {key} must be a file's name, got {said[key]!r}")
+    return path.parent / str(said[key])

@@ -1,0 +1,92 @@
+"""NUMERICS' benchmark log B32, made and identified: six parameters of a pneumatic drive, without a guess; then LuGre.
+
+    python problems/b32.py [--json FILE] [--out DIR]
+
+A 32/12 mm cylinder under a sampled position loop sticks, slips and moves fast both ways for 10 s at 1 kHz. The truth is
+integrated to 1e-10; position (20 um noise) and both pressures (1 kPa noise) are logged. Free: Coulomb and static
+friction, Stribeck velocity, viscous friction, conductance and leak of the valve, started from the log alone.
+"""
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+from claims import Claim, arguments, finish, frame
+from scipy import integrate
+
+import pneuopt as po
+from pneuopt.codegen import compiled
+from pneuopt.models.catalog import b32
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.system import names, vector
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SEED = 1
+LEVELS = (0.15, 0.05, 0.12, 0.04, 0.16, 0.10, 0.06, 0.14, 0.08, 0.10)  # [m] for 0.5 s each
+NOISE = {"position": 20e-6, "pressure_a": 1e3, "pressure_b": 1e3}
+FREE = ("friction.coulomb", "friction.static", "friction.stribeck_velocity", "friction.viscous")
+VALVE = ("valve.conductance", "valve.leak")
+START = {"position": 0.1, "pressure_a": 3.5e5, "pressure_b": 4e5}
+
+
+def main() -> "pd.DataFrame":
+    drive, truth = b32()
+    claims = _identified("stribeck", drive, truth, (*FREE, *VALVE))
+    drive, truth = b32(lugre=True)
+    bristles = ("friction.bristle_stiffness", "friction.bristle_damping")
+    return frame(claims + _identified("lugre", drive, truth, (*FREE, *bristles, *VALVE)))
+
+
+def _identified(name: str, drive: PneumaticDrive, truth: po.ParameterSet, free: tuple[str, ...]) -> list[Claim]:
+    log = generate(drive, truth)
+    blind = truth.with_values({n: drive.parameters.value(n) for n in free}).freed(*free)
+    began = time.perf_counter()
+    fit = po.identify(drive.system(), [log], blind)
+    seconds = time.perf_counter() - began
+    claims = [Claim(f"{name}.seconds", seconds, "s"), Claim(f"{name}.iterations", fit.stats["iterations"])]
+    for n, row in fit.estimates.iterrows():
+        true = truth.value(str(n))
+        inside = abs(row["value"] - true) / ((row["ci_high"] - row["ci_low"]) / 2)
+        claims.append(Claim(f"{name}.{n}", row["value"], row["unit"], true, f"{true:g} +- {0.01 * true:.6g}"))
+        claims.append(Claim(f"{name}.{n}.off", inside, "1", None, "<= 1" if name == "stribeck" else ""))
+    return claims
+
+
+def generate(drive: PneumaticDrive, truth: po.ParameterSet, seed: int = SEED) -> po.Experiment:
+    """The log: 10 s at 1 kHz after 0.3 s of settling, u = clip(4 e - 0.15 v, +-0.6) held over each sample."""
+    system, h = drive.system(), 1e-3
+    p, state = vector(system.parameters, truth), names(system.states)
+    ode = compiled(system.ode)
+    u = np.zeros(1)
+    solver = integrate.ode(lambda t, x: ode(t, x, u, p)[0])
+    scale = np.array([q.nominal for q in system.states])
+    solver.set_integrator("lsoda", rtol=1e-10, atol=1e-12 * scale, nsteps=100_000)
+    x = np.array([START.get(n, 0.0) for n in state])
+    rows, commands = [], []
+    for k in range(-300, 10_000):
+        u[0] = float(np.clip(4 * (reference(k * h) - x[0]) - 0.15 * x[1], -0.6, 0.6))
+        rows.append(x)
+        commands.append(u[0])
+        solver.set_initial_value(x, 0.0)
+        x = solver.integrate(h)
+    columns = dict(zip(state, np.array(rows[300:]).T, strict=True))
+    rng = np.random.default_rng(seed)
+    logged = {n: columns[n] + sigma * rng.standard_normal(10_000) for n, sigma in NOISE.items()}
+    t = np.arange(10_000) * h
+    return po.Experiment(po.Trajectory(t, {"valve_voltage": commands[300:], **logged}), NOISE, name="b32")
+
+
+def reference(t: float) -> float:
+    """Ten levels, then a triangle of 0.085 to 0.115 m with a period of 2.5 s [m]."""
+    if t < 5.0:
+        return LEVELS[max(0, int(t / 0.5 + 1e-9))]
+    phase = ((t - 5.0) / 2.5) % 1.0
+    return 0.1 + 0.015 * (1 - 4 * abs(((phase + 0.25) % 1.0) - 0.5))
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__).parse_args()
+    sys.exit(finish(main(), options))

@@ -1,0 +1,341 @@
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.errors import InputError
+from pneuopt.models.chamber import Polytropic, Thermal, blend
+from pneuopt.models.cylinder import Cylinder, areas, piston_leak
+from pneuopt.models.drive import part
+from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.gas import GAS_CONSTANT, IsentropicNozzle
+from pneuopt.models.load import GRAVITY, Load
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.valve import Port, ProportionalValve, Spool
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.simulate import simulate
+from pneuopt.system import Symbols, System, define, names, vector
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+DRIVES = {
+    "plain": PneumaticDrive(),
+    "lugre": PneumaticDrive(friction=PressureDependent(LuGre()), load=Load(spring=True, inclined=True)),
+    "thermal": PneumaticDrive(chamber=Thermal(), friction=Coulomb()),
+    "nozzle": PneumaticDrive(ProportionalValve(IsentropicNozzle(), Spool.FIRST_ORDER), chamber=Polytropic(mixed=True)),
+    "rigid": PneumaticDrive(ProportionalValve(spool=Spool.RIGID), Viscous(), cylinder=Cylinder(stops=False)),
+}
+AREAS = np.pi / 4 * 0.032**2, np.pi / 4 * (0.032**2 - 0.012**2)
+RANGE = {  # the operating box: beyond the stroke as far as a stop gives way, from vacuum pumps to compressors
+    "position": (-2e-3, 0.202), "speed": (-3.0, 3.0), "pressure_a": (1e3, 1.2e6), "pressure_b": (1e3, 1.2e6),
+    "temperature_a": (200.0, 450.0), "temperature_b": (200.0, 450.0), "valve.spool": (-1.3, 1.3),
+    "valve.spool_rate": (-1e3, 1e3), "friction.bristle": (-2e-3, 2e-3), "valve_voltage": (-8.0, 8.0),
+}  # fmt: skip
+
+
+@st.composite
+def points(draw: st.DrawFn, drive: PneumaticDrive) -> tuple[Array, Array]:
+    """A state and an input within the box; often where a formula could break."""
+    special = {"pressure_a": [101325.0, 701325.0], "pressure_b": [101325.0, 701325.0], "position": [0.0, 0.2]}
+    system, values = drive.system(), []
+    for q in (*system.states, *system.inputs):
+        own = st.floats(*RANGE[q.name]) | st.sampled_from([*special.get(q.name, []), sum(RANGE[q.name]) / 2])
+        values.append(draw(own))
+    return np.array(values[: len(system.states)]), np.array(values[len(system.states) :])
+
+
+def derivatives(system: System) -> ca.Function:
+    sizes = [system.ode.size1_in(i) for i in range(4)]
+    t, x, u, p = (ca.SX.sym(n, size) for n, size in zip("txup", sizes, strict=True))
+    free, weights = ca.vertcat(x, u, p), ca.SX.sym("w", len(system.states))
+    xdot = system.ode(t, x, u, p)[0]
+    hessian = ca.hessian(ca.dot(weights, xdot), free)[0]
+    return ca.Function("D", [x, u, p, weights], [xdot, ca.jacobian(xdot, free), hessian])
+
+
+DERIVATIVES = {name: derivatives(drive.system()) for name, drive in DRIVES.items()}
+
+
+def with_values(drive: PneumaticDrive, **values: float) -> ParameterSet:
+    return drive.parameters.with_values({k.replace("__", "."): v for k, v in values.items()})
+
+
+def rates(drive: PneumaticDrive, x: Array, u: float, p: ParameterSet) -> Array:
+    return np.asarray(drive.system().ode(0, x, [u], vector(drive.parameters, p))[0]).ravel()
+
+
+@pytest.mark.parametrize("name", DRIVES)
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_no_nan_in_value_gradient_or_hessian(name: str, data: st.DataObject) -> None:
+    drive = DRIVES[name]
+    p, weights = vector(drive.parameters, drive.parameters), np.ones(len(drive.states))
+    x, u = data.draw(points(drive))
+    equal = np.where(np.array(names(drive.states)) == "pressure_b", x[2], x)
+    for state in (x, equal):
+        for value in DERIVATIVES[name](state, u, p, weights):
+            assert np.all(np.isfinite(np.array(value)))
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_derivatives_are_the_central_differences(name: str) -> None:
+    drive, rng = DRIVES[name], np.random.default_rng(2)
+    system, p = drive.system(), vector(drive.parameters, drive.parameters)
+    nominal = np.array([q.nominal for q in (*system.states, *system.inputs)])
+    middle = np.array([np.mean(RANGE[q.name]) for q in (*system.states, *system.inputs)])
+    n, m = len(system.states), len(system.inputs)
+    for _ in range(3):
+        # voltage within the clip; speeds well away from the narrow turning of the friction
+        w = np.concatenate([middle + 0.3 * nominal * rng.uniform(-1, 1, n + m), p])
+        w[1] = rng.choice([-1, 1]) * rng.uniform(0.02, 0.3)
+        exact = np.array(DERIVATIVES[name](w[:n], w[n : n + m], w[n + m :], np.ones(n))[1])
+        scale = np.concatenate([nominal, np.maximum(np.abs(p), 1e-6)])
+        for k, step in enumerate(1e-6 * scale):
+            shift = step * (np.arange(len(w)) == k)
+            high, low = (
+                np.array(system.ode(0, *np.split(point, [n, n + m]))[0]).ravel() for point in (w + shift, w - shift)
+            )
+            rounding = 1e-13 * np.maximum(np.abs(high), 1.0) / step
+            assert np.all(np.abs(exact[:, k] - (high - low) / (2 * step)) <= 1e-4 * np.abs(exact[:, k]) + rounding)
+
+
+def test_names_units_and_wiring() -> None:
+    text = repr(DRIVES["thermal"].system())
+    assert "position [m], speed [m/s], pressure_a [Pa(a)], pressure_b [Pa(a)], temperature_a [K]" in text
+    assert "valve.spool [1], valve.spool_rate [1/s]" in text
+    assert "inputs: valve_voltage [V]\n  outputs: position [m], speed [m/s], pressure_a [Pa(a)], pressure_b" in text
+    assert DRIVES["plain"] == PneumaticDrive()
+    assert names(DRIVES["lugre"].states)[-1] == "friction.bristle"
+
+
+def test_newtons_law() -> None:
+    drive = replace(DRIVES["lugre"], cylinder=Cylinder(stops=False))
+    values = {"load__mass": 3.0, "load__force": 7.0, "load__stiffness": 200.0, "load__rest_position": 0.05}
+    p = with_values(drive, **values, load__inclination=0.3, friction__viscous=50.0, friction__coulomb_pressure_a=1e-5)
+    state = dict.fromkeys(names(drive.states), 0.0) | {"position": 0.1, "pressure_a": 5e5, "pressure_b": 4e5}
+    a, b = AREAS
+    push = a * 5e5 - b * 4e5 - (a - b) * 101325.0
+    expected = (push - 7.0 - 200.0 * 0.05) / 3.0 - GRAVITY * np.sin(0.3)
+    assert rates(drive, np.array(list(state.values())), 0.0, p)[1] == pytest.approx(expected, rel=1e-4)
+    sliding = np.array(list((state | {"speed": 1.0, "friction.bristle": (30 + 1e-5 * (5e5 - 101325)) / 5e4}).values()))
+    friction = 30 + 1e-5 * (5e5 - 101325) + 50.0
+    assert rates(drive, sliding, 0.0, p)[1] == pytest.approx(expected - friction / 3.0, rel=1e-4)
+
+
+def test_stops_push_back_beyond_the_stroke_only() -> None:
+    plain, free = DRIVES["plain"], replace(DRIVES["plain"], cylinder=Cylinder(stops=False))
+
+    def stop(y: float, v: float) -> float:
+        x = np.array([y, v, 3e5, 3e5, 0.0, 0.0])
+        return float((rates(plain, x, 0.0, plain.parameters) - rates(free, x, 0.0, free.parameters))[1] * 5.0)
+
+    assert stop(0.201, 0.0) == pytest.approx(-1000.0, rel=0.01)
+    assert stop(-0.001, 0.0) == pytest.approx(1000.0, rel=0.01)
+    assert stop(0.201, 0.5) == pytest.approx(-1500.0, rel=0.01)  # on its way in it pushes harder
+    assert stop(-0.001, 0.5) == pytest.approx(500.0, rel=0.01)
+    assert stop(0.19, 0.0) == pytest.approx(-0.25, rel=0.06)  # less what is left of the other
+
+
+def test_it_runs_into_the_stop_and_stays() -> None:
+    drive = DRIVES["plain"]
+    rest = drive.rest(drive.parameters)
+    t = np.linspace(0, 2, 401)
+    run = simulate(
+        drive.system(), Trajectory(t, {"valve_voltage": np.full_like(t, 5.0)}), drive.parameters, initial=rest.states
+    )
+    assert 0.2 < run["position"][-1] < 0.2006
+    assert abs(run["speed"][-1]) < 1e-6
+    assert run["pressure_a"][-1] == pytest.approx(701325.0, rel=1e-3)
+    assert run["position"].max() < 0.205
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_at_rest_nothing_changes(name: str) -> None:
+    drive = DRIVES[name]
+    p = with_values(drive, load__force=60.0, cylinder__leak=1e-10, valve__leak=0.005)
+    rest = drive.rest(p, position=0.07)
+    scale = np.array([q.nominal for q in drive.states])
+    found = rates(drive, np.array(list(rest.states.values())), rest.inputs["valve_voltage"], p)
+    assert np.abs(found / scale).max() < 1e-6
+    assert rest.states["position"] == 0.07
+    assert tuple(rest.states) == names(drive.states)
+
+
+def test_more_load_takes_more_opening_and_the_wrong_way_round() -> None:
+    drive = DRIVES["plain"]
+    voltages = [
+        drive.rest(with_values(drive, load__force=force)).inputs["valve_voltage"] for force in (-100.0, 0.0, 100.0)
+    ]
+    assert voltages == sorted(voltages)
+    assert voltages[1] < 0  # the area without rod is larger
+
+
+def test_trapped_air() -> None:
+    drive = DRIVES["plain"]
+    rest = drive.rest(drive.parameters, position=0.05, pressure_b=3.5e5)
+    assert (rest.states["pressure_b"], rest.inputs["valve_voltage"]) == (3.5e5, 0.0)
+    assert rates(drive, np.array(list(rest.states.values())), 0.0, drive.parameters)[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_loop_finds_its_rest() -> None:
+    drive = PneumaticDrive(friction=LuGre())
+    loop = ClosedLoop(drive.system(), PID())
+    p = loop.parameters.with_values({"cylinder.start": 0.2, "pid.Ki": 5.0})
+    for Ki in (0.0, 5.0):
+        x = loop.initial(p.with_values({"pid.Ki": Ki}))
+        system = loop.system()
+        scale = np.array([q.nominal for q in system.states])
+        assert np.abs(np.array(system.ode(0, x, [0.0], loop.numbers(p))[0]).ravel() / scale).max() < 1e-6
+        assert x[0] == pytest.approx(0.04)
+    position = ClosedLoop(drive.system(), PID(), measured="position")
+    assert position.initial(position.parameters, reference=0.13)[0] == 0.13
+    with pytest.raises(InputError, match=r"does not rest at \{'speed': 0.1\}"):
+        loop.initial(p, reference=0.1)
+
+
+@st.composite
+def rodless(draw: st.DrawFn) -> tuple[Array, float]:
+    spans = [(0.0, 0.2), (-2.0, 2.0), (1e5, 8e5), (1e5, 8e5), (-1.0, 1.0), (-300.0, 300.0), (-5e-4, 5e-4)]
+    return np.array([draw(st.floats(*span)) for span in spans]), draw(st.floats(-6.0, 6.0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(rodless())
+def test_a_rodless_drive_is_its_own_mirror_image(point: tuple[Array, float]) -> None:
+    drive = PneumaticDrive(friction=LuGre())
+    p = with_values(drive, cylinder__rod=0.0, cylinder__leak=1e-10, valve__dead_zone=0.02)
+    x, u = point
+    mirror = np.array([0.2 - x[0], -x[1], x[3], x[2], -x[4], -x[5], -x[6]])
+    there, back = rates(drive, x, u, p), rates(drive, mirror, -u, p)
+    swapped = np.array([-there[0], -there[1], there[3], there[2], -there[4], -there[5], -there[6]])
+    scale = np.array([1.0, 1e3, 1e7, 1e7, 1e3, 1e5, 1.0])
+    assert back / scale == pytest.approx(swapped / scale, rel=1e-9, abs=1e-9)
+
+
+def books(drive: PneumaticDrive) -> System:
+    """The drive with what crosses its border, integrated: mass into each chamber [kg], energy into the whole [J]."""
+    own = drive.system()
+    ledger = tuple(
+        Quantity(n, unit, s) for n, unit, s in (("fed_a", "kg", 1e-3), ("fed_b", "kg", 1e-3), ("energy", "J", 10))
+    )
+    thermal = isinstance(drive.chamber, Thermal)
+
+    def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
+        xs, ps = (ca.vertcat(*(v[n] for n in order)) for v, order in ((x, names(own.states)), (p, own.parameters)))
+        xdot, y = own.ode(t, xs, u["valve_voltage"], ps)
+        outside = p["ambient.temperature"]
+        ports = [Port(x[f"pressure_{s}"], x[f"temperature_{s}"] if thermal else outside) for s in "ab"]
+        borders = [Port(p[n], outside) for n in ("supply.pressure", "ambient.pressure")]
+        w = drive.valve.flows(x["valve.spool"], borders[0], borders[1], ports[0], ports[1], part(p, "valve"))
+        leak = piston_leak(ports[0].pressure, ports[1].pressure, p["cylinder.leak"])
+        crossing = {"a": (w.supply_a, -w.a_exhaust), "b": (w.supply_b, -w.b_exhaust)}
+        fed = {"fed_a": sum(crossing["a"]) + leak, "fed_b": sum(crossing["b"]) - leak}
+        c_p, inside = 3.5 * p["gas.constant"], dict(zip("ab", (q.temperature for q in ports), strict=True))
+        power = sum(
+            (c_p * rate * blend(rate, outside, inside[s]) for s, rates_ in crossing.items() for rate in rates_),
+            start=ca.SX(0),
+        )
+        if thermal:
+            power += sum((p["chamber.wall_conductance"] * (outside - q.temperature) for q in ports), start=ca.SX(0))
+        a, b = areas(p["cylinder.bore"], p["cylinder.rod"])
+        friction = drive.friction.force(x["speed"], {}, {}, part(p, "friction")).value
+        power -= ((a - b) * p["ambient.pressure"] + friction + p["load.force"]) * x["speed"]
+        rates_ = {n: xdot[k] for k, n in enumerate(names(own.states))} | fed | {"energy": power}
+        return rates_, {n: y[k] for k, n in enumerate(names(own.outputs))}
+
+    states = (*own.states, *ledger)
+    return define(states, own.inputs, own.outputs, own.parameters, rhs, rest_finder=own.rest_finder)
+
+
+@pytest.mark.parametrize("chamber", [Polytropic(), Thermal()], ids=["isothermal", "thermal"])
+def test_ten_seconds_leave_no_mass_or_energy_behind(chamber: Polytropic | Thermal) -> None:
+    drive = PneumaticDrive(friction=Viscous(), chamber=chamber, cylinder=Cylinder(stops=False))
+    thermal = isinstance(chamber, Thermal)
+    loop = ClosedLoop(books(drive), PID(limits=False), measured="position")
+    p = loop.parameters.with_values({"pid.Kp": 25.0, "load.force": 20.0, "cylinder.leak": 2e-10, "valve.leak": 0.002})
+    p = p if thermal else p.with_values({"chamber.exponent": 1.0})
+    t = np.linspace(0, 10, 1001)
+    wave = Trajectory(t, {"reference": 0.1 + 0.09 * np.sin(2 * np.pi * 1.1 * t)})
+    run = simulate(loop, wave, p, initial=loop.initial(p, reference=0.1))
+    y = run["position"]
+    assert 0 < y.min() < 0.04
+    assert 0.16 < y.max() < 0.2
+    V = 8e-6 + AREAS[0] * y, 8e-6 + AREAS[1] * (0.2 - y)
+    warmth = [run[f"temperature_{s}"] if thermal else 293.15 for s in "ab"]
+    for side, volume, temperature in zip("ab", V, warmth, strict=True):
+        mass = run[f"pressure_{side}"] * volume / (GAS_CONSTANT * temperature)
+        turnover = np.abs(np.diff(run[f"fed_{side}"])).sum()
+        assert turnover > 3 * mass.mean()
+        assert np.abs(mass - mass[0] - run[f"fed_{side}"]).max() < 1e-11 * turnover  # 1e-13 found
+    if thermal:
+        inner = sum(run[f"pressure_{s}"] * volume / 0.4 for s, volume in zip("ab", V, strict=True))
+        energy = inner + 2.5 * run["speed"] ** 2
+        assert np.ptp(energy) > 5.0
+        assert np.abs(energy - energy[0] - run["energy"]).max() < 1e-8  # of 177 J that crossed the border
+
+
+def test_much_wall_is_isothermal_and_none_adiabatic() -> None:
+    """The temperature state between the two exponents it stands for, on a closed valve and a moving load."""
+    t = np.linspace(0, 0.3, 151)
+    held = Trajectory(t, {"valve_voltage": np.zeros_like(t)})
+    found = {}
+    for label, chamber, values in (
+        ("isothermal", Polytropic(), {"chamber.exponent": 1.0}),
+        ("much", Thermal(), {"chamber.wall_conductance": 1e3}),
+        ("adiabatic", Polytropic(), {"chamber.exponent": 1.4}),
+        ("none", Thermal(), {"chamber.wall_conductance": 0.0}),
+    ):
+        drive = PneumaticDrive(friction=Viscous(), chamber=chamber)
+        p = with_values(drive, valve__dead_zone=0.1, valve__rounding=1e-5, friction__viscous=5.0).with_values(values)
+        state = {**drive.rest(p, pressure_b=4e5).states, "speed": 0.3}
+        found[label] = simulate(drive.system(), held, p, initial=state)["speed"]
+    assert np.abs(found["much"] - found["isothermal"]).max() < 5e-3
+    assert np.abs(found["none"] - found["adiabatic"]).max() < 2e-3
+    assert np.abs(found["isothermal"] - found["adiabatic"]).max() > 0.05
+
+
+IMPOSSIBLE = {
+    "cylinder.rod": (0.04, "m", r"cylinder.rod = 0.04 m \(source: a sketch\) is impossible; a rod is thinner.*0.032 m"),
+    "cylinder.dead_volume_a": (-1e-6, "m^3", "cylinder.dead_volume_a = -1e-06 m.3.*always hold some air"),
+    "valve.critical_ratio": (1.2, "1", "valve.critical_ratio = 1.2.*between 0 and 1"),
+    "supply.pressure": (9e4, "Pa(a)", "supply.pressure = 90000.*above the ambient pressure, 101325"),
+    "cylinder.start": (1.5, "1", "cylinder.start = 1.5.*within the stroke"),
+    "cylinder.leak": (-1.0, "kg/(s*Pa)", "no leakage is 0"),
+    "chamber.exponent": (0.0, "1", "1 is isothermal, 1.4 adiabatic"),
+    "load.mass": (0.0, "kg", "weighs something"),
+}
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_impossible_hardware_is_refused(name: str) -> None:
+    drive = DRIVES["plain"]
+    value, unit, message = IMPOSSIBLE[name]
+    p = drive.parameters | ParameterSet({name: Parameter(value, unit, source="a sketch")})
+    for refuse in (drive.check, drive.rest, ClosedLoop(drive.system(), PID()).initial):
+        with pytest.raises(InputError, match=message):
+            refuse(p)
+
+
+def test_what_cannot_rest_is_refused() -> None:
+    drive = DRIVES["plain"]
+    with pytest.raises(InputError, match=r"position = 0.3 m lies outside the stroke, 0 to 0.2 m"):
+        drive.rest(drive.parameters, position=0.3)
+    with pytest.raises(InputError, match=r"no equilibrium exists.*lower the load, raise the supply or the bore"):
+        drive.rest(with_values(drive, load__force=600.0))
+    with pytest.raises(InputError, match="pressure_b = 0 Pa is no absolute pressure"):
+        drive.rest(drive.parameters, pressure_b=0.0)
+    with pytest.raises(InputError, match="chamber a would need"):
+        drive.rest(with_values(drive, load__force=-400.0), pressure_b=2e5)
+
+
+def test_all_friction_models_fit_in() -> None:
+    for friction in (Viscous(), Coulomb(), Stribeck(), LuGre(), PressureDependent(Stribeck())):
+        drive = PneumaticDrive(friction=friction)
+        rest = drive.rest(drive.parameters)
+        assert np.all(np.isfinite(rates(drive, np.array(list(rest.states.values())), 1.0, drive.parameters)))

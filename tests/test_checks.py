@@ -1,0 +1,129 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pneuopt.errors import InputError, LogError, ModelError, UnknownNameError
+from pneuopt.experiments import Experiment
+from pneuopt.identify import identify
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.trajectories import Array, Trajectory
+
+NOISE = 2e-5  # [m]
+RIG = ForceDrive(Coulomb())
+
+
+def log_with(**columns: Array | None) -> Experiment:
+    """100 ms of a drive at rest, with other columns, or without those that are None."""
+    t = np.linspace(0, 0.1, 100, endpoint=False)
+    position = NOISE * np.random.default_rng(0).standard_normal(100)
+    given = {"force": np.zeros(100), "position": position, **columns}
+    return Experiment(Trajectory(t, {n: c for n, c in given.items() if c is not None}), name="run 0")
+
+
+def holed(value: float) -> Array:
+    force = np.zeros(100)
+    force[42] = value
+    return force
+
+
+def paused() -> Experiment:
+    log = log_with()
+    t = log.trajectory.t + np.where(np.arange(100) > 60, 0.5, 0.0)
+    return replace(log, trajectory=Trajectory(t, log.trajectory.values))
+
+
+BAD_LOGS = {
+    "no input": (
+        log_with(force=None),
+        LogError,
+        r"run 0: the model needs the channel 'force' \[N\] as input; the log has position",
+    ),
+    "input with a hole": (
+        log_with(force=holed(math.nan)),
+        LogError,
+        r"run 0: input 'force' is missing at t = 0\.042 s; cut or fill",
+    ),
+    "foreign channel": (
+        log_with(pressure_a=np.ones(100)),
+        LogError,
+        "cannot use channel 'pressure_a', it reads force, position, speed",
+    ),
+    "no output": (log_with(position=None), LogError, "run 0: none of the outputs is logged: position, speed"),
+    "empty output": (
+        log_with(position=np.full(100, math.nan)),
+        LogError,
+        "run 0: channel 'position' holds no sample; leave it out",
+    ),
+    "constant output": (
+        log_with(position=np.full(100, 3.0)),
+        LogError,
+        "run 0: channel 'position' is constant; leave it out",
+    ),
+    "too short": (
+        replace(log_with(), trajectory=log_with().trajectory.rows(0, 9)),
+        LogError,
+        "9 samples are too short a log; at least 10",
+    ),
+    "pause": (
+        paused(),
+        LogError,
+        r"nothing is logged for 0\.501 s from t = 0\.06 s; the usual step is 0\.001 s; cut the log in two",
+    ),
+    "unknown condition": (
+        log_with().with_conditions({"load.mas": 1.0}),
+        UnknownNameError,
+        r"run 0: condition: unknown parameter 'load\.mas'; did you mean 'load\.mass'",
+    ),
+    "condition out of bounds": (
+        log_with().with_conditions({"load.mass": -1.0}),
+        InputError,
+        r"run 0: condition load\.mass: value -1 kg lies outside",
+    ),
+    "condition on what is free": (
+        log_with().with_conditions({"friction.coulomb": 9.0}),
+        ModelError,
+        r"friction\.coulomb is free, but every log's conditions give its value",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_LOGS)
+def test_a_bad_log_is_refused_with_the_remedy(name: str) -> None:
+    log, error, message = BAD_LOGS[name]
+    with pytest.raises(error, match=message):
+        identify(RIG.system(), [log], RIG.parameters.freed("friction.coulomb"))
+
+
+def test_bad_parameters_are_refused() -> None:
+    system, log = RIG.system(), log_with()
+    with pytest.raises(LogError, match="no experiments: give at least one log"):
+        identify(system, [], system.parameters.freed("load.mass"))
+    with pytest.raises(ModelError, match="no parameter is free; mark what to estimate"):
+        identify(system, [log], system.parameters)
+    stranger = ParameterSet({"load.mess": Parameter(1.0, "kg", free=True)})
+    with pytest.raises(UnknownNameError, match=r"unknown parameter 'load\.mess'; did you mean 'load\.mass'"):
+        identify(system, [log], stranger)
+
+
+def test_a_loops_set_point_may_stay_in_the_log_and_names_become_distinct() -> None:
+    log = log_with(speed_reference=np.zeros(100))
+    anonymous = replace(log, name="")
+    free = RIG.parameters.freed("friction.coulomb")
+    result = identify(RIG.system(), [log, log, anonymous], free, throw=False)
+    assert list(result.trajectories) == ["run 0", "run 0 (2)", "log 3"]
+
+
+def test_a_sensors_noise_is_shared_between_logs() -> None:
+    still = log_with(position=np.full(100, 0.5))
+    result = identify(
+        RIG.system(),
+        [log_with(), replace(still, name="b")],
+        RIG.parameters.freed("load.force"),
+        throw=False,
+    )
+    noise = result.fit["noise"]
+    assert noise.iloc[0] == noise.iloc[1] == pytest.approx(NOISE, rel=0.3)

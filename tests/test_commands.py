@@ -1,0 +1,186 @@
+"""The command `study`; the others are in test_cli.py."""
+
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from typer.testing import CliRunner, Result
+
+from pneuopt import commands
+from pneuopt.cli import app
+from pneuopt.study import sweep
+
+DRIVE = """
+[drive]
+kind = "force"
+[load]
+mass = { value = "5 kg", lower = "1 kg", upper = "50 kg" }
+[friction]
+model = "coulomb"
+coulomb = "20 N"
+viscous = "40 N*s/m"
+smoothing = "5 mm/s"
+"""
+TUNING = """
+[pid]
+sample_time = "5 ms"
+Kp = "300 N*s/m"
+Ki = "5000 N/m"
+limits = ["-200 N", "200 N"]
+[[reference]]
+step = "0.2 m/s"
+horizon = "0.3 s"
+[[reference]]
+step = "-0.1 m/s"
+horizon = "0.3 s"
+[limits]
+settling_time = { max = "1 s", band = "5 %" }
+"""
+STUDY = """
+[study]
+drive = "drive.toml"
+tuning = "tuning.toml"
+[axes]
+load.mass = ["2 kg", "4000 g"]
+load.force = { from = "0 N", to = "50 N", steps = 2 }
+"""
+LINE = "study study.toml -o cases.csv --json cases.json --plot map.png"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The files of a study, which runs in a thread."""
+    for name, text in {"drive": DRIVE, "tuning": TUNING, "study": STUDY}.items():
+        (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    with ThreadPoolExecutor(1) as executor:
+        monkeypatch.setattr(commands, "sweep", partial(sweep, executor=executor))
+        yield tmp_path
+
+
+def run(line: str) -> Result:
+    return CliRunner().invoke(app, line.split(), catch_exceptions=False)
+
+
+def edit(name: str, old: str, new: str) -> None:
+    text = Path(name).read_text(encoding="utf-8")
+    assert old in text
+    Path(name).write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def test_a_study_is_shown_written_and_drawn(folder: Path) -> None:
+    result = run(LINE)
+    assert result.exit_code == 0, result.stdout
+    lines = result.stdout.splitlines()
+    assert lines[0] == "4 cases, each the worst of 2 references: all settle"
+    assert max(map(len, lines)) <= 80
+    assert all(words in result.stdout for words in ("load.mass", "load.force", "SettlingTime", "[kg]", "[N]", "[s]"))
+    cases = pd.read_csv("cases.csv")
+    assert cases["load.mass [kg]"].tolist() == [2, 2, 4, 4]
+    assert cases["load.force [N]"].tolist() == [0, 50, 0, 50]
+    assert {"SettlingTime[0 to 0.2] [s]", "Overshoot[0 to -0.1] [%]", "Peak[0 to 0.2] [m/s]", "seconds [s]"} <= {*cases}
+    worst = cases[["SettlingTime[0 to 0.2] [s]", "SettlingTime[0 to -0.1] [s]"]].max(axis=1)
+    assert all(f"{seconds:.4g}" in result.stdout for seconds in worst)
+    said = json.loads(Path("cases.json").read_text(encoding="utf-8"))
+    assert said["verdict"] == lines[0]
+    assert [c["SettlingTime[0 to 0.2]"] for c in said["cases"]] == pytest.approx(cases["SettlingTime[0 to 0.2] [s]"])
+    assert {"sha256[study.toml]", "sha256[drive.toml]", "sha256[tuning.toml]"} == said["provenance"].keys()
+    assert Path("map.png").stat().st_size > 10_000
+
+
+def test_the_band_of_the_study_counts_before_the_tunings(folder: Path) -> None:
+    run("study study.toml -o wide.csv")
+    edit("study.toml", "[axes]", '[metrics]\nband = "1 %"\nshow = ["PhaseMargin", "Ripple", "SettlingTime"]\n[axes]')
+    result = run("study study.toml -o narrow.csv")
+    assert "PhaseMargin" in result.stdout
+    assert "Overshoot" not in result.stdout
+    wide, narrow = (pd.read_csv(f"{name}.csv")["SettlingTime[0 to 0.2] [s]"] for name in ("wide", "narrow"))
+    assert (narrow.fillna(9.0) > wide).all()
+
+
+def test_cases_that_fail_or_never_settle_are_rows_and_status_1(folder: Path) -> None:
+    edit("study.toml", "load.force = {", 'load.force = ["0 N", "-900 N", "199 N"] # {')
+    result = run(LINE)
+    assert result.exit_code == 1
+    lines = result.stdout.splitlines()
+    assert lines[0] == "6 cases, each the worst of 2 references: 2 failed, 2 never settle"
+    assert "never" in result.stdout
+    assert "failed (2 of 6): InputError: the loop cannot start at rest: it needs a command of -900 N" in result.stdout
+    cases = pd.read_csv("cases.csv")
+    assert cases["error"].notna().tolist() == [False, True, False] * 2
+    assert Path("map.png").exists()
+
+
+def test_a_study_of_nothing_but_failures_is_shown_and_drawn(folder: Path) -> None:
+    edit("study.toml", "load.force = {", 'load.force = ["-900 N", "900 N"] # {')
+    result = run(LINE)
+    assert result.exit_code == 1
+    assert result.stdout.startswith("4 cases, each the worst of 2 references: 4 failed")
+    assert Path("map.png").exists()
+
+
+def test_many_cases_are_shown_by_the_worst(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pneuopt.console.MOST_CASES", 2)
+    result = run("study study.toml -o cases.csv")
+    assert "the 2 worst of 4 cases by SettlingTime; -o FILE writes all" in result.stdout
+    settling = pd.read_csv("cases.csv")[["SettlingTime[0 to 0.2] [s]", "SettlingTime[0 to -0.1] [s]"]].max(axis=1)
+    assert f"{settling.max():.4g}" in result.stdout
+    assert f"{settling.min():.4g}" not in result.stdout
+
+
+def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: str) -> None:
+        raise KeyboardInterrupt
+
+    with ThreadPoolExecutor(1) as executor:
+        interrupted = partial(sweep, executor=executor)
+        monkeypatch.setattr(commands, "sweep", lambda *a, **k: interrupted(*a, **{**k, "progress": interrupt}))
+        result = run(LINE)
+    assert result.exit_code == 130
+    assert result.stdout.startswith("4 cases, each the worst of 2 references: 3 interrupted")
+    assert pd.read_csv("cases.csv")["error"].fillna("").tolist() == ["", *["interrupted"] * 3]
+    assert Path("map.png").exists()
+
+
+def test_processes_do_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run("study study.toml -o threads.csv")
+    monkeypatch.setattr(commands, "sweep", sweep)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert run("study study.toml -o processes.csv").exit_code == 0
+    one, other = (pd.read_csv(f"{name}.csv").drop(columns="seconds [s]") for name in ("threads", "processes"))
+    pd.testing.assert_frame_equal(one, other)
+
+
+def test_one_that_was_not_certified_is_warned_of(folder: Path) -> None:
+    with Path("tuning.toml").open("a", encoding="utf-8") as file:
+        file.write('[status]\ncode = "interrupted"\nmessage = ""\n')
+    assert run("study study.toml").stderr == "warning: tuning.toml: its tuning is NOT converged (interrupted)\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("tuning.toml", "none.toml", "none.toml: cannot be read"),
+        ("load.mass", "load.mas", "study.toml: [axes]: unknown parameter 'load.mas'; did you mean 'load.mass'"),
+        ("2 kg", "60 kg", "study.toml: [axes] axis: load.mass: value 60 kg lies outside its bounds [1, 50]"),
+        ("4000 g", "2000 g", "study.toml: [axes] axis load.mass: a value is there twice"),
+        ("[axes]", '[metrics]\nshow = ["Oversoot"]\n[axes]', "[metrics] show: unknown metric 'Oversoot'; did you mean"),
+        ("[axes]", "[axes]\nfriction.coulomb = ['2 N']", "--plot draws one or two axes, there are 3; leave it out"),
+        ("drive.toml", "cases.json", "cases.json: is an input of this command"),
+    ],
+)
+def test_bad_input_gets_one_message_and_writes_nothing(folder: Path, old: str, new: str, said: str) -> None:
+    edit("study.toml", old, new)
+    before = {p: p.read_bytes() for p in folder.iterdir()}
+    result = run(LINE)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: ")
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert {p: p.read_bytes() for p in folder.iterdir()} == before

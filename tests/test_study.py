@@ -1,0 +1,329 @@
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from multiprocessing import active_children, get_context
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError, UnknownNameError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
+from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.study import INTERRUPTED, grid, sweep
+from pneuopt.system import System, discretise
+from pneuopt.tune import evaluate
+
+RIG = ParameterSet(
+    {
+        "load.mass": Parameter(5.0, "kg", 0.1, 100.0),
+        "load.force": Parameter(10.0, "N"),
+        "supply.pressure": Parameter(7e5, "Pa(a)"),
+    }
+)
+MODULE = """
+import os, time
+
+def acceleration(p):
+    return p.value("load.force") / p.value("load.mass")
+
+def troubled(p):
+    mass = p.value("load.mass")
+    if mass == 2.0:
+        raise ValueError("two\\nlines")
+    if mass == 3.0:
+        os._exit(7)
+    if mass == 4.0:
+        return [1, 2]
+    if mass == 5.0:
+        raise SystemExit("enough")
+    return {"mass": mass, "process": os.getpid()}
+
+def interrupting(p):
+    if p.value("load.mass") == 2.0:
+        raise KeyboardInterrupt
+    return 0.0
+
+def sleeping(p):
+    time.sleep(p.value("load.mass"))
+    return 1.0
+
+def hung(p):
+    time.sleep(60 * (p.value("load.mass") > 1.0))
+    return 1.0
+"""
+
+
+@pytest.fixture
+def functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """A module that other processes can import, too."""
+    (tmp_path / "study_functions.py").write_text(MODULE, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    yield importlib.import_module("study_functions")
+    del sys.modules["study_functions"]
+    assert active_children() == []
+
+
+@pytest.fixture
+def threads() -> Iterator[Executor]:
+    with ThreadPoolExecutor(2) as executor:
+        yield executor
+
+
+def masses(*values: float) -> dict[str, dict[str, float]]:
+    return {f"{v:g} kg": {"load.mass": v} for v in values}
+
+
+def test_a_grid_names_every_combination_the_last_axis_first() -> None:
+    cases = grid(RIG, {"supply.pressure": [5e5, 7e5], "load.mass": np.array([2, 8])})
+    assert list(cases) == [
+        "supply.pressure = 5 bar(a), load.mass = 2 kg",
+        "supply.pressure = 5 bar(a), load.mass = 8 kg",
+        "supply.pressure = 7 bar(a), load.mass = 2 kg",
+        "supply.pressure = 7 bar(a), load.mass = 8 kg",
+    ]
+    assert list(cases.values())[1] == {"supply.pressure": 5e5, "load.mass": 8.0}
+
+
+def test_neighbours_in_a_grid_keep_names_of_their_own() -> None:
+    assert len(grid(RIG, {"load.mass": [2.0, np.nextafter(2.0, 3.0), 2.00000001]})) == 3
+
+
+@pytest.mark.parametrize(
+    ("axes", "said"),
+    [
+        ({}, "a grid needs an axis"),
+        ({"load.mass": []}, "axis load.mass: no values"),
+        ({"load.mass": [2.0, 3.0, 2.0]}, "axis load.mass: a value is there twice"),
+        ({"load.mass": [2.0, 200.0]}, r"axis: load.mass: value 200 kg lies outside its bounds \[0.1, 100\]"),
+        ({"load.mass": [np.nan]}, "load.mass: a parameter's value is NaN"),
+        ({"load.mas": [2.0]}, "axis: unknown parameter 'load.mas'; did you mean 'load.mass'"),
+    ],
+)
+def test_a_bad_axis_is_refused(axes: dict[str, list[float]], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        grid(RIG, axes)
+
+
+def test_processes_give_what_a_loop_gives_in_the_order_of_the_cases(functions: ModuleType) -> None:
+    cases = grid(RIG, {"load.mass": [8.0, 2.0, 4.0], "load.force": [0.0, 20.0]})
+    news: list[str] = []
+    table = sweep(functions.acceleration, RIG, cases, progress=news.append)
+    assert list(table.columns) == ["case", "load.mass", "load.force", "value", "seconds", "error"]
+    assert table["case"].tolist() == list(cases)
+    expected = [functions.acceleration(RIG.with_values(case)) for case in cases.values()]
+    assert table["value"].tolist() == expected
+    assert table[["load.mass", "load.force"]].to_numpy().tolist() == [list(c.values()) for c in cases.values()]
+    assert (table["seconds"] >= 0).all()
+    assert (table["error"] == "").all()
+    assert news == [f"{k} of 6 cases" for k in range(1, 7)]
+
+
+def test_whatever_happens_to_a_case_stays_in_its_row(functions: ModuleType) -> None:
+    table = sweep(functions.troubled, RIG, masses(1, 2, 3, 4, 5, 6, 7)).set_index("case")
+    assert table["mass"].dropna().to_dict() == {"1 kg": 1, "6 kg": 6, "7 kg": 7}
+    assert (table["process"].dropna() != os.getpid()).all()
+    error = table["error"].to_dict()
+    assert [error[f"{k} kg"] for k in (1, 6, 7)] == ["", "", ""]
+    assert error["2 kg"].startswith("ValueError: two lines (study_functions.py, line ")
+    assert error["3 kg"] == "its process died (exit code 7)"
+    assert error["4 kg"] == "InputError: value is list; return numbers or text, by name"
+    assert error["5 kg"].startswith("SystemExit: enough")
+
+
+def test_a_study_of_nothing_but_failures_is_a_table(threads: Executor) -> None:
+    table = sweep(lambda p: p.value("load.mas"), RIG, masses(1, 2), executor=threads)
+    assert list(table.columns) == ["case", "load.mass", "seconds", "error"]
+    assert table["error"].tolist() == ["UnknownNameError: unknown parameter 'load.mas'; did you mean 'load.mass'?"] * 2
+
+
+@pytest.mark.parametrize(
+    ("result", "columns"),
+    [
+        (np.float64(2.0), {"value": 2.0}),
+        (True, {"value": True}),
+        ({"a": 1, "b": "good"}, {"a": 1, "b": "good"}),
+        (pd.Series({"a": 1.0, "b": 2.0}), {"a": 1.0, "b": 2.0}),
+        (pd.DataFrame({"a": [1.0], "b": [2.0]}), {"a": 1.0, "b": 2.0}),
+        (pd.DataFrame({"0 to 1": {"a": 1.0, "b": 2.0}}), {"a": 1.0, "b": 2.0}),
+        (
+            pd.DataFrame({"up": {"a": 1.0, "b": 2.0}, "down": {"a": 3.0, "b": 4.0}}),
+            {"a[up]": 1.0, "b[up]": 2.0, "a[down]": 3.0, "b[down]": 4.0},
+        ),
+    ],
+)
+def test_results_become_columns(threads: Executor, result: object, columns: dict[str, object]) -> None:
+    (row,) = sweep(lambda _: result, RIG, {"as given": {}}, executor=threads).to_dict("records")
+    seconds = row.pop("seconds")
+    assert row == {"case": "as given", **columns, "error": ""}
+    assert seconds >= 0
+
+
+@pytest.mark.parametrize(
+    ("result", "said"),
+    [
+        (None, "InputError: value is NoneType; return numbers or text, by name"),
+        ({"a": np.zeros(2)}, "InputError: a is ndarray; return"),
+        ({"seconds": 1.0}, "seconds: a result has the name of a column of the study; rename it"),
+        ({"load.mass": 1.0}, "load.mass: a result has the name"),
+    ],
+)
+def test_results_that_are_none_say_so(threads: Executor, result: object, said: str) -> None:
+    table = sweep(lambda _: result, RIG, masses(2), executor=threads)
+    assert table["error"].iloc[0].startswith(said)
+
+
+def test_cases_may_be_whole_sets_and_differ_in_what_they_change(threads: Executor) -> None:
+    other = RIG.with_values({"load.mass": 6.0}) | ParameterSet({"rod": Parameter(0.012, "m")})
+    table = sweep(len, RIG, {"as given": {}, "force": {"load.force": 3.0}, "other": other}, executor=threads)
+    assert table["value"].tolist() == [3, 3, 4]
+    assert table["load.force"].tolist() == [10, 3, 10]
+    assert table["load.mass"].tolist() == [5, 5, 6]
+    assert table["rod"].fillna(-1).tolist() == [-1, -1, 0.012]
+
+
+def test_cases_that_cannot_be_are_refused_before_any_is_computed() -> None:
+    with pytest.raises(InputError, match=r"heavy: load\.mass: value 1000 kg lies outside its bounds"):
+        sweep(len, RIG, {"light": {"load.mass": 1.0}, "heavy": {"load.mass": 1e3}})
+    with pytest.raises(UnknownNameError, match=r"heavy: unknown parameter 'load\.mas'"):
+        sweep(len, RIG, {"heavy": {"load.mas": 1.0}})
+    with pytest.raises(InputError, match="a study needs a case"):
+        sweep(len, RIG, {})
+
+
+def test_a_function_that_cannot_travel_is_refused_with_the_remedy(functions: ModuleType) -> None:
+    lock = threading.Lock()
+    for fn in (lambda _: 1.0, partial(functions.acceleration, lock)):
+        with pytest.raises(
+            InputError, match=r"cannot go to other processes.*a function of a module.*functools\.partial"
+        ):
+            sweep(fn, RIG, masses(2))
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool, pytest.raises(InputError, match="cannot go to other"):
+        sweep(lambda _: 1.0, RIG, masses(2), executor=pool)
+    Path(functions.__file__ or "").unlink()
+    with pytest.raises(InputError, match=r"cannot be loaded by other processes: ModuleNotFoundError.*in a module that"):
+        sweep(functions.acceleration, RIG, masses(2))
+
+
+def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pneuopt import Parameter, ParameterSet, sweep\n"
+        "sweep(len, ParameterSet({'a': Parameter(1.0, 'm')}), {'one': {'a': 2.0}})\n",
+        encoding="utf-8",
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    said = (
+        'InputError: the processes of a study cannot start; a script must call the study under `if __name__ == "__main'
+    )
+    assert said in done.stderr
+
+
+def test_any_executor_will_do(functions: ModuleType, threads: Executor) -> None:
+    cases = masses(0.2, 0.1)
+    expected = sweep(functions.sleeping, RIG, cases, executor=threads)
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        found = sweep(functions.sleeping, RIG, cases, executor=pool)
+        broken = sweep(functions.troubled, RIG, masses(3), executor=pool)
+    assert found.drop(columns="seconds").equals(expected.drop(columns="seconds"))
+    assert broken["error"].iloc[0].startswith("BrokenProcessPool: ")
+    assert sweep(lambda _: 1.0, RIG, cases, executor=AtOnce())["value"].tolist() == [1.0, 1.0]
+
+
+class AtOnce(Executor):
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def test_an_interruption_keeps_what_is_done_and_ends_what_runs(functions: ModuleType) -> None:
+    def interrupt(_: str) -> None:
+        raise KeyboardInterrupt
+
+    begun = time.perf_counter()
+    table = sweep(functions.hung, RIG, masses(1, 2, 3, 4), progress=interrupt)
+    assert time.perf_counter() - begun < 30
+    assert table["error"].tolist() == ["", *[INTERRUPTED] * 3]
+    assert table["value"].fillna(-1).tolist() == [1.0, -1, -1, -1]
+    assert table["load.mass"].tolist() == [1, 2, 3, 4]
+    assert table["seconds"].isna().tolist() == [False, True, True, True]
+
+
+def test_a_function_may_interrupt_the_study(functions: ModuleType) -> None:
+    with ThreadPoolExecutor(1) as one:
+        table = sweep(functions.interrupting, RIG, masses(1, 2, 3), executor=one)
+    assert table["error"].tolist() == ["", INTERRUPTED, INTERRUPTED]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends SIGINT to a group of processes")
+def test_ctrl_c_in_a_terminal_reaches_everybody_and_loses_nothing(functions: ModuleType, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pneuopt import Parameter, ParameterSet, sweep\n"
+        "from study_functions import hung\n"
+        "if __name__ == '__main__':\n"
+        "    rig = ParameterSet({'load.mass': Parameter(1.0, 'kg')})\n"
+        "    cases = {'quick': {}, 'hung': {'load.mass': 2.0}, 'never': {'load.mass': 3.0}}\n"
+        "    table = sweep(hung, rig, cases, progress=lambda line: print(line, flush=True))\n"
+        "    print(table['error'].tolist())\n",
+        encoding="utf-8",
+    )
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True, start_new_session=True) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == "1 of 3 cases\n"
+        os.killpg(run.pid, signal.SIGINT)
+        out, err = run.communicate(timeout=30)
+    assert (run.returncode, out, err) == (0, "['', 'interrupted', 'interrupted']\n", "")
+
+
+SYSTEMS = {
+    "force": ForceDrive(Asymmetric(LuGre())).system(),
+    "first order": FirstOrder(2).system(),
+    "second order": SecondOrder(1, Coulomb()).system(),
+    "integrator": Integrator().system(),
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_systems_travel(name: str, threads: Executor) -> None:
+    import pickle
+
+    system = SYSTEMS[name]
+    copy: System = pickle.loads(pickle.dumps(system))
+    assert (repr(copy), copy.start_finder) == (repr(system), system.start_finder)
+    x, u, p = (np.full(system.ode.size1_in(i), 0.3) for i in (1, 2, 3))
+    for ours, theirs in zip(copy.ode(0, x, u, p), system.ode(0, x, u, p), strict=True):
+        assert np.array_equal(np.array(ours), np.array(theirs))
+    assert repr(pickle.loads(pickle.dumps(discretise(system)))) == repr(discretise(system))
+
+
+def test_a_closed_loop_is_certified_elsewhere_with_the_same_figures(functions: ModuleType) -> None:
+    loop = ClosedLoop(ForceDrive(Coulomb()).system(), PID(sample_time=2e-3), Dither(frequency=50.0))
+    given = loop.parameters.with_values({"pid.Kp": 200.0, "pid.Ki": 2e4, "pid.lower": -300.0, "pid.upper": 300.0})
+    study, cases = partial(evaluate, loop, [Step(0.2, horizon=0.5)]), masses(4.0, 6.0)
+    here = evaluate(loop, [Step(0.2, horizon=0.5)], given.with_values(cases["6 kg"]))  # its caches are filled now
+    table = sweep(study, given, cases)
+    assert table["error"].tolist() == ["", ""]
+    there = table[list(here.index)].to_numpy(dtype=float)[1]
+    assert there == pytest.approx(here["0 to 0.2"].to_numpy(), rel=1e-9, nan_ok=True)
+    assert 0 < table["SettlingTime"].iloc[0] != table["SettlingTime"].iloc[1] > 0
