@@ -44,14 +44,14 @@ def main() -> None:
 
 
 def step_run(steps: tuple[tuple[float, float], ...], rng: np.random.Generator) -> dict[str, Array]:
-    """Speed of a drive whose valve voltage steps: 2.5 s at 500 Hz."""
+    """Speed of a drive whose valve voltage steps: 2.5 s at 1 kHz."""
     plant = po.SecondOrder(friction=po.Coulomb()).system()
-    t = np.round(np.arange(0, 2.5, 0.002), 6)
+    t = np.round(np.arange(0, 2.5, 0.001), 6)
     voltage = np.zeros_like(t)
     for at, level in steps:
         voltage[t >= at - 1e-9] = level
     values = truth("step_rig") | {"friction.viscous": 0.0, "friction.smoothing": 2e-3}
-    late = np.concatenate([np.zeros(round(values.pop("plant.dead_time") / 0.002)), voltage])[: len(t)]
+    late = np.concatenate([np.zeros(round(values.pop("plant.dead_time") / 0.001)), voltage])[: len(t)]
     run = po.simulate(plant, po.Trajectory(t, {"valve_voltage": late}), plant.parameters.with_values(values))
     noisy = run["speed"] + SPEED_NOISE * rng.standard_normal(len(t))
     return {"time [s]": t, "valve_voltage [V]": voltage, "speed [m/s]": quantised(noisy, SPEED_STEP)}

@@ -9,7 +9,7 @@ friction, Stribeck velocity, viscous friction, conductance and leak of the valve
 
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from claims import Claim, arguments, finish, frame
@@ -63,7 +63,8 @@ def generate(drive: PneumaticDrive, truth: po.ParameterSet, seed: int = SEED) ->
     u = np.zeros(1)
     solver = integrate.ode(lambda t, x: ode(t, x, u, p)[0])
     scale = np.array([q.nominal for q in system.states])
-    solver.set_integrator("lsoda", rtol=1e-10, atol=1e-12 * scale, nsteps=100_000)
+    tolerances: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12 * scale, "nsteps": 100_000}
+    solver.set_integrator("lsoda", **tolerances)
     x = np.array([START.get(n, 0.0) for n in state])
     rows, commands = [], []
     for k in range(-300, 10_000):

@@ -22,7 +22,6 @@ from pneuopt.trajectories import Trajectory
 Array = NDArray[np.float64]
 PRESSURES = ("pressure_a", "pressure_b")
 CONDUCTANCE, LEAK = "valve.conductance", "valve.leak"
-MOVING = 0.03  # of the largest pressure rate; quieter samples tell of leaks and noise only
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,7 @@ class PneumaticStarts:
     """
 
     system: Callable[[], System]
-    areas: Callable[[Mapping[str, Any]], tuple[float, float]]
+    areas: Callable[[Mapping[str, Any]], tuple[Any, Any]]
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates: one valve, friction for each of the Stribeck velocities tried."""
@@ -91,7 +90,7 @@ class _Rates:
     def pressures(
         self, measured: Trajectory, states: Mapping[str, Array], parameters: ParameterSet
     ) -> dict[str, Array]:
-        """Both pressures integrated along the logged motion, from between supply and ambient; ten Euler steps a sample."""
+        """Both pressures integrated along the logged motion, from half the supply; ten Euler steps a sample."""
         x = np.column_stack([states.get(n, np.zeros(len(measured))) for n in self._names])
         u, p = measured.matrix(names(self.system.inputs)), vector(self.system.parameters, parameters)
         rows = [self._names.index(n) for n in PRESSURES]
