@@ -72,7 +72,7 @@ class StickSlip:
         self._still = 10 * atols[self._speed]  # rounding must not end a motion that has just begun
         self._mode: int | None = None
         self._solver: integrate.OdeSolver
-        self._event = inf
+        self._event, self._edge = inf, 0.0
         self._dense: Callable[[float], Array] | None = None
         self._record = Record(system, grid, ("stuck",))
         self._events = list[Event]()
@@ -85,8 +85,11 @@ class StickSlip:
     def restart(self, t: float, x: Array, u: Array) -> None:
         """See `integration.Run`."""
         self._u = u
-        moving = int(np.sign(x[self._speed]))
-        self._begin(t - self._origin, x, moving or self._yields(t - self._origin, x))
+        if abs(x[self._speed]) > self._still:
+            self._begin(t - self._origin, x, int(np.sign(x[self._speed])))
+        else:
+            x = self._stopped(x)
+            self._begin(t - self._origin, x, self._yields(t - self._origin, x))
 
     def advance(self, t: float) -> Array:
         """See `integration.Run`."""
@@ -145,7 +148,7 @@ class StickSlip:
         t, x = self._solver.t, np.array(self._solver.y)
         self._solver.step()
         self._dense = None
-        if self._solver.status == "failed" or not np.isfinite(self._solver.y).all():
+        if self._solver.t <= t or not np.isfinite(self._solver.y).all():
             self._record.fail(self._origin + t, x if self._mode else self._stopped(x))
         self._event = inf if self._is_quiet() else _first_root(self._excess, self._solver.t_old, self._solver.t)
 

@@ -116,7 +116,7 @@ def test_a_mass_on_a_spring_with_dry_friction_loses_a_fixed_amount_a_half_swing(
     half = pi / sqrt(k / m)
     assert [e.t for e in run.events] == pytest.approx([half * i for i in range(n + 1)], abs=1e-8)
     assert [e.kind for e in run.events] == [BREAK_AWAY, *[REVERSAL] * (n - 1), STANDSTILL]
-    assert [e.direction for e in run.events] == [-1, *[1, -1] * (n // 2)][:n] + [0]
+    assert [e.direction for e in run.events] == [*((-1) ** (i + 1) for i in range(n)), 0]
     assert run.trajectory["position"][-1] == pytest.approx((-1) ** n * (y0 - 2 * n * Fc / k), abs=1e-9)
     assert run.trajectory["stuck"].tolist() == [0, 1]
 
@@ -172,7 +172,7 @@ def test_directions_and_pressures_raise_the_level() -> None:
 
 
 def test_work_in_is_kinetic_energy_and_heat_and_load() -> None:
-    """Every joule of the driving force is found again, to 1e-8 of it, over some 100 events."""
+    """Every joule of the driving force is found again, to 1e-8 of it, over some 60 events."""
     friction = Karnopp(Stribeck())
     plant = ForceDrive(friction, Load(spring=True)).system()
     energies = tuple(Quantity(n, "J", nominal=0.1) for n in ("work", "heat", "against_load"))
@@ -186,12 +186,12 @@ def test_work_in_is_kinetic_energy_and_heat_and_load() -> None:
         return {"position": rates[0], "speed": rates[1], **power}, {}
 
     system = define((*plant.states, *energies), plant.inputs, (), plant.parameters, rhs)  # type: ignore[arg-type]
-    t = np.linspace(0, 4, 4001)
+    t = np.linspace(0, 2.5, 2501)
     force = 60 * np.sin(2 * pi * 3 * t) + 80 * np.sin(2 * pi * 13 * t)
     p = given_values(plant, {"load.stiffness": 800.0, "load.force": 7.0, "load.mass": 1.5, **STRIBECK})
     result = simulate_stick_slip(system, Trajectory(t, {"force": force}), p)
     run = result.trajectory
-    assert len(result.events) > 80
+    assert len(result.events) > 50
     residual = run["work"] - run["heat"] - run["against_load"] - 0.5 * 1.5 * run["speed"] ** 2
     assert np.abs(residual).max() < 1e-8 * run["work"][-1]
     assert np.all(np.diff(run["heat"]) >= -1e-12)
@@ -256,10 +256,10 @@ def test_two_simulators_agree_on_a_sampled_loop() -> None:
     exact = simulate(loop, inputs, p)
     loop, p, inputs = speed_loop(Stribeck())
     differences = []
-    for width in (1e-4, 1e-5, 1e-6):
+    for width in (1e-4, 1e-6):
         run = simulate(loop, inputs, p.with_values({"friction.smoothing": width}))
         differences.append(np.abs(run["speed"] - exact["speed"]).max())
-    assert differences == pytest.approx([2.3e-4, 2.3e-5, 2.3e-6], rel=0.05)
+    assert differences == pytest.approx([2.3e-4, 2.3e-6], rel=0.05)
 
 
 def test_hundreds_of_events_a_second_are_quick() -> None:
@@ -316,6 +316,19 @@ def test_a_run_that_escapes_says_when_and_where() -> None:
     with pytest.raises(ConvergenceError, match=r"stopped after t = 0\.\d* s, where speed .* m/s") as caught:
         simulate(runaway, Trajectory([0.0, 0.2, 0.3, 1.0], {}), ParameterSet(), initial={"speed": 2.5})
     assert caught.value.solution["speed"][-1] == pytest.approx(10.0, rel=1e-7)
+
+
+def test_a_model_that_is_undefined_says_so() -> None:
+    states = (Quantity("speed", "m/s"), Quantity("level", "1"))
+    root = define(
+        states,
+        [],
+        [],
+        ParameterSet({DIRECTION: Parameter(0.0, "1")}),
+        lambda _t, x, _u, p: ({"speed": -p[DIRECTION], "level": -ca.sqrt(x["level"]) - 1}, {}),
+    )
+    with pytest.raises(ConvergenceError, match="not defined there"):
+        simulate(root, Trajectory([0.0, 0.5, 1.5], {}), ParameterSet(), initial={"level": 1.0})
 
 
 def test_a_plant_without_a_speed_is_refused() -> None:
