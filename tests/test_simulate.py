@@ -117,6 +117,15 @@ def test_instants_asked_for_are_those_of_the_same_run() -> None:
     assert few["speed"] == pytest.approx(many["speed"][np.searchsorted(many.t, t - 1e-9)], abs=1e-7)
 
 
+def test_instants_that_rounding_puts_beside_a_sample() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3))
+    t, fine = np.linspace(0, 0.1, 101), np.linspace(0, 0.1, 1001)
+    assert np.any((fine[::10] != t) & (np.abs(fine[::10] - t) < 1e-15))
+    inputs = Trajectory(t, {"reference": np.ones(101)})
+    run = simulate(loop, inputs, loop.parameters, t_out=fine)
+    assert run["speed"][::10] == pytest.approx(simulate(loop, inputs, loop.parameters)["speed"], abs=1e-9)
+
+
 def test_a_small_fast_sine_on_a_plant_at_rest_is_not_stepped_over() -> None:
     loop = ClosedLoop(FirstOrder().system(), PID(limits=False), Dither(frequency=160.0))
     p = loop.parameters.with_values({"pid.Kp": 0.0, "dither.amplitude": 1e-3})

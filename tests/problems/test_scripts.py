@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import b32
 import emps
 import pandas as pd
 import pytest
 import rig_demo
 import seal_friction
 import step_response
+import stick_slip
 import supply_and_load
 
 DATASETS = Path(__file__).parents[3] / "shared" / "datasets"
@@ -51,3 +53,16 @@ def test_supply_and_load(tmp_path: Path) -> None:
     assert failed(supply_and_load.main(job)) == []
     supply_and_load.figure(job).savefig(tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_b32() -> None:
+    assert failed(b32.main()) == []
+
+
+@pytest.mark.slow
+def test_stick_slip(tmp_path: Path) -> None:
+    job = stick_slip.run()
+    assert failed(stick_slip.main(job)) == []
+    stick_slip.figure(job).savefig(tmp_path / "runs.png")
+    assert (tmp_path / "runs.png").stat().st_size > 10_000
