@@ -88,7 +88,7 @@ class Actuator:
 
 @dataclass(frozen=True)
 class Encoder:
-    """A speed from a position's readings: difference over a sample, then a low-pass of first order.
+    """A speed from a position's readings: difference over a sample, then a low-pass of first order; it starts at zero.
 
     Parameters
     ----------

@@ -309,7 +309,7 @@ def _at_samples(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:
     rows, t, slack = held_inputs(model.inputs, inputs), inputs.t, 1e-9
     if isinstance(model, ClosedLoop):
         h = model.pid.sample_time or 0.0
-        slack = 1e-6 * h
+        slack = max(1e-6 * h, 4 * float(np.spacing(np.abs(t).max())))
         t = t[0] + h * np.arange(int((t[-1] - t[0] + slack) / h) + 1)
     rows = rows[np.searchsorted(inputs.t, t + slack, side="right") - 1]
     return Trajectory(t, dict(zip(names(model.inputs), rows.T, strict=True)))

@@ -137,6 +137,15 @@ def test_the_controller_knows_the_readings_only() -> None:
         assert log["force"][k] == pytest.approx(u, abs=1e-9)
 
 
+def test_a_log_may_begin_at_any_time() -> None:
+    loop, p = drive_loop(Karnopp(Stribeck()))
+    p, rig = p.with_values({"dither.amplitude": 0.0}), Rig(loop, REAL)
+    now = step(0.05, 0.2)
+    later = Trajectory(1.7e9 + now.t, dict(now.values))
+    runs = [record(rig, inputs, p, seed=1).truth["position"] for inputs in (now, later)]
+    assert runs[1] == pytest.approx(runs[0], abs=1e-6)
+
+
 def test_what_is_logged_and_what_is_true() -> None:
     run, p = logged_loop()
     assert run.experiment.name == "rig@7"
