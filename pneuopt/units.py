@@ -291,6 +291,7 @@ def _parsed(unit_text: str, where: str = "") -> _Scale:
 @cache
 def _scale(unit_text: str) -> _Scale:
     require(not re.search(r"\d{3}", unit_text), "a power this high would take for ever")
+    require("%%" not in unit_text.replace(" ", ""), "a percentage of a percentage is a slip of the finger")
     unit = _registry().parse_units(unit_text)
     zero, one = (_registry().Quantity(Fraction(k), unit).to_base_units() for k in range(2))
     # Base units, not the unit's dimensionality: an angle counts as a dimension here.

@@ -148,3 +148,9 @@ def test_writes_what_reads_well() -> None:
 def test_pint_stays_out_of_import_time() -> None:
     code = "import sys, pneuopt.units, pneuopt.experiments; assert not {'pint', 'pandas', 'casadi'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("text", ["2 %%", "2 % %"])
+def test_a_doubled_percent_sign_is_refused(text: str) -> None:
+    with pytest.raises(UnitError, match=r"unknown unit '% ?%'"):
+        read_value(text, "1")
