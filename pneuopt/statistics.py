@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 Array = NDArray[np.float64]
 
@@ -134,3 +134,91 @@ def correlation(covariance: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         deviation = np.sqrt(np.diag(covariance))
         return np.asarray(covariance / np.outer(deviation, deviation))
+
+
+def bayes_information(deviance: float, parameters: int, samples: float) -> float:
+    """``deviance + k ln n``: the lower, the better a model's fit for its number of parameters (Schwarz 1978).
+
+    Examples
+    --------
+    >>> round(bayes_information(100.0, 3, 1000.0), 2)
+    120.72
+    """
+    return deviance + parameters * math.log(max(samples, 1.0))
+
+
+def likelihood_ratio_p(drop: float, extra: int) -> float:
+    """Probability that `extra` idle parameters lower a deviance by `drop` or more: chi-square (Wilks 1938).
+
+    Examples
+    --------
+    >>> round(likelihood_ratio_p(3.841, 1), 3)
+    0.05
+    """
+    return float(chi2.sf(max(drop, 0.0), extra))
+
+
+def ljung_box(residuals: ArrayLike, lags: int = 20) -> tuple[float, float]:
+    """Whether residuals are white: Q = n (n + 2) sum of rho_k^2 / (n - k), chi-square with `lags` degrees of freedom.
+
+    Parameters
+    ----------
+    residuals : array_like, shape (n,)
+        NaN where a sample is missing; those are left out.
+    lags : int
+
+    Returns
+    -------
+    (float, float)
+        Q and the probability of so large a one if the residuals are white (Ljung, Box, Biometrika 65, 1978).
+
+    Examples
+    --------
+    >>> q, p = ljung_box(np.random.default_rng(0).standard_normal(500))
+    >>> p > 0.05, ljung_box(np.cumsum(np.ones(50)))[1] < 1e-6
+    (True, True)
+    """
+    e = np.asarray(residuals, dtype=float)
+    e = e[np.isfinite(e)]
+    e, n = e - e.mean(), e.size
+    if n <= lags + 1 or not np.any(e):
+        return math.nan, math.nan
+    k = np.arange(1, lags + 1)
+    rho = np.array([e[: n - j] @ e[j:] for j in k]) / (e @ e)
+    q = float(n * (n + 2) * np.sum(rho**2 / (n - k)))
+    return q, float(chi2.sf(q, lags))
+
+
+def cross_correlation(residuals: ArrayLike, command: ArrayLike, lags: int = 20) -> tuple[float, int]:
+    """How much of an input is left in the residuals: the largest correlation over the lags 0 to `lags`, and its lag.
+
+    Parameters
+    ----------
+    residuals, command : array_like, shape (n,)
+    lags : int
+        Of the input, in samples.
+
+    Returns
+    -------
+    (float, int)
+        In units of its own standard deviation if there is no relation, ``1 / sqrt(n)`` for white residuals: beyond
+        about 3 the model leaves out something that the input does.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> u = rng.standard_normal(1000)
+    >>> size, lag = cross_correlation(0.3 * np.roll(u, 4) + rng.standard_normal(1000), u)
+    >>> size > 5, lag
+    (True, 4)
+    """
+    e, u = np.asarray(residuals, dtype=float), np.asarray(command, dtype=float)
+    known = np.isfinite(e) & np.isfinite(u)
+    e, u = np.where(known, e - np.mean(e[known]), 0.0), np.where(known, u - np.mean(u[known]), 0.0)
+    spread = math.sqrt(float(e @ e) * float(u @ u))
+    if spread == 0:
+        return math.nan, 0
+    n = int(known.sum())
+    rho = np.array([e[k:] @ u[: len(u) - k] for k in range(min(lags, n - 2) + 1)]) / spread
+    lag = int(np.argmax(np.abs(rho)))
+    return float(abs(rho[lag]) * math.sqrt(n)), lag

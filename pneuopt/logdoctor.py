@@ -1,0 +1,181 @@
+"""`examine`: what is wrong with a log, from the log alone: units, signs, zero points, sampling, silence."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.experiments import Experiment
+from pneuopt.trajectories import Trajectory
+from pneuopt.units import ATMOSPHERE
+
+Array = NDArray[np.float64]
+BLOCKS = 20  # of a log, whose means tell motion from noise
+VACUUM = 0.3  # of the atmosphere: no pneumatic chamber is exhausted further
+RETURNS = 0.3  # of the path: a log that ends this near to its beginning does no net work on a load
+AGAINST = -0.2  # of the power's absolute value: what a brake would take, not a drive
+SLOPES = (0.8, 1.25)  # of a speed over its position's slope
+CLIPPED = 0.02  # share of the samples at exactly the largest value
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing about a log.
+
+    Attributes
+    ----------
+    channel : str
+    message : str
+        What is found, with figures, and the remedy.
+    fault : bool
+        The log cannot be used so; otherwise it is worth knowing.
+    """
+
+    channel: str
+    message: str
+    fault: bool
+
+
+def examine(experiment: Experiment) -> tuple[Finding, ...]:
+    """Look a log over, before any model is fitted to it.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Its noise, where given, tells motion from noise.
+
+    Returns
+    -------
+    tuple of Finding
+        Faults first: nothing moves; a channel is constant; position and speed disagree in sign or unit; the force, or
+        the pressures, brake the motion on balance, which no drive does; a pressure is a vacuum, or above the supply.
+        Then notes: jitter, a clipped sensor, a coarse resolution.
+
+    Examples
+    --------
+    >>> t = np.arange(2000) * 1e-3
+    >>> swing = {"position": 0.1 * np.sin(6 * t), "force": 5.0 * np.cos(6 * t)}
+    >>> examine(Experiment(Trajectory(t, swing)))
+    ()
+    >>> print(examine(Experiment(Trajectory(t, {**swing, "force": -swing["force"]})))[0].message)
+    the force brakes the motion on balance (-100 % of its power), which no drive does: change the sign of 'force'
+    """
+    log = experiment.trajectory
+    checks = (_silent(experiment), _contradicting(log), _braking(log), _pressures(experiment), _sampling(log))
+    found = [finding for check in checks for finding in check]
+    return tuple(sorted(found, key=lambda f: not f.fault))
+
+
+def _silent(experiment: Experiment) -> Iterator[Finding]:
+    """Channels without content."""
+    log = experiment.trajectory
+    for name in log:
+        y = log[name][np.isfinite(log[name])]
+        if y.size and not np.any(np.diff(y)) and name in ("position", "speed"):
+            yield Finding(name, f"{name!r} is constant: without motion a log tells nothing about friction", True)
+        elif name in ("position", "speed") and name in experiment.noise and y.size >= 2 * BLOCKS:
+            size = y.size // BLOCKS
+            means = y[: BLOCKS * size].reshape(BLOCKS, size).mean(axis=1)
+            noise = experiment.noise[name]
+            still = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
+            if still:
+                told = f"{name!r} shows its noise ({noise:.2g}) and no motion: log a run in which the drive moves"
+                yield Finding(name, told, True)
+
+
+def _contradicting(log: Trajectory) -> Iterator[Finding]:
+    """Position and speed that do not belong together."""
+    if "position" not in log or "speed" not in log:
+        return
+    slope, speed = _slope(log), log["speed"]
+    known = np.isfinite(slope) & np.isfinite(speed)
+    slope, speed = slope[known], speed[known]
+    power = math.sqrt(float(slope @ slope) * float(speed @ speed))
+    if power == 0 or abs(slope @ speed) < 0.7 * power:
+        return
+    ratio = float(speed @ slope) / float(slope @ slope)
+    if ratio < 0:
+        yield Finding("speed", "position and speed run against each other: change the sign of one", True)
+    elif not SLOPES[0] < ratio < SLOPES[1]:
+        yield Finding("speed", f"speed is {ratio:.3g} times the slope of the position: check both units", True)
+
+
+def _braking(log: Trajectory) -> Iterator[Finding]:
+    """Whatever drives has to do work against friction, once the load is back where it was."""
+    motion = log["speed"] if "speed" in log else _slope(log) if "position" in log else None
+    if motion is None:
+        return
+    drives = {"force": ("the force brakes", "'force'")}
+    if "pressure_a" in log and "pressure_b" in log:
+        drives["pressures"] = ("the pressures brake", "the position, or exchange pressure_a and pressure_b")
+    for name, (told, remedy) in drives.items():
+        if name == "force" and name not in log:
+            continue
+        push = log[name] if name == "force" else log["pressure_a"] - log["pressure_b"]
+        share = _work_share(log.t, push, motion, centred=name != "force")
+        if share < AGAINST:
+            why = f"{told} the motion on balance ({100 * share:.0f} % of its power), which no drive does"
+            yield Finding(name, f"{why}: change the sign of {remedy}", True)
+
+
+def _work_share(t: Array, push: Array, motion: Array, *, centred: bool) -> float:
+    """Work over the integral of the power's absolute value; NaN where the log does not return to its beginning."""
+    known = np.isfinite(push) & np.isfinite(motion)
+    if known.sum() < 10:
+        return math.nan
+    t, push, motion = t[known], push[known], motion[known]
+    path = float(np.trapezoid(np.abs(motion), t))
+    if path == 0 or abs(float(np.trapezoid(motion, t))) > RETURNS * path:
+        return math.nan
+    power = (push - push.mean() if centred else push) * motion
+    total = float(np.trapezoid(np.abs(power), t))
+    return float(np.trapezoid(power, t)) / total if total > 0 else math.nan
+
+
+def _pressures(experiment: Experiment) -> Iterator[Finding]:
+    """Zero points: gauge taken for absolute, or the reverse."""
+    log = experiment.trajectory
+    supply = experiment.conditions.get("supply.pressure")
+    if supply is None and "supply_pressure" in log:
+        supply = float(np.nanmedian(log["supply_pressure"]))
+    for name in ("pressure_a", "pressure_b", "supply_pressure"):
+        if name not in log:
+            continue
+        low, high = (float(np.nanpercentile(log[name], q)) for q in (1, 99))
+        if low < VACUUM * ATMOSPHERE:
+            told = f"{name!r} falls to {low / 1e5:.2f} bar(a), a vacuum; a gauge sensor's unit is written bar(g)"
+            yield Finding(name, told, True)
+        elif supply is not None and high > 1.1 * supply and name != "supply_pressure":
+            told = f"{name!r} rises to {high / 1e5:.2f} bar(a), above the supply of {supply / 1e5:.2f} bar(a)"
+            yield Finding(name, f"{told}; is an absolute sensor read as bar(g)?", True)
+
+
+def _sampling(log: Trajectory) -> Iterator[Finding]:
+    """What blurs a log."""
+    steps = np.diff(log.t)
+    usual = float(np.median(steps))
+    jitter = float(np.median(np.abs(steps - usual))) * 1.4826
+    if jitter > 0.05 * usual:
+        yield Finding("time", f"the samples jitter by {jitter / usual:.0%} of {usual:g} s; their times are used", False)
+    for name in log:
+        y = log[name][np.isfinite(log[name])]
+        levels = np.unique(y).size
+        for end, which in ((y.max(initial=-np.inf), "largest"), (y.min(initial=np.inf), "smallest")):
+            share = float(np.mean(y == end)) if y.size else 0.0
+            if name.startswith("pressure") and levels > 50 and share > CLIPPED:
+                told = f"{share:.0%} of the samples of {name!r} have exactly its {which} value: is the sensor clipped?"
+                yield Finding(name, told, False)
+        if name in ("position", "speed") and 2 < levels < min(50, y.size // 4):
+            told = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
+            yield Finding(name, told, False)
+
+
+def _slope(log: Trajectory) -> Array:
+    """Speed from the position over a window of a hundredth of the log, at least five samples."""
+    half = max(2, len(log) // 200)
+    t, y = log.t, log["position"]
+    slope = np.full(len(t), np.nan)
+    slope[half:-half] = (y[2 * half :] - y[: -2 * half]) / (t[2 * half :] - t[: -2 * half])
+    return slope

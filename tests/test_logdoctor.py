@@ -1,0 +1,111 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pneuopt.experiments import Experiment, read_log
+from pneuopt.logdoctor import examine
+from pneuopt.trajectories import Array, Trajectory
+
+DATA = Path(__file__).parents[1] / "data"
+T = np.arange(4000) * 1e-3
+
+
+def swing(**changed: Array) -> Experiment:
+    """A drive under friction going to and fro: pressures and force do work."""
+    rng = np.random.default_rng(0)
+    v = 0.3 * np.cos(2 * np.pi * T)
+    push = 30 * np.sign(v) + 60 * v - 5 * np.sin(2 * np.pi * T)
+    columns = {
+        "position": 0.1 + 0.3 / (2 * np.pi) * np.sin(2 * np.pi * T) + 1e-5 * rng.standard_normal(T.size),
+        "speed": v + 1e-3 * rng.standard_normal(T.size),
+        "force": push,
+        "pressure_a": 5e5 + 5e2 * push + 1e3 * rng.standard_normal(T.size),
+        "pressure_b": 4.5e5 - 5e2 * push + 1e3 * rng.standard_normal(T.size),
+    }
+    return Experiment(Trajectory(T, {**columns, **changed}), {"position": 1e-5, "speed": 1e-3}, name="swing")
+
+
+def faults(experiment: Experiment) -> list[str]:
+    return [f.message for f in examine(experiment) if f.fault]
+
+
+def test_a_sound_log_has_no_findings() -> None:
+    assert examine(swing()) == ()
+
+
+@pytest.mark.parametrize("path", sorted(DATA.glob("*/*.csv")), ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_the_example_logs_have_no_faults(path: Path) -> None:
+    assert faults(read_log(path)) == []
+
+
+@pytest.mark.parametrize("channel", ["position", "speed"])
+def test_a_wrong_sign_is_seen_between_position_and_speed(channel: str) -> None:
+    told = faults(swing(**{channel: -swing().trajectory[channel]}))
+    assert any("run against each other" in message for message in told)
+
+
+def test_a_wrong_sign_of_the_force_is_seen_in_its_work() -> None:
+    log = swing(force=-swing().trajectory["force"])
+    told = faults(replace(log, trajectory=log.trajectory.select(["position", "force"]), noise={}))
+    assert len(told) == 1
+    assert "brakes the motion on balance" in told[0]
+    assert "change the sign of 'force'" in told[0]
+
+
+def test_exchanged_pressures_are_seen_in_their_work() -> None:
+    log = swing().trajectory
+    told = faults(swing(pressure_a=log["pressure_b"], pressure_b=log["pressure_a"]))
+    assert len(told) == 1
+    assert "exchange pressure_a and pressure_b" in told[0]
+
+
+def test_a_load_that_is_only_lowered_may_be_braked() -> None:
+    down = {"position": 0.5 - 0.1 * T, "force": np.full(T.size, 50.0)}
+    assert faults(Experiment(Trajectory(T, down))) == []
+
+
+def test_units_of_position_and_speed_must_agree() -> None:
+    told = faults(swing(speed=1e3 * swing().trajectory["speed"]))
+    assert any("times the slope of the position: check both units" in message for message in told)
+
+
+def test_gauge_read_as_absolute_is_a_vacuum() -> None:
+    told = faults(swing(pressure_b=swing().trajectory["pressure_b"] - 4.3e5))
+    assert len(told) == 1
+    assert "'pressure_b' falls to" in told[0]
+    assert "bar(g)" in told[0]
+
+
+def test_absolute_read_as_gauge_exceeds_the_supply() -> None:
+    told = faults(swing().with_conditions({"supply.pressure": 4.2e5}))
+    assert any("above the supply of 4.20 bar(a)" in message for message in told)
+
+
+@pytest.mark.parametrize("motion", ["constant", "noise"])
+def test_a_log_without_motion_is_refused(motion: str) -> None:
+    still = np.full(T.size, 0.1) + (1e-5 * np.random.default_rng(2).standard_normal(T.size) if motion == "noise" else 0)
+    log = Experiment(Trajectory(T, {"position": still, "force": np.sin(T)}), {"position": 1e-5})
+    told = faults(log)
+    assert len(told) == 1
+    assert "motion" in told[0]
+
+
+def test_slow_creep_is_motion() -> None:
+    rng = np.random.default_rng(3)
+    creep = 5e-5 * T / T[-1] + 1e-5 * rng.standard_normal(T.size)
+    assert faults(Experiment(Trajectory(T, {"position": creep, "force": np.sin(T)}), {"position": 1e-5})) == []
+
+
+def test_what_blurs_is_noted_and_no_fault() -> None:
+    rng = np.random.default_rng(4)
+    log = swing().trajectory
+    jittering = Trajectory(T + 2e-4 * rng.uniform(-1, 1, T.size), log.values)
+    notes = [f.message for f in examine(Experiment(jittering))]
+    assert len(notes) == 1
+    assert "jitter" in notes[0]
+    clipped = swing(pressure_a=np.minimum(log["pressure_a"], 5.15e5))
+    assert ["clipped" in f.message and not f.fault for f in examine(clipped)] == [True]
+    coarse = swing(position=np.round(log["position"] / 5e-3) * 5e-3)
+    assert ["levels" in f.message for f in examine(coarse)] == [True]
