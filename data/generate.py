@@ -1,10 +1,12 @@
 """Make the example logs of this folder: `python data/generate.py`. They are generated, not measured.
 
-Truth is integrated by `pneuopt.simulate` (LSODA, 1e-8); a delay is exact, the sensors add noise and are quantised.
+Truth is integrated by `pneuopt.simulate` (LSODA, 1e-8), or by `pneuopt.record`, event by event; a delay is exact, the
+sensors add noise and are quantised.
 """
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +31,20 @@ FORCE_RUNS = {
 }
 POSITION_NOISE, POSITION_STEP, FORCE_STEP = 5e-6, 1e-5, 1e-3  # [m], [m], [N]
 
+SPEED_LOOP = {"pid.Kp": 1.5, "pid.Ki": 25.0, "pid.lower": -5.0, "pid.upper": 5.0}
+PNEUMATIC_RUNS = {  # (speed [m/s], for [s])
+    "run_01": (
+        *((0.25, 0.4), (-0.25, 0.4), (0.1, 0.5), (-0.1, 0.5), (0.5, 0.25), (-0.5, 0.25), (0.03, 0.9), (-0.03, 0.9)),
+        *((0.15, 0.4), (-0.3, 0.2), (0.2, 0.3), (-0.15, 0.4), (0.05, 0.6)),
+    ),
+    "run_02": ((0.2, 0.5), (-0.2, 0.5), (0.05, 0.8), (-0.08, 0.8), (0.4, 0.3), (-0.35, 0.3), (0.12, 0.8)),
+}
+COMMAND_STEP = 1e-4  # [V], of the log
 
-def truth(rig: str) -> dict[str, float]:
-    """The generating values of a rig [SI], by parameter."""
-    return dict(tomllib.loads((HERE / rig / "truth.toml").read_text(encoding="utf-8")))
+
+def truth(rig: str) -> dict[str, Any]:
+    """The generating values of a rig [SI], by parameter; and its table [rig], if it has one."""
+    return tomllib.loads((HERE / rig / "truth.toml").read_text(encoding="utf-8"))
 
 
 def main() -> None:
@@ -41,6 +53,8 @@ def main() -> None:
         write(HERE / "step_rig" / f"{name}.csv", step_run(steps, rng))
     for name, levels in FORCE_RUNS.items():
         write(HERE / "force_rig" / f"{name}.csv", force_run(levels, rng))
+    for seed, (name, speeds) in enumerate(PNEUMATIC_RUNS.items(), SEED):
+        write(HERE / "pneumatic_rig" / f"{name}.csv", pneumatic_run(speeds, seed))
 
 
 def step_run(steps: tuple[tuple[float, float], ...], rng: np.random.Generator) -> dict[str, Array]:
@@ -72,6 +86,35 @@ def force_run(levels: tuple[float, ...], rng: np.random.Generator) -> dict[str, 
     noisy = run["position"] + POSITION_NOISE * rng.standard_normal(len(t))
     columns = {"time [s]": t, "force [N]": quantised(run["control"], FORCE_STEP)}
     return {**columns, "position [mm]": quantised(noisy * 1e3, POSITION_STEP * 1e3)}
+
+
+def pneumatic_run(speeds: tuple[tuple[float, float], ...], seed: int) -> dict[str, Array]:
+    """A cylinder under a hand-tuned speed loop that hunts: 4 to 6 s at 1 kHz, by the rig model."""
+    values = truth("pneumatic_rig")
+    said = values.pop("rig")
+    known = po.read_drive(HERE / "pneumatic_rig" / "drive.toml")[1]
+    drive = po.PneumaticDrive(friction=po.Karnopp(po.Stribeck()))
+    loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3))
+    given = {n: known.value(n) for n in drive.parameters if n in known} | values
+    reference = np.concatenate([np.full(round(1000 * seconds), speed) for speed, seconds in speeds])
+    t = np.round(np.arange(len(reference)) * 1e-3, 6)
+    rig = po.Rig(
+        loop, sensors(said), po.Actuator(said["valve_hysteresis"]), po.Encoder(filter_time=said["speed_filter"])
+    )
+    p = loop.parameters.with_values(given | SPEED_LOOP)
+    run = po.record(rig, po.Trajectory(t, {"reference": reference}), p, seed=seed).experiment.trajectory
+    columns = {"time [s]": t, "speed_reference [m/s]": reference}
+    columns |= {"valve_voltage [V]": quantised(run["valve_voltage"], COMMAND_STEP)}
+    columns |= {"position [mm]": quantised(run["position"] * 1e3, said["position_resolution"] * 1e3)}
+    step = said["pressure_resolution"] * 1e-5
+    return columns | {f"pressure_{side} [bar(a)]": quantised(run[f"pressure_{side}"] * 1e-5, step) for side in "ab"}
+
+
+def sensors(said: dict[str, float]) -> dict[str, po.Sensor]:
+    """Of the pneumatic rig: an encoder and two pressure sensors."""
+    pressure = po.Sensor(said["pressure_lag"], said["pressure_noise"], said["pressure_resolution"])
+    position = po.Sensor(resolution=said["position_resolution"])
+    return {"position": position, "pressure_a": pressure, "pressure_b": pressure}
 
 
 def quantised(values: Array, step: float) -> Array:

@@ -1,12 +1,14 @@
 """Types of the names that `__init__.py` loads lazily."""
 
+from pneuopt.certify import evaluate, respond
+from pneuopt.control.averaging import averaged, mean_start, ripple
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import margins
 from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError, PneuoptError
+from pneuopt.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from pneuopt.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.files import read_drive, write_fit
 from pneuopt.identify import IdentificationResult, identify, predict, validate
@@ -14,7 +16,15 @@ from pneuopt.instruments import Actuator, Encoder, Sensor
 from pneuopt.models.chamber import Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive
-from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.friction import (
+    Asymmetric,
+    Coulomb,
+    LuGre,
+    PressureDependent,
+    Stribeck,
+    Viscous,
+    friction_ladder,
+)
 from pneuopt.models.gas import IsentropicNozzle, Iso6358
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
@@ -27,11 +37,12 @@ from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.plotting import plot_bode, plot_fit, plot_friction, plot_map, plot_prediction, plot_steps, save_figure
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
 from pneuopt.rig import Rig, record
-from pneuopt.simulate import simulate, simulate_stick_slip
+from pneuopt.selection import ModelSelection, select_model
+from pneuopt.simulate import contacts, simulate, simulate_stick_slip
 from pneuopt.study import grid, sweep
 from pneuopt.system import DiscreteSystem, System, define, discretise
 from pneuopt.trajectories import Trajectory
-from pneuopt.tune import TuningResult, evaluate, respond, tune
+from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuningfile import read_tuning, write_tuned
@@ -62,11 +73,13 @@ __all__ = [
     "Load",
     "LuGre",
     "MaxSensitivity",
+    "ModelSelection",
     "MotionDrive",
     "Overshoot",
     "Parameter",
     "ParameterSet",
     "PeakControl",
+    "PhysicsWarning",
     "PneumaticDrive",
     "PneuoptError",
     "Polytropic",
@@ -88,13 +101,17 @@ __all__ = [
     "TuningResult",
     "TwoPhase",
     "Viscous",
+    "averaged",
+    "contacts",
     "define",
     "differentiate",
     "discretise",
     "evaluate",
+    "friction_ladder",
     "grid",
     "identify",
     "margins",
+    "mean_start",
     "plot_bode",
     "plot_fit",
     "plot_friction",
@@ -108,7 +125,9 @@ __all__ = [
     "record",
     "resample",
     "respond",
+    "ripple",
     "save_figure",
+    "select_model",
     "simulate",
     "simulate_stick_slip",
     "split",

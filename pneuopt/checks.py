@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from pneuopt.errors import LogError, ModelError, check_known, require
+from pneuopt.errors import InputError, LogError, ModelError, check_known, require
 from pneuopt.experiments import Experiment
+from pneuopt.logdoctor import Finding, examine
 from pneuopt.parameters import ParameterSet
 from pneuopt.statistics import noise_level
-from pneuopt.system import System, names
+from pneuopt.system import DIRECTION, System, names
 
 REFERENCES = ("speed_reference", "position_reference")  # a loop's set-points may stay in a log; no plant reads them
 LONGEST_PAUSE = 50  # usual steps without a sample; the inputs in between are unknown
@@ -20,6 +21,7 @@ def check_logs(system: System, experiments: Sequence[Experiment], parameters: Pa
     """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
     require(len(experiments) > 0, "no experiments: give at least one log", LogError)
     check_known("parameter", parameters, system.parameters)
+    system.check(parameters)
     known = {*names(system.inputs), *names(system.outputs), *REFERENCES}
     taken: set[str] = set()
     out = []
@@ -28,7 +30,7 @@ def check_logs(system: System, experiments: Sequence[Experiment], parameters: Pa
         name = name if name not in taken else f"{name} ({number})"
         taken.add(name)
         _check_channels(system, experiment, name, known)
-        check_known("parameter", experiment.conditions, system.parameters, f"{name}: condition")
+        _check_conditions(system, experiment, parameters, name)
         out.append(replace(experiment, name=name))
     return _with_noise(system, out)
 
@@ -41,6 +43,36 @@ def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> N
         known = all(name in e.conditions for e in experiments)
         message = f"{name} is free, but every log's conditions give its value; fix it, or drop the condition"
         require(not known, message, ModelError)
+
+
+def check_content(experiments: Sequence[Experiment]) -> None:
+    """Refuse logs that most of them show to be wrong or silent; a window of a good log may well stand still."""
+    found: dict[str, dict[str, Finding]] = {}
+    for experiment in experiments:
+        for finding in examine(experiment):
+            if finding.fault:
+                found.setdefault(finding.channel, {})[experiment.name] = finding
+    for faults in found.values():
+        name, fault = next(iter(faults.items()))
+        require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}", LogError)
+
+
+def check_smooth(system: System) -> None:
+    """Refuse Karnopp's friction where derivatives are taken: without its events a search sees no dry friction."""
+    message = (
+        "the plant has Karnopp's friction (friction.direction), which only a simulation switches; search on the smooth "
+        "model, Coulomb() or Stribeck(), and prove the result on this one with simulate, evaluate or record"
+    )
+    require(DIRECTION not in system.parameters, message, ModelError)
+
+
+def _check_conditions(system: System, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
+    """The hardware as it is in this log."""
+    check_known("parameter", experiment.conditions, system.parameters, f"{name}: condition")
+    try:
+        system.check((system.parameters | parameters).with_values(experiment.conditions))
+    except InputError as error:
+        raise InputError(f"{name}: condition {error}") from None
 
 
 def _check_channels(system: System, experiment: Experiment, name: str, known: set[str]) -> None:

@@ -5,6 +5,7 @@ interrupted. Whatever is heavy is imported by the command that needs it, so that
 """
 
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from pneuopt.errors import ConvergenceError, InputError, require
+from pneuopt.errors import ConvergenceError, InputError, PhysicsWarning, require
 
 NOT_GOOD, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -140,7 +141,7 @@ def info() -> None:
     import platform
     from importlib.metadata import version
 
-    from pneuopt.codegen import cache_directory, compiler
+    from pneuopt.compiler import cache_directory, compiler
     from pneuopt.console import screen, show_pairs
 
     packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
@@ -156,9 +157,15 @@ def info() -> None:
 
 @contextmanager
 def _guarded() -> Iterator[None]:
-    """Turn what a user can mend into one message and an exit status."""
+    """Turn what a user can mend into one message and an exit status, and a warning of the physics into one line."""
     try:
-        yield
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", PhysicsWarning)
+            try:
+                yield
+            finally:
+                for line in dict.fromkeys(f"warning: {warning.message}" for warning in told):
+                    typer.echo(line, err=True)
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(BAD_INPUT) from None

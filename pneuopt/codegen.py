@@ -1,20 +1,14 @@
 """CasADi Functions as cached machine code; the CasADi VM where there is no compiler. Both give the same answers.
 
-`compiled` makes one Function callable; `Rollout` runs a sampled system over many segments at once, with forward
-sensitivities. Binaries are cached by content (source, flags, compiler, CPU); logs, values and step sizes are arguments,
-so one binary serves every log and every continuation step.
+`compiled` makes one Function callable; `Rollout` runs a sampled system over many segments at once, each in a SIMD
+lane, with forward sensitivities. Binaries are cached by content (source, flags, compiler, CPU); logs, values and step
+sizes are arguments, so one binary serves every log and every continuation step.
 """
 
 import ctypes
 import functools
-import hashlib
 import itertools
-import logging
 import os
-import platform
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,13 +18,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.compiler import build, say_once
+from pneuopt.emission import Kernel, emit
 from pneuopt.errors import ModelError, require
+from pneuopt.runge_kutta import rk4
 
 Array = NDArray[np.float64]
-DRIVER = Path(__file__).with_suffix(".c")
-FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
-COMPILE_SECONDS = 300
-log = logging.getLogger("pneuopt")
+HERE = Path(__file__).parent
+SAMPLED = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often the inputs of a piece change: see `emission.RATES`
+RESULTS = {"step": ("x_next", "S_next"), "output": ("y", "dy"), "update": ("x_next", "S_next")}
+STEPPED = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +40,13 @@ class Pieces:
         ``(t, h, x, u, p) -> (x_next, y)``.
     update : casadi.Function or None
         ``(t, x, u, p) -> x``.
+    ode : casadi.Function or None
+        ``(t, x, u, p) -> (xdot, y)``, of which `step` is the RK4 step: its sensitivities are cheaper stage by stage.
     """
 
     step: ca.Function
     update: ca.Function | None = None
+    ode: ca.Function | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,19 +84,34 @@ class Rollout:
         Whether sensitivities to the start state are wanted.
     threads : int, optional
         Default: one a processor.
+    lanes : int, optional
+        Segments that one processor runs at once, a power of 2. Default: as many as the CPU has SIMD lanes, or one where
+        the compiler knows no vectors; 0: the CasADi VM.
+
+    Attributes
+    ----------
+    lanes : int
+        As they are; 0 where the CasADi VM runs.
     """
 
     def __init__(
-        self, pieces: Pieces, wrt: Sequence[int] = (), start: bool = False, threads: int | None = None
+        self,
+        pieces: Pieces,
+        wrt: Sequence[int] = (),
+        start: bool = False,
+        threads: int | None = None,
+        lanes: int | None = None,
     ) -> None:
-        self._functions = _with_sensitivities(pieces, tuple(wrt), start)
+        self._functions, source = _prepared(*map(_content, (pieces.step, pieces.update, pieces.ode)), tuple(wrt), start)
         step = self._functions["step"]
         self.n_states, self.n_inputs, self.n_parameters = (step.size1_in(i) for i in (2, 3, 4))
         self.n_outputs = self._functions["output"].size1_out(0)
         self.n_columns = len(tuple(wrt)) + (self.n_states if start else 0)
         self._starts = self.n_states if start else 0
         self._threads = threads or os.cpu_count() or 1
-        self._library = _build(_rollout_source(self._functions, self._sizes()))
+        choices = ("SIMD", "LANES=1") if lanes is None else (f"LANES={lanes}",)
+        self._library = build(source, *choices) if source and lanes != 0 else None
+        self.lanes = 0 if self._library is None else ctypes.c_int.in_dll(self._library, "rollout_lanes").value
 
     @property
     def is_compiled(self) -> bool:
@@ -145,12 +160,6 @@ class Rollout:
         run = self._run_compiled if self._library is not None else self._run_vm
         return run(x0, u, p, t, h, substeps, states)
 
-    def _sizes(self) -> dict[str, int]:
-        work = max(f.sz_w() for f in self._functions.values())
-        sizes = {"NX": self.n_states, "NU": self.n_inputs, "NP": self.n_parameters, "NY": self.n_outputs}
-        has_update = int("update" in self._functions)
-        return sizes | {"NS": self.n_columns, "STARTS": self._starts, "WORK": work, "HAS_UPDATE": has_update}
-
     def _run_compiled(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
@@ -162,8 +171,9 @@ class Rollout:
         function = self._library.rollout
         function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int, ctypes.c_longlong] + [ctypes.c_void_p] * 10
         function.restype = None
-        parts = max(1, min(self._threads, m))
-        edges = [m * i // parts for i in range(parts + 1)]
+        blocks = -(-m // self.lanes)
+        parts = max(1, min(self._threads, blocks))
+        edges = [min(m, blocks * i // parts * self.lanes) for i in range(parts + 1)]
         calls = [(a, b, n, substeps, stride, *pointers) for a, b in itertools.pairwise(edges)]
         if len(calls) == 1:
             function(*calls[0])
@@ -173,28 +183,29 @@ class Rollout:
 
     def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
-        update, step, output = (_mapped(self._functions.get(k), m) for k in ("update", "step", "output"))
+        update, step, output = (f and f.map(m) for f in map(self._functions.get, ("update", "step", "output")))
         assert step is not None
         assert output is not None
-        pm = np.broadcast_to(p, (m, self.n_parameters)).T
-        x, S = x0.T, np.tile(np.eye(nx, ns) if self._starts else np.zeros((nx, ns)), (1, m))
+        numbers = ca.DM(np.broadcast_to(p, (m, self.n_parameters)).T)
+        x, S = ca.DM(x0.T), ca.DM(np.tile(np.eye(nx, ns) if self._starts else np.zeros((nx, ns)), (1, m)))
         xs, ys, dys = [], [], []
         for j in range(n):
-            tj, hj, uj = t[:, j], h[:, j] / substeps, u[:, j].T
+            tj, hj, uj = (ca.DM(np.atleast_2d(a)) for a in (t[:, j], h[:, j] / substeps, u[:, j].T))
             xs.append(x)
             if update is not None:
-                x, S = update(tj, x, uj, pm, S)
-            y, dy = output(tj, x, uj, pm, S)
+                x, S = update(tj, x, uj, numbers, S)
+            y, dy = output(tj, x, uj, numbers, S)
             ys.append(y)
             dys.append(dy)
             for k in range(substeps):
-                x, S = step(tj + k * hj, hj, x, uj, pm, S)
-        run_y = np.stack([a.T for a in ys], axis=1) if ny else np.empty((m, n, 0))
-        run_x = np.stack([a.T for a in xs], axis=1) if states else None
+                x, S = step(tj + k * hj, hj, x, uj, numbers, S)
+        run_y = np.stack([np.array(a).T for a in ys], axis=1) if ny else np.empty((m, n, 0))
+        run_x = np.stack([np.array(a).T for a in xs], axis=1) if states else None
+        x_end = np.array(x).T.copy()
         if not ns:
-            return Run(run_y, np.ascontiguousarray(x.T), run_x)
+            return Run(run_y, x_end, run_x)
         run_dy = np.stack([_unstacked(a, ny, m, ns) for a in dys], axis=1)
-        return Run(run_y, np.ascontiguousarray(x.T), run_x, run_dy, _unstacked(S, nx, m, ns))
+        return Run(run_y, x_end, run_x, run_dy, _unstacked(S, nx, m, ns))
 
 
 def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
@@ -212,7 +223,7 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     """
     function = _dense(function, "system_function")
     shapes = [function.size_out(i) for i in range(function.n_out())]
-    library = _build(_source({"f": function}))
+    library = build(_casadi_source(function))
     if library is None:
         return lambda *inputs: tuple(map(_shaped, map(np.array, function.call(list(inputs))), shapes))
     buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
@@ -238,31 +249,10 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     return evaluate
 
 
-def compiler() -> str | None:
-    """Path of the C compiler that is used: ``$PNEUOPT_CC``, ``$CC``, gcc, clang, cc; None if none is found."""
-    chosen = os.environ.get("PNEUOPT_CC", os.environ.get("CC"))
-    if chosen is not None:
-        return shutil.which(chosen) if chosen else None
-    return next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
-
-
-def cache_directory() -> Path:
-    """Where binaries are kept: ``$PNEUOPT_CACHE`` or the platform's cache folder; a temporary one if unwritable."""
-    home = Path.home() / ("AppData/Local" if os.name == "nt" else ".cache")
-    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME") or home
-    folder = Path(os.environ.get("PNEUOPT_CACHE") or Path(base) / "pneuopt")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError as error:
-        return _temporary_folder(f"{folder}: {error.strerror or error}")
-
-
-@functools.cache
-def _temporary_folder(reason: str) -> Path:
-    log.warning("the cache of compiled models cannot be written (%s): compiling anew in each run", reason)
-    return Path(tempfile.mkdtemp(prefix="pneuopt-"))
+def _casadi_source(function: ca.Function) -> str:
+    generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
+    generator.add(function)
+    return str(generator.dump())
 
 
 @functools.cache
@@ -270,32 +260,52 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="pneuopt")
 
 
+def _content(function: ca.Function | None) -> str | None:
+    return None if function is None else str(function.serialize())
+
+
+@functools.lru_cache(maxsize=64)
+def _prepared(
+    step: str, update: str | None, ode: str | None, wrt: tuple[int, ...], start: bool
+) -> tuple[dict[str, ca.Function], str]:
+    """The pieces with sensitivities, and their C; by content, for the same system is run again and again."""
+    others = [None if text is None else ca.Function.deserialize(text) for text in (update, ode)]
+    functions = _with_sensitivities(Pieces(ca.Function.deserialize(step), *others), wrt, start)
+    try:
+        return functions, _source(functions, len(wrt), start)
+    except NotImplementedError as missing:
+        say_once(f"no C for {missing}: this model runs in the CasADi VM, about ten times slower")
+        return functions, ""
+
+
 def _with_sensitivities(pieces: Pieces, wrt: tuple[int, ...], start: bool) -> dict[str, ca.Function]:
     """Each piece with S = dx/d(columns) carried along: (..., x, u, p, S) -> (value, its sensitivity)."""
-    sx = {k: ca.SX.sym(k, pieces.step.size1_in(i)) for i, k in enumerate(("t", "h", "x", "u", "p"))}
-    t, h, x, u, p = sx.values()
-    ns = len(wrt) + (x.numel() if start else 0)
-    S = ca.SX.sym("S", x.numel(), ns)
-    dp = ca.SX(p.numel(), ns)
-    for column, position in enumerate(wrt, ns - len(wrt)):
-        dp[position, column] = 1
+    t, h, x, u, p = (ca.SX.sym(k, pieces.step.size1_in(i)) for i, k in enumerate(("t", "h", "x", "u", "p")))
+    S = ca.SX.sym("S", x.numel(), len(wrt) + (x.numel() if start else 0))
 
-    def carried(name: str, arguments: list[ca.SX], value: ca.SX) -> ca.Function:
-        directions = [_directional(value, x, p, S[:, c], dp[:, c]) for c in range(ns)]
-        sensitivity = ca.horzcat(*directions) if ns else ca.SX(value.numel(), 0)
+    def moved(value: ca.SX) -> ca.SX:
+        """The value's sensitivity: its Jacobian first, which is cheaper than each column through every operation."""
+        fixed = ca.SX(value.numel(), S.size2() - len(wrt))
+        return ca.mtimes(ca.jacobian(value, x), S) + ca.horzcat(fixed, ca.jacobian(value, p)[:, list(wrt)])
+
+    def carried(name: str, arguments: list[ca.SX], value: ca.SX, sensitivity: ca.SX) -> ca.Function:
         # a bare "step" would be bound to the C library's own
-        inputs, outputs = [*arguments, x, u, p, S], [ca.densify(value), ca.densify(sensitivity)]
-        return ca.Function(f"system_{name}", inputs, outputs, {"cse": True})
+        outputs = [ca.densify(value), ca.densify(sensitivity)]
+        return ca.Function(f"system_{name}", [*arguments, x, u, p, S], outputs, {"cse": True})
 
     x_next, y = pieces.step(t, h, x, u, p)
-    functions = {"step": carried("step", [t, h], x_next), "output": carried("output", [t], y)}
+    S_next = moved(x_next)
+    if pieces.ode is not None:
+        rate = ca.Function(
+            "rate", [t, x, u, p, S], [ca.horzcat(*(f(pieces.ode(t, x, u, p)[0]) for f in (ca.densify, moved)))]
+        )
+        both = rk4(lambda at, z: rate(at, z[:, 0], u, p, z[:, 1:]), t, h, ca.horzcat(x, S))
+        x_next, S_next = both[:, 0], both[:, 1:]
+    functions = {"step": carried("step", [t, h], x_next, S_next), "output": carried("output", [t], y, moved(y))}
     if pieces.update is not None:
-        functions["update"] = carried("update", [t], pieces.update(t, x, u, p))
+        after = pieces.update(t, x, u, p)
+        functions["update"] = carried("update", [t], after, moved(after))
     return functions
-
-
-def _directional(value: ca.SX, x: ca.SX, p: ca.SX, dx: ca.SX, dp: ca.SX) -> ca.SX:
-    return ca.jtimes(value, ca.vertcat(x, p), ca.vertcat(dx, dp))
 
 
 def _dense(function: ca.Function, name: str) -> ca.Function:
@@ -304,86 +314,30 @@ def _dense(function: ca.Function, name: str) -> ca.Function:
     return ca.Function(name, inputs, [ca.densify(o) for o in outputs], {"cse": True})
 
 
-def _source(functions: dict[str, ca.Function]) -> str:
-    generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
-    for function in functions.values():
-        generator.add(function)
-    return str(generator.dump())
+def _source(functions: dict[str, ca.Function], chosen: int, start: bool) -> str:
+    """The run in C: sizes, lanes, and the driver around the pieces."""
+    nx, nu, np_ = (functions["step"].size1_in(i) for i in (2, 3, 4))
+    starts = nx if start else 0
+    sizes = {"NX": nx, "NU": nu, "NP": np_, "NY": functions["output"].size1_out(0)}
+    sizes |= {"STARTS": starts, "NS": starts + chosen, "HAS_UPDATE": int("update" in functions)}
+    pieces = []
+    for name, results in RESULTS.items():
+        text, kept = "", 0
+        if name in functions:
+            arguments = ("t", "h", "x", "u", "p", "S") if name == "step" else ("t", "x", "u", "p", "S")
+            rates = STEPPED if name == "step" else SAMPLED
+            text, kept = emit(Kernel(name, functions[name], arguments, results), rates)
+        pieces.append(text)
+        sizes |= {f"{name.upper()}_KEPT": kept}
+    defines = (f"#define {k} {v}" for k, v in sizes.items())
+    lanes, driver = ((HERE / name).read_text(encoding="utf-8") for name in ("lanes.h", "rollout.c"))
+    before, after = driver.split("#include PIECES", 1)
+    return "\n".join([*defines, lanes, before, *pieces, after])
 
 
-def _rollout_source(functions: dict[str, ca.Function], sizes: dict[str, int]) -> str:
-    defines = "".join(f"#define {k} {v}\n" for k, v in sizes.items())
-    driver = DRIVER.read_text(encoding="utf-8")
-    before, after = driver.split("#include GENERATED", 1)
-    return defines + before + _source(functions) + after
-
-
-@functools.cache
-def _build(source: str) -> ctypes.CDLL | None:
-    """Compile, or load from the cache; None where that cannot be done, which is said once."""
-    cc = compiler()
-    if cc is None:
-        _say_once("no C compiler found: models run in the CasADi VM, with the same answers, about ten times slower")
-        return None
-    try:
-        identity = [source, *FLAGS, _compiler_version(cc), platform.processor(), _cpu()]
-        name = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:32]
-        return _loaded(cc, source, cache_directory() / f"{name}.so")
-    except (OSError, subprocess.SubprocessError) as error:
-        detail = getattr(error, "stderr", None) or str(error)
-        _say_once(f"compiling with {cc} failed, the CasADi VM runs instead, with the same answers: {detail[:400]}")
-        return None
-
-
-def _loaded(cc: str, source: str, binary: Path) -> ctypes.CDLL:
-    if binary.exists():
-        try:
-            return ctypes.CDLL(str(binary))
-        except OSError:  # damaged on the disk; it is built anew
-            log.debug("%s cannot be loaded, compiling it anew", binary)
-    _compile(cc, source, binary)
-    return ctypes.CDLL(str(binary))
-
-
-def _compile(cc: str, source: str, binary: Path) -> None:
-    with tempfile.TemporaryDirectory(dir=binary.parent) as folder:
-        text, product = Path(folder) / "model.c", Path(folder) / binary.name
-        text.write_text(source, encoding="utf-8")
-        command = [cc, *FLAGS, str(text), "-o", str(product), "-lm"]
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=COMPILE_SECONDS)
-        product.replace(binary)
-
-
-@functools.cache
-def _say_once(message: str) -> None:
-    log.warning("%s", message)
-
-
-@functools.cache
-def _compiler_version(cc: str) -> str:
-    result = subprocess.run([cc, "--version"], capture_output=True, text=True, timeout=30, check=False)
-    return cc + result.stdout
-
-
-@functools.cache
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.machine()
-    return "".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
-
-
-def _mapped(function: ca.Function | None, m: int) -> Callable[..., tuple[Array, ...]] | None:
-    if function is None:
-        return None
-    mapped = function.map(m)
-    return lambda *inputs: tuple(np.array(a) for a in mapped.call([ca.DM(np.atleast_2d(i)) for i in inputs]))
-
-
-def _unstacked(block: Array, rows: int, m: int, columns: int) -> Array:
+def _unstacked(block: ca.DM, rows: int, m: int, columns: int) -> Array:
     """(rows, m * columns) as CasADi's map stacks it -> (m, rows, columns)."""
-    return np.ascontiguousarray(block.reshape(rows, m, columns).transpose(1, 0, 2))
+    return np.ascontiguousarray(np.array(block).reshape(rows, m, columns).transpose(1, 0, 2))
 
 
 def _swapped(array: Array | None) -> Array | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pneuopt.certify import evaluate, respond
 from pneuopt.console import (
     SMALLEST_IS_WORST,
     metric_units,
@@ -52,7 +53,7 @@ from pneuopt.study import grid, sweep
 from pneuopt.studyfile import Axis, read_axes, read_study
 from pneuopt.system import System
 from pneuopt.trajectories import Trajectory
-from pneuopt.tune import TuningResult, evaluate, respond, tune
+from pneuopt.tune import TuningResult, tune
 from pneuopt.tuningfile import Tuning, read_tuning, write_tuned
 
 if TYPE_CHECKING:

@@ -35,6 +35,23 @@ class ModelError(InputError):
     """A model, its parameters and its data do not fit together."""
 
 
+class HardwareError(InputError):
+    """A number that no hardware has; the message says what would be possible.
+
+    Attributes
+    ----------
+    parameter, remedy : str
+    """
+
+    def __init__(self, message: str, parameter: str = "", remedy: str = "") -> None:
+        super().__init__(message)
+        self.parameter, self.remedy = parameter, remedy
+
+
+class PhysicsWarning(UserWarning):
+    """A simulation has left what its model describes: the piston hit an end stop, or a chamber was emptied."""
+
+
 class ConvergenceError(PneuoptError):
     """A solver stopped without an answer that may be trusted.
 

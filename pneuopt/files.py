@@ -9,13 +9,20 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import tomlkit
 
-from pneuopt.errors import InputError, UnknownNameError, check_known, require
+from pneuopt.errors import HardwareError, InputError, UnitError, UnknownNameError, check_known, require
 from pneuopt.experiments import CHANNELS
 from pneuopt.models.chamber import ChamberModel, Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.gas import FlowLaw, IsentropicNozzle, Iso6358
+from pneuopt.models.gas import (
+    CRITICAL_RATIO,
+    FlowLaw,
+    IsentropicNozzle,
+    Iso6358,
+    Smoothing,
+    conductance_of_nominal_flow,
+)
 from pneuopt.models.linear import SPEED, VALVE_VOLTAGE, FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
@@ -24,7 +31,8 @@ from pneuopt.nlp.status import Code, Status
 from pneuopt.output import plain, write_text
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import System
-from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
+from pneuopt.tomlfile import Places, inline_table, read_parameter, read_toml, toml_table, write_parameter
+from pneuopt.units import read_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,6 +49,7 @@ LAWS: Mapping[str, Callable[[], FlowLaw]] = {"iso6358": Iso6358, "isentropic": I
 SPOOLS = {spool.name.lower(): spool for spool in Spool}
 PLANTS = ("first_order", "second_order", "integrator")
 CHAMBERS = ("pressure_a", "pressure_b")
+NOMINAL, CONDUCTANCE, RATIO = "nominal_flow", "valve.conductance", "valve.critical_ratio"
 RESULTS = ("estimates", "status", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
@@ -48,7 +57,7 @@ RESULTS = ("estimates", "status", "provenance")
 _STRUCTURE: Sections = {
     "drive": {"kind": "text"},
     "cylinder": {"stops": "true or false"},
-    "valve": {"law": "text", "spool": "text"},
+    "valve": {"law": "text", "spool": "text", "smoothing": "a table", "nominal_flow": "text or a table"},
     "supply": {},
     "gas": {},
     "chamber": {"model": "text", "mixed": "true or false"},
@@ -58,11 +67,14 @@ _STRUCTURE: Sections = {
     "plant": {"model": "text", "input": "text", "output": "text", "pade_order": "a whole number"},
     "rig": {"chamber": "true or false"},
 }
+_WIDTHS = {"corner": "1", "zero": "1", "pressure": "Pa"}
 _TYPES: Mapping[str, tuple[type, ...]] = {
     "text": (str,),
     "true or false": (bool,),
     "true, false or a list": (bool, list),
     "a whole number": (int,),
+    "a table": (dict,),
+    "text or a table": (str, dict),
 }
 
 
@@ -118,16 +130,14 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
     InputError
         UnitError, UnknownNameError or other; the message names file, section and key.
     """
-    said = read_toml(path).unwrap()
-    sections = {name: section for name, section in said.items() if name not in RESULTS}
-    check_known("section", sections, _STRUCTURE, str(path))
+    document = read_toml(path)
+    places = Places(path, document.as_string())
+    sections = {name: section for name, section in document.unwrap().items() if name not in RESULTS}
     for name, section in sections.items():
-        require(isinstance(section, dict), f"{path}: {name} must be a section, [{name}]")
-    drive = _build(sections, path)
-    parameters = _filled(drive.system().parameters, sections, path)
-    if isinstance(drive, PneumaticDrive):
-        _check(drive, parameters, path)
-    return drive, parameters
+        check_known("section", [name], _STRUCTURE, places.at(name))
+        require(isinstance(section, dict), f"{places.at(name)}: {name} must be a section, [{name}]")
+    drive = _build(sections, places)
+    return drive, _filled(drive.system(), sections, places)
 
 
 def read_status(path: str | Path) -> Status | None:
@@ -172,7 +182,9 @@ def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
     InputError
         If one of the files cannot be read or written.
     """
-    document, given = read_toml(source), read_drive(source)[1]
+    document, (drive, given) = read_toml(source), read_drive(source)
+    if any(n in given and result.parameters[n] != given[n] for n in (CONDUCTANCE, RATIO)):
+        given = _without_nominal_flow(document, drive, given)
     for name, found in result.parameters.items():
         if name in given and found != given[name]:
             write_parameter(document, name, found, given[name])
@@ -183,66 +195,83 @@ def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
     write_text(path, tomlkit.dumps(document))
 
 
-def _build(sections: Sections, path: str | Path) -> Drive:
+def _without_nominal_flow(document: tomlkit.TOMLDocument, drive: Drive, given: ParameterSet) -> ParameterSet:
+    """Once the conductance or the critical ratio is estimated, a nominal flow no longer says both; drop it."""
+    valve: Any = document.get("valve", {})
+    if NOMINAL not in valve:
+        return given
+    valve.remove(NOMINAL)
+    return given | drive.system().parameters.select([CONDUCTANCE])
+
+
+def _build(sections: Sections, places: Places) -> Drive:
     for name, known in _STRUCTURE.items():
         for key in known.keys() & sections.get(name, {}).keys():
             right = type(sections[name][key]) in _TYPES[known[key]]
-            require(right, f"{path}: [{name}] {key} must be {known[key]}, got {sections[name][key]!r}")
-    kind = _choice(sections, "drive", "kind", _KINDS, path)
-    return _KINDS[kind](sections, path)
+            require(right, f"{places.at(name, key)}: [{name}] {key} must be {known[key]}, got {sections[name][key]!r}")
+    kind = _choice(sections, "drive", "kind", _KINDS, places)
+    return _KINDS[kind](sections, places)
 
 
-def _check(drive: PneumaticDrive, parameters: ParameterSet, path: str | Path) -> None:
-    try:
-        drive.check(parameters)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def _pneumatic(sections: Sections, path: str | Path) -> Drive:
-    law = LAWS[_choice(sections, "valve", "law", LAWS, path, "iso6358")]()
-    spool = SPOOLS[_choice(sections, "valve", "spool", SPOOLS, path, "second_order")]
+def _pneumatic(sections: Sections, places: Places) -> Drive:
+    law = LAWS[_choice(sections, "valve", "law", LAWS, places, "iso6358")]()
+    spool = SPOOLS[_choice(sections, "valve", "spool", SPOOLS, places, "second_order")]
+    valve = ProportionalValve(law, spool, _smoothing(sections, places))
     cylinder = Cylinder(**_said(sections, "cylinder"))
-    return PneumaticDrive(
-        ProportionalValve(law, spool), _friction(sections, path), _load(sections), _chamber(sections, path), cylinder
+    return PneumaticDrive(valve, _friction(sections, places), _load(sections), _chamber(sections, places), cylinder)
+
+
+def _smoothing(sections: Sections, places: Places) -> Smoothing:
+    """How the orifice's law is rounded: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
+    said, where = (
+        sections.get("valve", {}).get("smoothing", {}),
+        f"{places.at('valve', 'smoothing')}: [valve] smoothing",
     )
+    check_known("key", said, _WIDTHS, where)
+    widths = {n: read_value(v, _WIDTHS[n], where=f"{where}: {n}") for n, v in said.items()}
+    for name, width in widths.items():
+        require(width > 0, f"{where}: {name} must be positive, got {said[name]}; smaller is sharper and stiffer")
+    return Smoothing(**widths)
 
 
-def _chamber(sections: Sections, path: str | Path) -> ChamberModel:
+def _chamber(sections: Sections, places: Places) -> ChamberModel:
     said = _said(sections, "chamber")
-    if _choice(sections, "chamber", "model", ("polytropic", "thermal"), path, "polytropic") == "polytropic":
+    if _choice(sections, "chamber", "model", ("polytropic", "thermal"), places, "polytropic") == "polytropic":
         return Polytropic(said.get("mixed", False))
-    require("mixed" not in said, f"{path}: [chamber] mixed: a thermal chamber has no exponents; leave it out")
+    require(
+        "mixed" not in said,
+        f"{places.at('chamber', 'mixed')}: [chamber] mixed: a thermal chamber has no exponents; leave it out",
+    )
     return Thermal()
 
 
-def _force(sections: Sections, path: str | Path) -> Drive:
-    return ForceDrive(_friction(sections, path), _load(sections))
+def _force(sections: Sections, places: Places) -> Drive:
+    return ForceDrive(_friction(sections, places), _load(sections))
 
 
 def _load(sections: Sections) -> Load:
     return Load(**_said(sections, "load"))
 
 
-def _motion(sections: Sections, path: str | Path) -> Drive:
-    return MotionDrive(_friction(sections, path), chamber=sections.get("rig", {}).get("chamber", True))
+def _motion(sections: Sections, places: Places) -> Drive:
+    return MotionDrive(_friction(sections, places), chamber=sections.get("rig", {}).get("chamber", True))
 
 
-def _linear(sections: Sections, path: str | Path) -> Drive:
+def _linear(sections: Sections, places: Places) -> Drive:
     plant = sections.get("plant", {})
-    model = _choice(sections, "plant", "model", PLANTS, path)
+    model = _choice(sections, "plant", "model", PLANTS, places)
     signals = [plant.get("input", "valve_voltage"), plant.get("output", "speed")]
-    check_known("channel", signals, CHANNELS, f"{path}: [plant]")
+    check_known("channel", signals, CHANNELS, f"{places.at('plant')}: [plant]")
     known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
     u, y = (known.get(name, Quantity(name, CHANNELS[name])) for name in signals)
     # Order 3 follows a delay up to 4.6 rad of phase and adds three states; 0 leaves the dead time out.
     order = plant.get("pade_order", 3 if "dead_time" in plant else 0)
     if model == "second_order":
-        return SecondOrder(order, _friction(sections, path) if "friction" in sections else None, u, y)
+        return SecondOrder(order, _friction(sections, places) if "friction" in sections else None, u, y)
     return (FirstOrder if model == "first_order" else Integrator)(order, u, y)
 
 
-_KINDS: Mapping[str, Callable[[Sections, str | Path], Drive]] = {
+_KINDS: Mapping[str, Callable[[Sections, Places], Drive]] = {
     "pneumatic": _pneumatic,
     "force": _force,
     "motion": _motion,
@@ -255,16 +284,18 @@ def _said(sections: Sections, name: str) -> dict[str, Any]:
     return {key: value for key, value in sections.get(name, {}).items() if key in _STRUCTURE[name]}
 
 
-def _friction(sections: Sections, path: str | Path) -> FrictionModel:
+def _friction(sections: Sections, places: Places) -> FrictionModel:
     said = sections.get("friction", {})
-    model = FRICTION[_choice(sections, "friction", "model", FRICTION, path)]()
+    model = FRICTION[_choice(sections, "friction", "model", FRICTION, places)]()
     if said.get("asymmetric", False):
         model = Asymmetric(model)
     dependent = said.get("pressure_dependent", False)
     if not dependent:
         return model
     chambers = CHAMBERS if dependent is True else tuple(dependent)
-    check_known("chamber", chambers, CHAMBERS, f"{path}: [friction] pressure_dependent")
+    check_known(
+        "chamber", chambers, CHAMBERS, f"{places.at('friction', 'pressure_dependent')}: [friction] pressure_dependent"
+    )
     return PressureDependent(model, chambers)
 
 
@@ -273,27 +304,76 @@ def _choice(
     section: str,
     key: str,
     known: Sequence[str] | Mapping[str, Any],
-    path: str | Path,
+    places: Places,
     usual: str | None = None,
 ) -> str:
     value = sections.get(section, {}).get(key, usual)
     if value is None:
-        raise InputError(f'{path}: [{section}] says no {key}; write {key} = "...", one of: {", ".join(known)}')
-    check_known(key, [value], known, f"{path}: [{section}]")
+        raise InputError(
+            f'{places.at(section)}: [{section}] says no {key}; write {key} = "...", one of: {", ".join(known)}'
+        )
+    check_known(key, [value], known, f"{places.at(section, key)}: [{section}]")
     return str(value)
 
 
-def _filled(defaults: ParameterSet, sections: Sections, path: str | Path) -> ParameterSet:
+def _filled(system: System, sections: Sections, places: Places) -> ParameterSet:
+    defaults, edits = system.parameters, dict[str, Parameter]()
     known = {name.partition(".")[0] for name in defaults} | {"drive"}
     known |= {name for name in ("friction", "plant") if any(n.startswith(f"{name}.") for n in defaults)}
-    edits: dict[str, Parameter] = {}
     for section, entries in sections.items():
         if section not in known:
-            raise UnknownNameError("section", section, known, f"{path}: kind {sections['drive']['kind']!r}")
+            where = f"{places.at(section)}: kind {sections['drive']['kind']!r}"
+            raise UnknownNameError("section", section, known, where)
         structure = _STRUCTURE.get(section, {})
         keys = [name.partition(".")[2] for name in defaults if name.startswith(f"{section}.")]
-        check_known("key", entries, [*structure, *keys], f"{path}: [{section}]")
-        for key in (k for k in entries if k not in structure):
-            name = f"{section}.{key}"
-            edits[name] = read_parameter(entries[key], defaults[name], f"{path}: [{section}] {key}")
+        for key in entries:
+            check_known("key", [key], [*structure, *keys], f"{places.at(section, key)}: [{section}]")
+    entries = {f"{s}.{k}": v for s, said in sections.items() for k, v in said.items() if f"{s}.{k}" in defaults}
+    _check_hardware(system, entries, places)
+    entries |= _nominal(sections, entries, defaults, places)
+    for name, entry in entries.items():
+        edits[name] = read_parameter(entry, defaults[name], _place(name, places))
     return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
+
+
+def _check_hardware(system: System, entries: Mapping[str, Any], places: Places) -> None:
+    """Refuse impossible values first, for the model's bounds do not say what would be possible."""
+    said = {n: entry.get("value") if isinstance(entry, dict) else entry for n, entry in entries.items()}
+    units = {n: system.parameters[n].unit for n in said}
+    given = {n: read_value(v, units[n], where=_place(n, places)) for n, v in said.items() if v is not None}
+    try:
+        system.check(system.parameters | ParameterSet({n: Parameter(v, units[n]) for n, v in given.items()}))
+    except HardwareError as error:
+        if error.parameter not in given:
+            raise InputError(f"{places}: {error} (the model's own value; the file says none)") from None
+        written = f"{_place(error.parameter, places)} = {tomlkit.item(said[error.parameter]).as_string()}"
+        raise InputError(f"{written} is impossible; {error.remedy}") from None
+
+
+def _nominal(sections: Sections, entries: Mapping[str, Any], defaults: ParameterSet, places: Places) -> dict[str, Any]:
+    """The conductance that [valve] nominal_flow means: 6 to 5 bar(g), in l/min(ANR), at the critical ratio given."""
+    said, where = sections.get("valve", {}).get(NOMINAL), f"{places.at('valve', NOMINAL)}: [valve] {NOMINAL}"
+    if said is None:
+        return {}
+    require(CONDUCTANCE not in entries, f"{where} and conductance say the same; leave one of them out")
+    b = CRITICAL_RATIO
+    if RATIO in defaults:
+        b = read_parameter(entries.get(RATIO, defaults.value(RATIO)), defaults[RATIO], _place(RATIO, places)).value
+
+    def conductance(text: Any) -> str:
+        is_anr = isinstance(text, str) and text.strip().endswith("(ANR)")
+        remedy = 'a nominal flow, 6 to 5 bar(g), is written at ANR (20 degC, 100 kPa): "700 l/min(ANR)"'
+        require(is_anr, f"{where}: {text!r}: {remedy}", UnitError)
+        flow = read_value(text.strip().removesuffix("(ANR)"), "m^3/s", where=where)
+        require(flow > 0, f"{where}: a flow is positive, got {text!r}")
+        return f"{conductance_of_nominal_flow(flow, b)!r} {defaults[CONDUCTANCE].unit}"
+
+    fields = said if isinstance(said, dict) else {"value": said}
+    flows = ("value", "lower", "upper")
+    return {CONDUCTANCE: {f: conductance(v) if f in flows else v for f, v in fields.items()}}
+
+
+def _place(name: str, places: Places) -> str:
+    """Of a parameter: file, line, section and key."""
+    section, _, key = name.partition(".")
+    return f"{places.at(section, key)}: [{section}] {key}"

@@ -11,24 +11,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.checks import check_free, check_logs, measured_outputs
-from pneuopt.errors import ConvergenceError, InputError
+from pneuopt.checks import check_content, check_free, check_logs, check_smooth, measured_outputs
+from pneuopt.errors import ConvergenceError
 from pneuopt.experiments import Experiment
-from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
+from pneuopt.nlp.least_squares import NOISE_LEVEL, Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status
-from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.parameters import ParameterSet
+from pneuopt.posing import Problem, conditioned
 from pneuopt.provenance import provenance
 from pneuopt.simulate import simulate
 from pneuopt.statistics import agreement, confidence_interval, correlation_time
-from pneuopt.system import Log, Start, System, discretise, names
+from pneuopt.system import System
 from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-NOISE_LEVEL = 1.2  # squared residuals a sample, in noise variances, up to which a fit is as good as the noise allows
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +95,13 @@ def identify(
         If no candidate start converged; the error's `solution` is the result, marked.
     """
     method = method or LeastSquares()
+    check_smooth(system)
     experiments = check_logs(system, experiments, parameters)
     check_free(experiments, parameters)
-    problem = _Problem(system, tuple(experiments), system.parameters | parameters, method)
+    check_content(experiments)
+    problem = Problem(system, tuple(experiments), system.parameters | parameters, method)
     fit, label = _best(problem, method)
-    result = problem.result(fit, label)
+    result = _result(problem, fit, label)
     if throw and not result.status.converged:
         raise ConvergenceError(f"identification {result.status}", result)
     return result
@@ -149,92 +150,42 @@ def predict(system: System, experiment: Experiment, parameters: ParameterSet) ->
 
 
 def _predicted(system: System, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
+    inputs, known = experiment.trajectory, conditioned(fixed, experiment)
+    if not system.states:
+        return simulate(system, inputs, known)
     whole = LeastSquares(segment_time=math.inf)
-    problem = _Problem(system, (experiment,), fixed, whole)
+    problem = Problem(system, (experiment,), fixed, whole)
     start = problem.candidates()[0]
     initial = solve_least_squares(problem.transcription(start), whole).solution.trajectories[0]
     state = {s.name: float(initial[s.name][0]) for s in system.states}
-    return simulate(system, experiment.trajectory, _conditioned(fixed, experiment), initial=state)
+    return simulate(system, inputs, known, initial=state)
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """What is to be identified, and its translation to a transcription and back."""
-
-    system: System
-    experiments: tuple[Experiment, ...]
-    parameters: ParameterSet
-    method: LeastSquares
-
-    def candidates(self) -> Sequence[Start]:
-        """The model's own starts from all logs together."""
-        logs = {e.name: Log(e.trajectory, _conditioned(self.parameters, e)) for e in self.experiments}
-        return self.system.starts(logs)
-
-    def unknowns(self) -> ParameterSet:
-        """The problem's parameters: the system's, each log's conditions, each log's own copies."""
-        own: dict[str, Parameter] = {}
-        shared = dict(self.parameters)
-        for experiment in self.experiments:
-            for name, value in experiment.conditions.items():
-                own[f"{name}[{experiment.name}]"] = Parameter(value, shared[name].unit, source="condition of the log")
-        for name in self.parameters.free_names:
-            if self.parameters[name].per_log:
-                shared[name] = replace(self.parameters[name], free=False)
-                unknown = (e.name for e in self.experiments if name not in e.conditions)
-                own |= {f"{name}[{log}]": self.parameters[name] for log in unknown}
-        return ParameterSet({**shared, **own})
-
-    def transcription(self, candidate: Start) -> Transcription:
-        """Pose the problem as multiple shooting, started from a candidate."""
-        phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
-        residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
-        parameters = self.unknowns().with_values(candidate.parameters)
-        return Transcription(discretise(self.system), parameters, phases, residuals)
-
-    def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
-        t = experiment.trajectory.t
-        h = np.append(np.diff(t), np.diff(t)[-1])
-        inputs = experiment.trajectory.matrix(names(self.system.inputs))
-        nodes = every(len(t), self._segment(h))
-        return Phase(experiment.name, t, h, inputs, nodes, guess=states.matrix(names(self.system.states)))
-
-    def _segment(self, h: Array) -> int:
-        """Samples between two nodes; a static map has no gaps, so its cut is only for batching."""
-        if not self.system.states:
-            return 100
-        samples = self.method.segment_time / float(np.median(h))
-        return len(h) if math.isinf(samples) else max(2, round(samples))
-
-    def _residuals(self, index: int, experiment: Experiment) -> Residuals:
-        outputs = measured_outputs(self.system, experiment)
-        noise = np.array([experiment.noise[o] for o in outputs])
-        return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
-
-    def result(self, fit: Fit, label: str) -> IdentificationResult:
-        """Read the solver's answer back into parameters and tables."""
-        solution = fit.solution
-        free = solution.parameters.free_names
-        shared = [n for n in free if n in self.parameters]
-        values = {n: solution.parameters.value(n) for n in shared}
-        runs = {e.name: t for e, t in zip(self.experiments, solution.trajectories, strict=True)}
-        starts = len(self.experiments) * len(self.system.states)
-        variance = fit.chi_square / max(1, fit.count - len(free) - starts)
-        correlated = _correlated(self.system, self.experiments, runs)
-        covariance = None if fit.covariance is None else fit.covariance * variance * correlated
-        return IdentificationResult(
-            self.parameters.with_values(values),
-            _estimates(solution.parameters.select(free), covariance, fit.at_bound, solution.status),
-            _square(free, covariance),
-            _fit_table(self.system, self.experiments, runs),
-            runs,
-            solution.status,
-            {**solution.stats, "chi_square_ratio": variance, "correlation_time": correlated},
-            {**provenance(self.method), "start": label, **{f"sha256[{e.name}]": e.sha256 for e in self.experiments}},
-        )
+def _result(problem: Problem, fit: Fit, label: str) -> IdentificationResult:
+    """Read the solver's answer back into parameters and tables."""
+    solution = fit.solution
+    free = solution.parameters.free_names
+    shared = [n for n in free if n in problem.parameters]
+    values = {n: solution.parameters.value(n) for n in shared}
+    runs = {e.name: t for e, t in zip(problem.experiments, solution.trajectories, strict=True)}
+    starts = len(problem.experiments) * len(problem.system.states)
+    squares = fit.chi_square if fit.jumps is None else 2 * solution.stats["cost"]
+    variance = squares / max(1, fit.count - len(free) - starts)
+    correlated = max(_correlated(problem.system, problem.experiments, runs), _correlated_jumps(fit.jumps))
+    covariance = None if fit.covariance is None else fit.covariance * variance * correlated
+    return IdentificationResult(
+        problem.parameters.with_values(values),
+        _estimates(solution.parameters.select(free), covariance, fit.at_bound, solution.status),
+        _square(free, covariance),
+        _fit_table(problem.system, problem.experiments, runs),
+        runs,
+        solution.status,
+        {**solution.stats, "chi_square_ratio": variance, "correlation_time": correlated},
+        {**provenance(problem.method), "start": label, **{f"sha256[{e.name}]": e.sha256 for e in problem.experiments}},
+    )
 
 
-def _best(problem: _Problem, method: LeastSquares) -> tuple[Fit, str]:
+def _best(problem: Problem, method: LeastSquares) -> tuple[Fit, str]:
     """The first candidate that converges at the noise's level; else the least cost, once two have found it, or of all.
 
     A wrong basin can converge, too; its residuals then exceed the noise.
@@ -267,14 +218,6 @@ def _are_alike(best: Fit, second: Fit) -> bool:
     return converged and _cost(second) <= 1.001 * _cost(best)
 
 
-def _conditioned(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:
-    """The parameters as they are in one log, where its conditions are known and so not free."""
-    try:
-        return parameters.with_values(experiment.conditions).fixed(*experiment.conditions)
-    except InputError as error:
-        raise InputError(f"{experiment.name}: condition {error}") from None
-
-
 def _fit_table(system: System, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
     import pandas as pd
 
@@ -300,6 +243,11 @@ def _correlated(system: System, experiments: Sequence[Experiment], runs: Mapping
         for channel in measured_outputs(system, e)
     ]
     return float(np.mean(times))
+
+
+def _correlated_jumps(jumps: Array | None) -> float:
+    """The same for what stands for noise of the states."""
+    return 1.0 if jumps is None else float(np.mean([correlation_time(column) for column in jumps.T]))
 
 
 def _estimates(

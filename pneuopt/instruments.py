@@ -88,7 +88,7 @@ class Actuator:
 
 @dataclass(frozen=True)
 class Encoder:
-    """A speed from a position's readings: difference over a sample, then a low-pass of first order; it starts at zero.
+    """A speed from a position's readings: difference a sample, then a first-order low-pass; it starts true.
 
     Parameters
     ----------

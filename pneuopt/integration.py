@@ -1,7 +1,9 @@
-"""How `simulate` integrates a smooth plant, and how it keeps what it finds; `stick_slip` holds the other integrator."""
+"""How `simulate` integrates a smooth plant, watches and keeps it; `stick_slip` holds the other integrator."""
 
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn, Protocol
 
 import numpy as np
@@ -10,11 +12,14 @@ from scipy import integrate
 
 from pneuopt.codegen import compiled
 from pneuopt.errors import ConvergenceError
+from pneuopt.guards import Contact
+from pneuopt.parameters import ParameterSet
 from pneuopt.system import System, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 MOST_STEPS = 200_000
+LOOK = 1e-3  # [s] between two looks at the guards; a stop holds a piston for longer
 
 
 class Run(Protocol):
@@ -39,6 +44,59 @@ class Run(Protocol):
     def trajectory(self) -> Trajectory:
         """What was recorded so far."""
         ...
+
+
+class Watch:
+    """Looks at a run between the instants that are asked for, so that none of the plant's guards is passed unseen.
+
+    The states of `plant` come first in the vectors that it sees.
+    """
+
+    def __init__(self, plant: System, parameters: ParameterSet, t: float, x: Array) -> None:
+        full = plant.parameters | parameters.select(n for n in parameters if n in plant.parameters)
+        self._guards, self._contacts = plant.guards, dict[int, Contact]()
+        self._indices = [names(plant.states).index(g.state) for g in self._guards]
+        self._states = [plant.states[k] for k in self._indices]
+        self._limits = np.array([g.limit(full) for g in self._guards])
+        self._sides = np.array([g.side for g in self._guards])
+        self._t, self._values = t, x[self._indices]
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Each guard's first, in order of time."""
+        return tuple(sorted(self._contacts.values(), key=lambda contact: contact.t))
+
+    @contextmanager
+    def telling(self) -> Iterator[None]:
+        """Add what was met to the message of a run that stops."""
+        try:
+            yield
+        except ConvergenceError as error:
+            if not self._contacts:
+                raise
+            met = "; ".join(map(str, self.contacts))
+            raise ConvergenceError(f"{error}. Before that, {met}", error.solution) from None
+
+    def advance(self, run: Run, t: float) -> Array:
+        """As ``run.advance(t)``, looking every millisecond on the way."""
+        if len(self._contacts) < len(self._guards):
+            begin = self._t
+            for k in range(1, math.ceil((t - begin) / LOOK)):
+                self.look(begin + k * LOOK, run.advance(begin + k * LOOK))
+        x = run.advance(t)
+        self.look(t, x)
+        return x
+
+    def look(self, t: float, x: Array) -> None:
+        """Compare with what was seen last."""
+        before, values = self._values, x[self._indices]
+        room = self._sides * (self._limits - before)
+        for k in np.flatnonzero((room > 0) & (self._sides * (self._limits - values) <= 0)):
+            part = (self._limits[k] - before[k]) / (values[k] - before[k])
+            at, rate = self._t + part * (t - self._t), (values[k] - before[k]) / (t - self._t)
+            found = Contact(float(at), float(self._limits[k]), float(rate), self._states[k], self._guards[k])
+            self._contacts.setdefault(int(k), found)
+        self._t, self._values = t, values
 
 
 class Record:

@@ -69,20 +69,30 @@ def examine(experiment: Experiment) -> tuple[Finding, ...]:
 
 
 def _silent(experiment: Experiment) -> Iterator[Finding]:
-    """Channels without content."""
-    log = experiment.trajectory
-    for name in log:
-        y = log[name][np.isfinite(log[name])]
-        if y.size and not np.any(np.diff(y)) and name in ("position", "speed"):
+    """Channels without motion."""
+    for name in ("position", "speed"):
+        if name not in experiment.trajectory:
+            continue
+        y = experiment.trajectory[name]
+        y, noise = y[np.isfinite(y)], experiment.noise.get(name, 0.0)
+        if y.size and not np.any(np.diff(y)) and (name == "position" or y[0] == 0):
             yield Finding(name, f"{name!r} is constant: without motion a log tells nothing about friction", True)
-        elif name in ("position", "speed") and name in experiment.noise and y.size >= 2 * BLOCKS:
-            size = y.size // BLOCKS
-            means = y[: BLOCKS * size].reshape(BLOCKS, size).mean(axis=1)
-            noise = experiment.noise[name]
-            still = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
-            if still:
-                told = f"{name!r} shows its noise ({noise:.2g}) and no motion: log a run in which the drive moves"
-                yield Finding(name, told, True)
+        elif y.size >= 2 * BLOCKS and (_is_still(y, noise) or (name == "position" and _is_white(y))):
+            told = f"{name!r} shows noise and no motion: log a run in which the drive moves"
+            yield Finding(name, told, True)
+
+
+def _is_still(y: Array, noise: float) -> bool:
+    """Whether a channel stays where it is, to its noise, and so do its block means."""
+    size = y.size // BLOCKS
+    means = y[: BLOCKS * size].reshape(BLOCKS, size).mean(axis=1)
+    return float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
+
+
+def _is_white(y: Array) -> bool:
+    """Whether neighbouring samples have nothing to do with each other, which no moving mass's position shows."""
+    e = y - y.mean()
+    return abs(float(e[1:] @ e[:-1])) < 3 / math.sqrt(e.size) * float(e @ e)
 
 
 def _contradicting(log: Trajectory) -> Iterator[Finding]:

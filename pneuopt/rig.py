@@ -7,7 +7,7 @@ finite resolution, and a controller that sees only those sensors, and differenti
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import casadi as ca
 import numpy as np
@@ -20,9 +20,9 @@ from pneuopt.experiments import CHANNELS, Experiment
 from pneuopt.instruments import Actuator, Encoder, Sensor
 from pneuopt.integration import Run
 from pneuopt.parameters import ParameterSet, Quantity
-from pneuopt.simulate import first_state, held_inputs, new_run
+from pneuopt.simulate import contacts, first_state, held_inputs, new_run, warn_of
 from pneuopt.stick_slip import Event, StickSlip
-from pneuopt.system import Symbols, System, define, names, stacked, vector
+from pneuopt.system import Rest, RestFinder, Symbols, System, define, names, stacked, vector
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -97,7 +97,10 @@ class Rig:
 
     @cached_property
     def sensed(self) -> System:
-        """The plant with an output "sensor.*" a sensor, and a state of that name where it lags."""
+        """The plant with an output "sensor.*" a sensor, and a state of that name where it lags.
+
+        A loop on it, ``ClosedLoop(rig.sensed, ..., measured="sensor.speed")``, can be tuned for what it will see.
+        """
         plant = self.plant
         shown = {f"sensor.{q.name}": q for q in plant.outputs if q.name in self.channels}
         lags = {n: self.sensors[q.name].lag for n, q in shown.items()}
@@ -113,7 +116,9 @@ class Rig:
         sensors = {n: replace(q, name=n) for n, q in shown.items()}
         lagging = (q for n, q in sensors.items() if lags[n] > 0)
         states, outputs = (*plant.states, *lagging), (*plant.outputs, *sensors.values())
-        return define(states, plant.inputs, outputs, plant.parameters, rhs)
+        system = define(states, plant.inputs, outputs, plant.parameters, rhs)
+        finder = partial(_rest, plant, plant.rest_finder) if plant.rest_finder else None
+        return replace(system, rest_finder=finder, checker=plant.checker, guards=plant.guards)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,15 +199,13 @@ def record(
     """
     fed = _at_samples(rig.model, inputs)
     x, p = first_state(rig.model, parameters, initial), vector(rig.plant.parameters, parameters)
-    own = x[len(rig.plant.states) :]
-    source = (
-        _Controller(rig, rig.model, parameters, fed, own) if isinstance(rig.model, ClosedLoop) else _Player(rig, fed)
-    )
+    source = _Controller(rig, rig.model, parameters, fed, x) if isinstance(rig.model, ClosedLoop) else _Player(rig, fed)
     run = new_run(rig.sensed, p, fed.t, rtol, 1e-2 * rtol)
     readings, control = _drive(rig, run, source, fed, x[: len(rig.plant.states)], p, np.random.default_rng(seed))
     logged = {n: fed[n] for n in names(rig.plant.inputs) if n != rig.command.name} | source.columns()
     logged |= dict(zip(rig.channels, readings.T, strict=True))
     truth = run.trajectory().with_columns({"control": control})
+    warn_of(contacts(truth, rig.plant, parameters))
     spread = {n: s.spread for n, s in rig.sensors.items() if s.spread > 0}
     return Recording(
         Experiment(Trajectory(fed.t, logged), spread, name=name),
@@ -237,9 +240,12 @@ class _Controller:
         echo = define([seen], [loop.command], [seen], loop.plant.parameters, lambda _t, y, _u, _p: (_at_rest(y), y))
         echoing = replace(loop, plant=echo)
         self._update, self._p = compiled(echoing.update), echoing.numbers(parameters)
-        self._rig, self._loop, self._fed, self._x = rig, loop, fed, x
+        plant, own = np.split(x, [len(rig.plant.states)])
+        self._rig, self._loop, self._fed, self._x = rig, loop, fed, own
         self._command = names(echoing.states).index("pid.command")
-        self.before = float(x[self._command - 1])
+        self.before = float(own[self._command - 1])
+        still = np.zeros(len(rig.plant.inputs))
+        self._first = _outputs(rig, fed.t[0], plant, still, vector(rig.plant.parameters, parameters))[seen.name]
         self._seen, self._commands = list[float](), list[float]()
         self._position: float | None = None
 
@@ -265,7 +271,7 @@ class _Controller:
             return readings[wanted]
         before, self._position = self._position, readings[str(source)]
         if before is None:
-            return 0.0
+            return self._first
         h = self._loop.pid.sample_time or 0.0
         raw = (self._position - before) / h
         return self._seen[-1] + h / (h + self._rig.encoder.filter_time) * (raw - self._seen[-1])
@@ -300,8 +306,24 @@ def _drive(
 
 def _settled(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
     """The plant's state, and the sensors' at rest with it."""
-    y = dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel(), strict=True))
+    y = _outputs(rig, t, x, u, p)
     return np.append(x, [y[n] for n in rig.channels if rig.sensors[n].lag > 0])
+
+
+def _outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
+    """The plant's, by name."""
+    return dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel().tolist(), strict=True))
+
+
+def _rest(plant: System, finder: RestFinder, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
+    """The plant's rest, or steady motion, and every sensor's at the truth."""
+    wanted = {n.removeprefix("sensor."): value for n, value in outputs.items()}
+    rest = finder(parameters, wanted)
+    x = [rest.states.get(n, 0.0) for n in names(plant.states)]
+    u = [rest.inputs.get(n, 0.0) for n in names(plant.inputs)]
+    y = np.array(plant.ode(0, x, u, vector(plant.parameters, parameters))[1]).ravel().tolist()
+    shown = {f"sensor.{n}": value for n, value in zip(names(plant.outputs), y, strict=True)}
+    return Rest({**rest.states, **shown}, rest.inputs)
 
 
 def _at_samples(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:

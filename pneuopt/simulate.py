@@ -5,6 +5,7 @@ changes or where a sampled controller acts. The controller's exact update runs a
 friction sticks and slips between events that are located (`stick_slip`).
 """
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,15 +14,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import ModelError, check_known, require
-from pneuopt.integration import Run, Smooth
+from pneuopt.errors import ModelError, PhysicsWarning, check_known, require
+from pneuopt.guards import Contact
+from pneuopt.integration import Run, Smooth, Watch
 from pneuopt.parameters import ParameterSet, Quantity
-from pneuopt.stick_slip import DIRECTION, Event, StickSlip
-from pneuopt.system import System, names, vector
+from pneuopt.stick_slip import Event, StickSlip
+from pneuopt.system import DIRECTION, System, names, vector
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Update = Callable[..., tuple[Array, ...]]
+RESTS_AT = "position"  # where a plant can be asked to rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +64,9 @@ def simulate(
     parameters : ParameterSet
         A missing one keeps the model's default.
     initial : mapping of state to value, or array of shape (n_states,), optional
-        Absent states start at zero; by default a plant starts at zero and a loop at rest (`ClosedLoop.initial`).
+        By default a plant that knows its rest starts there, another at zero, and a loop at rest (`ClosedLoop.initial`).
+        States absent from a mapping are as at rest, a drive's at the position given, {"position": 0.05}; zero where the
+        plant knows no rest.
     t_out : array_like, shape (n,), optional
         Instants to report [s], within the inputs' time; by default those of the inputs.
     rtol, atol : float
@@ -76,9 +81,15 @@ def simulate(
     Raises
     ------
     InputError
-        If an input is missing or NaN, an instant lies outside, or a state starts outside its physical range.
+        If an input is missing or NaN, an instant lies outside, hardware is impossible, or a state starts outside its
+        physical range.
     ConvergenceError
         If the integration stops; the message gives the time and the state, `solution` is the trajectory so far.
+
+    Warns
+    -----
+    PhysicsWarning
+        If the piston reaches an end stop, or a chamber is emptied: when, where, and what the response is from there.
 
     Examples
     --------
@@ -88,7 +99,9 @@ def simulate(
     >>> round(run["speed"][-1].item(), 6)
     0.632121
     """
-    return _integrated(model, inputs, parameters, initial, t_out, (rtol, atol)).trajectory()
+    run, met = _integrated(model, inputs, parameters, initial, t_out, (rtol, atol))
+    warn_of(met)
+    return run.trajectory()
 
 
 def simulate_stick_slip(
@@ -118,10 +131,49 @@ def simulate_stick_slip(
     >>> [(round(e.t, 4), e.kind.value) for e in run.events]
     [(0.1, 'breaks away'), (0.4364, 'sticks')]
     """
-    run = _integrated(model, inputs, parameters, initial, t_out, (rtol, atol))
+    run, met = _integrated(model, inputs, parameters, initial, t_out, (rtol, atol))
     if not isinstance(run, StickSlip):
         raise ModelError("the model has no Karnopp friction, say ForceDrive(Karnopp(Stribeck())); take simulate")
+    warn_of(met)
     return StickSlipResult(run.trajectory(), run.events)
+
+
+def contacts(trajectory: Trajectory, model: System | ClosedLoop, parameters: ParameterSet) -> tuple[Contact, ...]:
+    """Where a response runs into an end stop or empties a chamber: what `simulate` warns of, seen at the instants.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        With the plant's states.
+    model : System or ClosedLoop
+    parameters : ParameterSet
+
+    Returns
+    -------
+    tuple of Contact
+        The first of each kind, in order of time; a response that begins in a stop has not run into it.
+
+    Examples
+    --------
+    >>> from pneuopt.models.pneumatic_drive import PneumaticDrive
+    >>> drive = PneumaticDrive().system()
+    >>> run = Trajectory([0.0, 0.1], {q.name: [q.nominal, q.nominal] for q in drive.states})
+    >>> run = run.with_columns({"position": [0.18, 0.22]})
+    >>> print(str(contacts(run, drive, drive.parameters)[0]).partition(";")[0])
+    the piston reached the front end stop (position 199.9 mm) at t = 0.04975 s with 0.4 m/s
+    """
+    plant = _plant(model)
+    rows = trajectory.matrix(names(plant.states))
+    watch = Watch(plant, parameters, trajectory.t[0], rows[0])
+    for t, row in zip(trajectory.t, rows, strict=True):
+        watch.look(t, row)
+    return watch.contacts
+
+
+def warn_of(met: Sequence[Contact]) -> None:
+    """Give a `PhysicsWarning` for each contact, in the name of the caller's caller."""
+    for contact in met:
+        warnings.warn(str(contact), PhysicsWarning, stacklevel=3)
 
 
 def new_run(system: System, p: Array, grid: Array, rtol: float, atol: float) -> Run:
@@ -136,7 +188,7 @@ def _integrated(
     initial: Mapping[str, float] | ArrayLike | None,
     t_out: ArrayLike | None,
     tolerances: tuple[float, float],
-) -> Run:
+) -> tuple[Run, tuple[Contact, ...]]:
     system, update, sample_time = _pieces(model)
     u, grid = held_inputs(system.inputs, inputs), _instants(t_out, inputs.t)
     x, p = first_state(model, parameters, initial), vector(system.parameters, parameters)
@@ -144,16 +196,18 @@ def _integrated(
     breaks, is_sample = _breaks(inputs.t, u, sample_time, slack)
     rows = u[np.searchsorted(inputs.t, breaks + slack, side="right") - 1]
     run, done = new_run(system, p, grid, *tolerances), 0
-    for at, end, row, acts in zip(breaks, [*breaks[1:], np.inf], rows, is_sample, strict=True):
-        run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row)
-        until = int(np.searchsorted(grid, end - slack))
-        for t in grid[done:until]:
-            run.advance(t)
-            run.record()
-        if until == len(grid):
-            break
-        x, done = run.advance(end), until
-    return run
+    watch = Watch(_plant(model), parameters, inputs.t[0], x)
+    with watch.telling():
+        for at, end, row, acts in zip(breaks, [*breaks[1:], np.inf], rows, is_sample, strict=True):
+            run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row)
+            until = int(np.searchsorted(grid, end - slack))
+            for t in grid[done:until]:
+                watch.advance(run, t)
+                run.record()
+            if until == len(grid):
+                break
+            x, done = watch.advance(run, end), until
+    return run, watch.contacts
 
 
 def _pieces(model: System | ClosedLoop) -> tuple[System, Update | None, float | None]:
@@ -206,13 +260,15 @@ def _breaks(t: Array, u: Array, sample_time: float | None, slack: float) -> tupl
 def first_state(
     model: System | ClosedLoop, parameters: ParameterSet, initial: Mapping[str, float] | ArrayLike | None
 ) -> Array:
-    """The state from which `simulate` starts; one outside its physical range is an error."""
-    states = model.states
+    """The state from which `simulate` starts; one where the plant cannot be is an error."""
+    states, plant = model.states, _plant(model)
     if initial is None:
-        x = np.zeros(len(states)) if isinstance(model, System) else model.initial(parameters)
+        x = _at_rest(model, parameters, {}) if isinstance(model, System) else model.initial(parameters)
     elif isinstance(initial, Mapping):
         check_known("state", initial, names(states), "initial")
-        x = np.array([initial.get(q.name, 0.0) for q in states], dtype=float)
+        held = {n: float(v) for n, v in initial.items() if n == RESTS_AT}
+        base = _at_rest(model, parameters, held) if initial.keys() < set(names(states)) else np.zeros(len(states))
+        x = np.array([initial.get(q.name, value) for q, value in zip(states, base, strict=True)], dtype=float)
     else:
         x = np.array(initial, dtype=float)
         require(x.shape == (len(states),), f"initial has shape {x.shape}, the model has {len(states)} states")
@@ -221,4 +277,21 @@ def first_state(
             q.lower <= value <= q.upper,
             f"{q.name} starts at {value:g} {q.unit}, outside [{q.lower:g}, {q.upper:g}]; give it in `initial`",
         )
+    plant.check(parameters, dict(zip(names(plant.states), x.tolist(), strict=False)))
     return x
+
+
+def _at_rest(model: System | ClosedLoop, parameters: ParameterSet, held: Mapping[str, float]) -> Array:
+    """The model at rest where the held outputs have these values; zeros where the plant knows no rest."""
+    plant = _plant(model)
+    if plant.rest_finder is None:
+        return np.zeros(len(model.states))
+    rest = plant.rest_finder(parameters, held)
+    x = np.array([rest.states.get(n, 0.0) for n in names(plant.states)])
+    if isinstance(model, System):
+        return x
+    return model.initial(parameters, x, command=rest.inputs.get(model.command.name, 0.0))
+
+
+def _plant(model: System | ClosedLoop) -> System:
+    return model.plant if isinstance(model, ClosedLoop) else model

@@ -21,11 +21,10 @@ from scipy import integrate, optimize
 from pneuopt.codegen import compiled
 from pneuopt.errors import ConvergenceError, ModelError, require
 from pneuopt.integration import Record
-from pneuopt.system import System, names
+from pneuopt.system import DIRECTION, System, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-DIRECTION = "friction.direction"
 MOST_EVENTS = 100_000
 LOOKS = 4  # a step
 

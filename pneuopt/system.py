@@ -9,14 +9,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.codegen import Pieces
 from pneuopt.errors import ConvergenceError, ModelError, check_known, require
+from pneuopt.guards import Checker, Guard
 from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.runge_kutta import rk4
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Symbols = Mapping[str, ca.SX]
 Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
 Update = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
+DIRECTION = "friction.direction"  # of Karnopp's friction: what a simulation switches
 
 
 class Log(NamedTuple):
@@ -96,6 +100,10 @@ class System:
         How this model starts from a log.
     rest_finder : RestFinder, optional
         How this model comes to rest.
+    checker : Checker, optional
+        Which of its numbers are impossible.
+    guards : tuple of Guard
+        What a simulation of it watches.
     """
 
     states: tuple[Quantity, ...]
@@ -105,9 +113,29 @@ class System:
     ode: ca.Function
     start_finder: StartFinder | None = None
     rest_finder: RestFinder | None = None
+    checker: Checker | None = None
+    guards: tuple[Guard, ...] = ()
 
     def __repr__(self) -> str:
         return describe(self)
+
+    def check(self, parameters: ParameterSet, start: Mapping[str, float] | None = None) -> None:
+        """Refuse what this plant cannot be.
+
+        Parameters
+        ----------
+        parameters : ParameterSet
+            A missing one counts with its default; others are not read.
+        start : mapping of state to value, optional
+            Where a simulation is to begin.
+
+        Raises
+        ------
+        InputError
+            If hardware is impossible or the start lies outside; the message names value, source and remedy.
+        """
+        if self.checker is not None:
+            self.checker(parameters, start)
 
     def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Candidates from which an identification can start.
@@ -139,9 +167,12 @@ class System:
 
         Raises
         ------
+        InputError
+            If the hardware is impossible.
         ConvergenceError
             If no equilibrium is found; the message names the state whose rate stays largest.
         """
+        self.check(p)
         guess = dict(guess or {})
         check_known("state", guess, names(self.states))
         scale = np.array([s.nominal for s in self.states])
@@ -175,7 +206,13 @@ class System:
         Returns
         -------
         Linearisation
+
+        Raises
+        ------
+        InputError
+            If the hardware is impossible.
         """
+        self.check(p)
         matrices = self._jacobian(0, x, self._inputs(u), vector(self.parameters, p))
         A, B, C, D = (np.array(m) for m in matrices)
         return Linearisation(A, B, C, D, names(self.states), names(self.inputs), names(self.outputs))
@@ -207,6 +244,8 @@ class DiscreteSystem:
         Integration steps from one sample to the next.
     sample_time : float, optional
         The controller's sample time [s]; None if any grid will do.
+    ode : casadi.Function, optional
+        ``(t, x, u, p) -> (xdot, y)``, where `step` is its RK4 step.
     """
 
     states: tuple[Quantity, ...]
@@ -217,6 +256,12 @@ class DiscreteSystem:
     update: ca.Function | None = None
     substeps: int = 1
     sample_time: float | None = None
+    ode: ca.Function | None = None
+
+    @property
+    def pieces(self) -> Pieces:
+        """The Functions, as compiled runs take them."""
+        return Pieces(self.step, self.update, self.ode)
 
     def __repr__(self) -> str:
         return describe(self)
@@ -300,13 +345,10 @@ def discretise(system: System, substeps: int = 1) -> DiscreteSystem:
     n = {k: system.ode.size1_in(i) for i, k in enumerate("txup")}
     t, h = ca.SX.sym("t"), ca.SX.sym("h")
     x, u, p = (ca.SX.sym(k, n[k]) for k in "xup")
-    k1, y = system.ode(t, x, u, p)
-    k2 = system.ode(t + h / 2, x + h / 2 * k1, u, p)[0]
-    k3 = system.ode(t + h / 2, x + h / 2 * k2, u, p)[0]
-    k4 = system.ode(t + h, x + h * k3, u, p)[0]
-    x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    step = ca.Function("step", [t, h, x, u, p], [x_next, y], ["t", "h", "x", "u", "p"], ["x_next", "y"])
-    return DiscreteSystem(system.states, system.inputs, system.outputs, system.parameters, step, None, substeps)
+    results = [rk4(lambda at, z: system.ode(at, z, u, p)[0], t, h, x), system.ode(t, x, u, p)[1]]
+    step = ca.Function("step", [t, h, x, u, p], results, ["t", "h", "x", "u", "p"], ["x_next", "y"], {"cse": True})
+    own = (system.states, system.inputs, system.outputs, system.parameters)
+    return DiscreteSystem(*own, step, substeps=substeps, ode=system.ode)
 
 
 def symbols(quantities: Sequence[Quantity]) -> dict[str, ca.SX]:

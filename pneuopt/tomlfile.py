@@ -3,8 +3,9 @@
 A value is "32 mm", or { value = "40 N", lower = "5 N", upper = "90 N", free = true }.
 """
 
+import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from pneuopt.parameters import Parameter
 from pneuopt.units import read_value, write_value
 
 _FLAGS = ("free", "log", "per_log")
+_HEAD = re.compile(r"\s*\[+([^\[\]]+)\]")
+_KEY = re.compile(r"\s*([\w\"'. -]+?)\s*=")
 _FIELDS = ("value", "lower", "upper", *_FLAGS, "source")
 
 
@@ -45,6 +48,42 @@ def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
         raise InputError(f"{path}: not a text file in UTF-8; save it so") from None
     except TOMLKitError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where things stand in a TOML file, for messages; printed, it is the file's name.
+
+    Parameters
+    ----------
+    path : str or Path
+    text : str
+        What the file holds.
+    """
+
+    path: str | Path
+    text: str
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def at(self, section: str, key: str = "") -> str:
+        r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it says no such.
+
+        Examples
+        --------
+        >>> Places("drive.toml", '[valve]\nleak = 0.01  # tight').at("valve", "leak")
+        'drive.toml:2'
+        """
+        head: tuple[str, ...] = ()
+        wanted = (section, key) if key else (section,)
+        for number, line in enumerate(self.text.splitlines(), 1):
+            entry, table = _KEY.match(line), _HEAD.match(line)
+            head = _bare(table[1]) if table else head
+            said = head + _bare(entry[1]) if entry and not table else head
+            if said[: len(wanted)] == wanted:
+                return f"{self.path}:{number}"
+        return str(self.path) if not key else self.at(section)
 
 
 def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
@@ -119,6 +158,11 @@ def inline_table(entries: Mapping[Any, Any]) -> InlineTable:
     table = tomlkit.inline_table()
     table.update(plain(entries))
     return table
+
+
+def _bare(dotted: str) -> tuple[str, ...]:
+    """The parts of a dotted key, unquoted."""
+    return tuple(part.strip().strip("\"'") for part in dotted.split("."))
 
 
 def _differ(field: str, found: Parameter, given: Parameter) -> bool:

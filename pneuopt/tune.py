@@ -5,6 +5,7 @@ A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or s
 """
 
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -12,17 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.certify import check_labels, evaluate
+from pneuopt.checks import check_smooth
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import margins
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, require
+from pneuopt.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.provenance import provenance
-from pneuopt.requirements import PeakControl, Requirement, Specification, name, read, specify
-from pneuopt.simulate import simulate
-from pneuopt.trajectories import Trajectory
-from pneuopt.tuning.candidates import Simulator, Space, Tell, cut, inputs, measure, spacing, span, worst
+from pneuopt.requirements import MaxSensitivity, PeakControl, Requirement, Specification, name, read, specify
+from pneuopt.tuning.candidates import Simulator, Space, Tell, span, worst
 from pneuopt.tuning.screening import Screening, screen
 from pneuopt.tuning.two_phase import TwoPhase, is_linear, solve_two_phase
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Method = TwoPhase | Screening
 ATTEMPTS = 3  # margins tried, each twice the one before
+CHECKED = 20  # printed gains whose sensitivity is computed at once
 TRIED = 5  # printed gains certified at each margin, at most
 GRAZING = 0.01  # relative excess of the certified over the claimed settling time
 PEAKS_EXACT, PEAKS_SCREENED = 1 / 300, 1 / 5  # of the margin, for peak control and sensitivity
-FINE = 4  # points of the certifying record a sample of the search's
 UNFELT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # by a linear loop's average
 SHOWN = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity")
 
@@ -58,7 +58,7 @@ class TuningResult:
     stats : mapping of str to float
         "seconds", "deviation.SettlingTime" and so on (the largest |claimed - certified|), and the search's own:
         "margin", "starts", "starts_converged", "starts_agreeing", "optimum" (before rounding), "simulations"; where
-        nothing is certified "rejected.pid.Kp" and so on.
+        nothing is certified "rejected.pid.Kp" and so on, and "contacts" where a response ran into an end stop.
     provenance : mapping of str to str
     """
 
@@ -92,7 +92,7 @@ def tune(
     ----------
     loop : ClosedLoop
     references : Step or sequence of Step
-        Each from rest; the worst counts.
+        Each from rest, or from steady motion, and with a label of its own; the worst counts.
     parameters : ParameterSet
         Of plant, controller and dither. The free ones ("pid.*", "dither.*") are tuned and need two finite bounds each.
     minimise : Requirement, or mapping of Requirement to weight
@@ -130,9 +130,11 @@ def tune(
     (True, True)
     """
     begun = time.perf_counter()
+    check_smooth(loop.plant)
     spec, steps = specify(minimise, subject_to), [references] if isinstance(references, Step) else list(references)
     spec = spec.without(PeakControl) if _clip(loop, parameters) <= spec.limit(PeakControl) else spec
     require(len(steps) > 0, "no reference to tune for; give a Step")
+    check_labels(steps)
     space = span(loop, parameters)
     linear = is_linear(loop)
     method = method or (TwoPhase() if linear else Screening())
@@ -161,73 +163,6 @@ def _clip(loop: ClosedLoop, parameters: ParameterSet) -> float:
     """The largest command that the controller's own limits let through."""
     full = loop.parameters | parameters
     return max(abs(full.value("pid.lower")), abs(full.value("pid.upper"))) if loop.pid.limits else np.inf
-
-
-def evaluate(
-    loop: ClosedLoop, references: Step | Sequence[Step], parameters: ParameterSet, *, band: float = 0.02
-) -> "pd.DataFrame":
-    """Certified metrics: by the tight independent simulation, at the given parameters.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : Step or sequence of Step
-        Each from rest.
-    parameters : ParameterSet
-    band : float
-        Half width of the settling band around the reference, a fraction of the step.
-
-    Returns
-    -------
-    DataFrame
-        A row a metric, a column a reference ("0 to 0.25"): those of `step_metrics`, then MaxSensitivity, GainMargin
-        and PhaseMargin [deg] about the state in which the response ends.
-
-    Raises
-    ------
-    ConvergenceError
-        If the simulation stops.
-    """
-    import pandas as pd
-
-    steps = [references] if isinstance(references, Step) else list(references)
-    return pd.DataFrame({_label(r): _certified(loop, r, parameters, band) for r in steps})
-
-
-def respond(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory:
-    """The response that `evaluate` measures: simulated tightly from rest, on a grid finer than the search's.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    reference : Step
-    parameters : ParameterSet
-
-    Returns
-    -------
-    Trajectory
-        States and outputs of the loop.
-    """
-    run = inputs(loop, reference, spacing(loop, reference))
-    fine = np.linspace(run.t[0], run.t[-1], FINE * (len(run) - 1) + 1)
-    start = loop.initial(parameters, reference=reference.initial)
-    return simulate(loop, run, parameters, initial=start, t_out=fine)
-
-
-def _label(reference: Step) -> str:
-    return f"{reference.initial:g} to {reference.final:g}"
-
-
-def _certified(loop: ClosedLoop, reference: Step, parameters: ParameterSet, band: float) -> dict[str, float]:
-    response = respond(loop, reference, parameters)
-    metrics = measure(loop, parameters, reference, response, band)
-    x = np.array([response[q.name][-1] for q in loop.plant.states])
-    robust = margins(cut(loop, parameters, x, float(response["control"][-1])))
-    return metrics | {
-        "MaxSensitivity": robust.max_sensitivity if robust.stable else np.inf,
-        "GainMargin": robust.gain_margin,
-        "PhaseMargin": robust.phase_margin,
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +198,7 @@ class _Search:
                 return result or self._result(simulator, found, found.point)
             for point in self._printed(simulator, found.point, margin):
                 result = self._result(simulator, found, point)
-                if result.status.converged:
+                if result.status.converged or "contacts" in result.stats:
                     return result
             start = found.point
         assert result is not None
@@ -309,11 +244,18 @@ class _Search:
         if self.method.digits is None:
             return [point]
         spec = self._tightened(margin / 2)
-        points = self.space.printed(point, self.method.digits, 1)
-        found = simulator.values(points, spec)
-        good = [(spec.objective(v), k) for k, v in enumerate(found) if not spec.violated(v)]
-        ranked = [points[k] for merit, k in sorted(good) if np.isfinite(merit)]
-        return ranked[:TRIED] or [self.space.printed(point, self.method.digits)[0]]
+        points, kept = self.space.printed(point, self.method.digits, 1), list[Array]()
+        quick = spec if spec.weight(MaxSensitivity) else spec.without(MaxSensitivity)  # the dear one: of the best only
+        found = simulator.values(points, quick)
+        good = sorted((quick.objective(v), k) for k, v in enumerate(found) if not quick.violated(v))
+        ranked = points[[k for merit, k in good if np.isfinite(merit)]]
+        for first in range(0, len(ranked), CHECKED):
+            batch = ranked[first : first + CHECKED]
+            found = simulator.values(batch, spec)
+            kept += [near for near, v in zip(batch, found, strict=True) if not spec.violated(v)]
+            if len(kept) >= TRIED:
+                break
+        return kept[:TRIED] or [self.space.printed(point, self.method.digits)[0]]
 
     def _result(self, simulator: Simulator, found: _Found, point: Array) -> TuningResult:
         import pandas as pd
@@ -321,15 +263,17 @@ class _Search:
         parameters = self.space.filled(point)
         shown = [*SHOWN, "Ripple"] if self.loop.dither_period(parameters) else list(SHOWN)
         rows = zip(self.references, simulator.table(point, self.spec), strict=True)
-        claimed = pd.DataFrame({_label(r): metrics for r, metrics in rows}).loc[shown]
+        claimed = pd.DataFrame({r.label: metrics for r, metrics in rows}).loc[shown]
         try:
-            certified = evaluate(self.loop, self.references, parameters, band=self.spec.band).loc[shown]
-            status = self._verdict(found, claimed, certified)
+            certified, met = self._certified(parameters)
+            certified = certified.loc[shown]
+            status = _outside(met) if met else self._verdict(found, claimed, certified)
         except ConvergenceError as error:
-            certified = claimed * np.nan
+            certified, met = claimed * np.nan, []
             status = Status(Code.NOT_CERTIFIED, str(error))
         deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
         values = dict(zip(self.space.names, point.tolist(), strict=True))
+        contacts = {"contacts": float(len(met))} if met else {}
         rejected = {} if status.converged else {f"rejected.{n}": v for n, v in values.items()}
         return TuningResult(
             self.space.parameters.with_values(values) if status.converged else self.space.parameters,
@@ -337,9 +281,16 @@ class _Search:
             certified,
             found.active,
             status,
-            {**found.stats, **deviation, **rejected},
+            {**found.stats, **deviation, **contacts, **rejected},
             provenance(self.method, *self.spec.weights, *self.spec.limits, *self.references),
         )
+
+    def _certified(self, parameters: ParameterSet) -> tuple["pd.DataFrame", list[str]]:
+        """The certificate, and what the responses ran into."""
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", PhysicsWarning)
+            certified = evaluate(self.loop, self.references, parameters, band=self.spec.band)
+        return certified, [str(w.message) for w in told if issubclass(w.category, PhysicsWarning)]
 
     def _verdict(self, found: _Found, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
         """Whether the independent simulation confirms the search."""
@@ -367,6 +318,12 @@ class _Search:
         return Status(
             Code.CONVERGED, f"certified objective {ours:.6g}, claimed {self.spec.objective(claim):.6g}{agreeing}"
         )
+
+
+def _outside(met: Sequence[str]) -> Status:
+    """Of a response that ran into an end stop or emptied a chamber: whatever it shows, the drive does not."""
+    remedy = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
+    return Status(Code.NOT_CERTIFIED, f"{'; '.join(dict.fromkeys(met))}; {remedy}")
 
 
 def _screened(spec: Specification, values: Mapping[str, float]) -> Status:

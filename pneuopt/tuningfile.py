@@ -256,21 +256,24 @@ def _references(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Ste
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
     require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
-    steps = [_step(e, loop.feedback.unit, f"{path}: [[reference]] {k}") for k, e in enumerate(entries, 1)]
-    ends = [(s.initial, s.final) for s in steps]
-    require(
-        len(set(ends)) == len(ends), f"{path}: two references step between the same values; tables tell them by that"
-    )
+    steps = [_step(e, loop, f"{path}: [[reference]] {k}") for k, e in enumerate(entries, 1)]
+    labels = {s.label for s in steps}
+    require(len(labels) == len(steps), f"{path}: two references step between the same values; tables tell them by that")
     return tuple(steps)
 
 
-def _step(entry: Mapping[str, Any], unit: str, where: str) -> Step:
+def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
+    unit, outputs = loop.feedback.unit, {q.name: q.unit for q in loop.plant.outputs}
     units = {"step": unit.partition("(")[0], "initial": unit, "at": "s", "horizon": "s"}
-    check_known("key", entry, units, where)
+    check_known("key", entry, (*units, "start"), where)
+    start = entry.get("start", {})
+    require(isinstance(start, dict), f'{where} start: write start = {{ position = "250 mm" }}')
+    check_known("output", start, outputs, f"{where} start")
     for key in ("step", "horizon"):
         require(key in entry, f"{where} says no {key}")
     read = {("size" if k == "step" else k): _value(entry, k, units[k], where) for k in units if k in entry}
-    return _checked(lambda: Step(**read), where)
+    begun = {n: _value(start, n, outputs[n], f"{where} start") for n in start}
+    return _checked(lambda: Step(start=begun, **read), where)
 
 
 def _minimise(said: Sections, path: str | Path) -> dict[Requirement, float]:

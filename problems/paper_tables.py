@@ -27,6 +27,7 @@ from claims import Claim, arguments, finish, frame
 from numpy.typing import NDArray
 from scipy import optimize, signal
 
+from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import Margins, frequency_response, margins
@@ -38,7 +39,7 @@ from pneuopt.parameters import ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
 from pneuopt.simulate import simulate
 from pneuopt.trajectories import Trajectory
-from pneuopt.tune import TuningResult, evaluate, tune
+from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 if TYPE_CHECKING:

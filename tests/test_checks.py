@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pneuopt.checks import check_content
 from pneuopt.errors import InputError, LogError, ModelError, UnknownNameError
 from pneuopt.experiments import Experiment
 from pneuopt.identify import identify
@@ -17,9 +18,9 @@ RIG = ForceDrive(Coulomb())
 
 
 def log_with(**columns: Array | None) -> Experiment:
-    """100 ms of a drive at rest, with other columns, or without those that are None."""
+    """100 ms of a drive that coasts, with other columns, or without those that are None."""
     t = np.linspace(0, 0.1, 100, endpoint=False)
-    position = NOISE * np.random.default_rng(0).standard_normal(100)
+    position = 0.01 * t + NOISE * np.random.default_rng(0).standard_normal(100)
     given = {"force": np.zeros(100), "position": position, **columns}
     return Experiment(Trajectory(t, {n: c for n, c in given.items() if c is not None}), name="run 0")
 
@@ -127,3 +128,18 @@ def test_a_sensors_noise_is_shared_between_logs() -> None:
     )
     noise = result.fit["noise"]
     assert noise.iloc[0] == noise.iloc[1] == pytest.approx(NOISE, rel=0.3)
+
+
+def test_a_log_that_contradicts_itself_is_refused() -> None:
+    t = np.linspace(0, 2, 2000, endpoint=False)
+    swing = {"position": 0.1 * np.sin(6 * t), "force": -(30 * np.sign(np.cos(6 * t)) + 20 * np.cos(6 * t))}
+    log = Experiment(Trajectory(t, swing), name="run")
+    with pytest.raises(LogError, match=r"run: the force brakes the motion on balance .* change the sign of 'force'"):
+        identify(RIG.system(), [log], RIG.parameters.freed("friction.coulomb"))
+
+
+def test_a_still_window_among_moving_ones_is_no_fault() -> None:
+    still = log_with(position=np.full(100, 0.5))
+    check_content([log_with(), replace(still, name="b")])
+    with pytest.raises(LogError, match="b: 'position' is constant"):
+        check_content([replace(still, name="b")])

@@ -194,7 +194,7 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
     "unit missing": (
         IDENTIFY,
         edit("drive.toml", '"40 N"', '"40"'),
-        "drive.toml: [friction] coulomb: '40' has no unit",
+        "drive.toml:8: [friction] coulomb: '40' has no unit",
     ),
     "unit wrong": (
         TUNE,
@@ -204,7 +204,7 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
     "bare bar": (
         IDENTIFY,
         lambda folder: rewrite(folder, "drive.toml", DRIVE + PRESSURE),
-        "drive.toml: [ambient] pressure: a pressure level in 'bar' may be absolute or gauge; write \"bar(a)\" or",
+        "drive.toml:13: [ambient] pressure: a pressure level in 'bar' may be absolute or gauge; write \"bar(a)\" or",
     ),
     "unknown key": (
         TUNE,
@@ -230,7 +230,7 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
     "start out of bounds": (
         IDENTIFY,
         edit("drive.toml", '"5 kg"', '"50 kg"'),
-        "drive.toml: [load] mass: value 50 kg lies outside its bounds [1, 20]; move the value or the bounds",
+        "drive.toml:5: [load] mass: value 50 kg lies outside its bounds [1, 20]; move the value or the bounds",
     ),
     "too short": (IDENTIFY, cut, "run_01.csv: 7 samples are too few; at least 10 are needed"),
     "missing file": (
@@ -366,3 +366,34 @@ def test_ctrl_c_ends_a_real_process_with_130(folder: Path) -> None:
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (130, "interrupted: no file was left half-written\n")
     assert not Path("tuned.toml").exists()
+
+
+CYLINDER = '[drive]\nkind = "pneumatic"\n[cylinder]\nstart = "80 %"\n[friction]\nmodel = "stribeck"\n'
+SPEED_LOOP = """[pid]
+sample_time = "1 ms"
+Kp = "2 V*s/m"
+Ki = "20 V/m"
+limits = ["-5 V", "5 V"]
+[[reference]]
+step = "0.2 m/s"
+horizon = "0.4 s"
+"""
+
+
+def test_an_end_stop_is_told_in_one_line(folder: Path) -> None:
+    """From 160 of 200 mm at 0.2 m/s, for longer than 0.2 s; the command goes on."""
+    (folder / "cylinder.toml").write_text(CYLINDER, encoding="utf-8")
+    (folder / "speed.toml").write_text(SPEED_LOOP, encoding="utf-8")
+    result = run("simulate cylinder.toml speed.toml -o steps.csv")
+    assert result.exit_code == 0
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("warning: the piston reached the front end stop (position 199.9 mm) at t = 0.2")
+    assert line.endswith("from there the response is the stop's")
+
+
+def test_impossible_hardware_is_refused_with_its_line(folder: Path) -> None:
+    (folder / "cylinder.toml").write_text(CYLINDER.replace('"80 %"', '"80 %"\nrod = "40 mm"'), encoding="utf-8")
+    (folder / "speed.toml").write_text(SPEED_LOOP, encoding="utf-8")
+    result = run("simulate cylinder.toml speed.toml")
+    assert result.exit_code == 2
+    assert result.stderr.startswith('error: cylinder.toml:5: [cylinder] rod = "40 mm" is impossible; a rod is thinner')

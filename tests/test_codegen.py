@@ -1,17 +1,11 @@
-import logging
-import os
-import re
-import shutil
-import stat
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pneuopt import codegen
+from pneuopt import codegen, compiler
 from pneuopt.codegen import Pieces, Rollout, compiled
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
@@ -22,22 +16,8 @@ from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
 from pneuopt.system import DiscreteSystem, discretise, vector
 from pneuopt.trajectories import Array
 
-needs_compiler = pytest.mark.skipif(codegen.compiler() is None, reason="no C compiler")
-CACHES = (codegen._build, codegen._say_once, codegen._compiler_version, codegen._temporary_folder)
-
-
-def forget() -> None:
-    for cache in CACHES:
-        cache.cache_clear()
-
-
-@pytest.fixture
-def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """Nothing is remembered of what was built or said, before and after."""
-    forget()
-    yield monkeypatch
-    monkeypatch.undo()
-    forget()
+Forget = Callable[[], None]
+needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="no C compiler")
 
 
 def loop() -> DiscreteSystem:
@@ -74,7 +54,7 @@ class Case:
         self.t = 0.7 + 2e-3 * np.tile(np.arange(n), (m, 1))
 
     def rollout(self, wrt: tuple[int, ...] = (), start: bool = False, threads: int | None = 1) -> Rollout:
-        return Rollout(Pieces(self.system.step, self.system.update), wrt, start, threads)
+        return Rollout(self.system.pieces, wrt, start, threads)
 
     def run(self, rollout: Rollout, **changed: Array) -> codegen.Run:
         given = {"x0": self.x0, "u": self.u, "p": self.p, "t": self.t, "h": self.h, **changed}
@@ -137,22 +117,74 @@ def test_sensitivities_are_the_central_differences(name: str) -> None:
             assert_allclose(found, exact, rtol=2e-4, atol=2e-4 * size + 1e-7, err_msg=f"{which}[{index}]")
 
 
-@needs_compiler
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_machine_code_and_the_casadi_vm_agree_to_rounding(name: str, fresh: pytest.MonkeyPatch) -> None:
-    case = Case(name)
-    wrt = (0, 2, case.p.shape[1] - 1)
-    fast = case.rollout(wrt, start=True)
-    assert fast.is_compiled
-    forget()
-    fresh.setenv("PNEUOPT_CC", "")
-    slow = case.rollout(wrt, start=True)
-    assert not slow.is_compiled
-    a, b = case.run(fast), case.run(slow)
+def assert_alike(a: codegen.Run, b: codegen.Run) -> None:
     for field in ("y", "x_end", "x", "dy", "dx_end"):
         left, right = getattr(a, field), getattr(b, field)
         assert left.shape == right.shape, field
         assert_allclose(left, right, rtol=1e-9, atol=1e-9 * np.abs(right).max(initial=1e-3), err_msg=field)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_machine_code_and_the_casadi_vm_agree_to_rounding(name: str) -> None:
+    case = Case(name)
+    wrt = (0, 2, case.p.shape[1] - 1)
+    fast = case.rollout(wrt, start=True)
+    assert fast.is_compiled
+    slow = Rollout(case.system.pieces, wrt, start=True, lanes=0)
+    assert not slow.is_compiled
+    assert_alike(case.run(fast), case.run(slow))
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("lanes", [1, 2, 8])
+def test_the_number_of_lanes_changes_nothing(lanes: int, name: str) -> None:
+    case = Case(name, m=9)
+    wrt = (0, 2, case.p.shape[1] - 1)
+    usual = case.rollout(wrt, start=True)
+    other = Rollout(case.system.pieces, wrt, start=True, threads=1, lanes=lanes)
+    assert other.lanes == lanes
+    assert_alike(case.run(other), case.run(usual))
+
+
+@needs_compiler
+def test_lanes_are_as_many_as_the_cpu_has() -> None:
+    flags = compiler._cpu().split()
+    expected = 8 if "avx512f" in flags else 4 if "avx" in flags else 2
+    assert Case("stribeck").rollout().lanes == expected
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 7, 8, 9])
+def test_a_segment_does_not_depend_on_its_neighbours(m: int) -> None:
+    case = Case("sampled loop", m=9)
+    rollout = case.rollout((0, 1), start=True)
+    whole = case.run(rollout)
+    fields = {k: getattr(case, k)[9 - m :] for k in ("x0", "u", "p", "t", "h")}
+    part = case.run(rollout, **fields)
+    for field in ("y", "x_end", "x", "dy", "dx_end"):
+        assert_array_equal(getattr(part, field), getattr(whole, field)[9 - m :], err_msg=field)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_what_is_not_a_number_stays_in_its_segment(name: str) -> None:
+    case = Case(name, m=9)
+    rollout = case.rollout((0,), start=True)
+    sound = case.run(rollout)
+    case.x0[2], case.p[6] = np.nan, np.inf
+    with np.errstate(all="ignore"):
+        sick = case.run(rollout)
+    others = [k for k in range(9) if k not in (2, 6)]
+    for field in ("y", "x_end", "x", "dy", "dx_end"):
+        assert_array_equal(getattr(sick, field)[others], getattr(sound, field)[others], err_msg=field)
+    assert not np.isfinite(sick.y[6]).all()
+
+
+def test_stage_by_stage_gives_the_sensitivities_of_the_step_as_a_whole() -> None:
+    case = Case("lugre")
+    wrt = tuple(range(case.p.shape[1]))
+    whole = Rollout(Pieces(case.system.step, case.system.update), wrt, start=True, threads=1)
+    assert_alike(case.run(case.rollout(wrt, start=True)), case.run(whole))
 
 
 @pytest.mark.parametrize("threads", [2, 3, 16])
@@ -164,9 +196,11 @@ def test_threads_change_nothing(threads: int) -> None:
 
 
 @pytest.mark.parametrize("cc", [None, ""])
-def test_one_parameter_vector_serves_all_segments(cc: str | None, fresh: pytest.MonkeyPatch) -> None:
+def test_one_parameter_vector_serves_all_segments(
+    cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
     if cc is not None:
-        fresh.setenv("PNEUOPT_CC", cc)
+        monkeypatch.setenv("PNEUOPT_CC", cc)
     case = Case("stribeck")
     rollout = case.rollout((0,))
     shared = case.run(rollout, p=case.p[0])
@@ -211,9 +245,11 @@ def mixed() -> ca.Function:
 
 
 @pytest.mark.parametrize("cc", [None, ""])
-def test_compiled_takes_scalars_vectors_and_matrices(cc: str | None, fresh: pytest.MonkeyPatch) -> None:
+def test_compiled_takes_scalars_vectors_and_matrices(
+    cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
     if cc is not None:
-        fresh.setenv("PNEUOPT_CC", cc)
+        monkeypatch.setenv("PNEUOPT_CC", cc)
     B, c = np.arange(6.0).reshape(2, 3), np.array([1.0, -1.0, 2.0])
     product, turned, sparse, nothing = compiled(mixed())(2.0, B, c)
     assert_allclose(product, 2 * B @ c)
@@ -233,90 +269,3 @@ def test_results_are_the_callers_own() -> None:
 def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers() -> None:
     with pytest.raises(ModelError, match="argument 2 has 2 numbers, expected 3"):
         compiled(mixed())(1.0, np.ones((2, 3)), np.ones(2))
-
-
-def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [r.getMessage() for r in caplog.records if r.name == "pneuopt" and r.levelno >= logging.WARNING]
-
-
-def test_without_a_compiler_one_line_says_so(fresh: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    fresh.setenv("PNEUOPT_CC", "")
-    for name in ("stribeck", "lugre"):
-        assert not Case(name).rollout().is_compiled
-    compiled(mixed())
-    assert len(warnings_in(caplog)) == 1
-    assert "no C compiler found" in warnings_in(caplog)[0]
-
-
-def script(folder: Path, text: str) -> str:
-    path = folder / "cc"
-    path.write_text(text)
-    path.chmod(path.stat().st_mode | stat.S_IXUSR)
-    return str(path)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="the broken compilers here are shell scripts")
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("#!/bin/sh\necho 'model.c: no licence' >&2; exit 1\n", "no licence"),
-        ("#!/bin/sh\nexit 0\n", "No such file"),
-        ("not a program", "Exec format error"),
-        (
-            '#!/bin/sh\nwhile [ "$1" != -o ]; do shift || exit 0; done; echo junk > "$2"\n',
-            "invalid ELF header|too short",
-        ),
-    ],
-)
-def test_a_broken_compiler_is_a_warning_not_a_crash(
-    text: str, reason: str, fresh: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    fresh.setenv("PNEUOPT_CC", script(tmp_path, text))
-    fresh.setenv("PNEUOPT_CACHE", str(tmp_path / "cache"))
-    case = Case("stribeck")
-    slow, again = case.rollout(), case.rollout()
-    assert not slow.is_compiled
-    assert not again.is_compiled
-    assert_allclose(case.run(slow).y, by_hand(case)[0])
-    (warning,) = warnings_in(caplog)
-    assert "failed, the CasADi VM runs instead" in warning
-    assert re.search(reason, warning), warning
-
-
-def test_a_compiler_that_is_not_there_counts_as_none(fresh: pytest.MonkeyPatch) -> None:
-    fresh.setenv("PNEUOPT_CC", "no-such-compiler")
-    assert codegen.compiler() is None
-
-
-@needs_compiler
-def test_an_unwritable_cache_is_a_warning(
-    fresh: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    fresh.setenv("PNEUOPT_CACHE", str(blocked / "cache"))
-    case = Case("stribeck")
-    assert case.rollout().is_compiled
-    assert case.rollout((0,)).is_compiled
-    assert len(warnings_in(caplog)) == 1
-    assert "cannot be written" in warnings_in(caplog)[0]
-    shutil.rmtree(codegen.cache_directory())
-
-
-@needs_compiler
-def test_a_cached_binary_is_loaded_and_a_damaged_one_built_anew(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    fresh.setenv("PNEUOPT_CACHE", str(tmp_path))
-    assert Case("stribeck").rollout().is_compiled
-    (binary,) = tmp_path.iterdir()
-    built = binary.stat().st_mtime_ns
-    forget()
-    assert Case("stribeck").rollout().is_compiled
-    assert binary.stat().st_mtime_ns == built
-    forget()
-    damaged = tmp_path / "damaged"
-    damaged.mkdir()
-    shutil.copy(binary, damaged / binary.name)  # the loaded one must not be touched
-    (damaged / binary.name).write_bytes(b"junk")
-    fresh.setenv("PNEUOPT_CACHE", str(damaged))
-    assert Case("stribeck").rollout().is_compiled
-    assert (damaged / binary.name).stat().st_size > 1000

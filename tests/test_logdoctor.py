@@ -83,13 +83,21 @@ def test_absolute_read_as_gauge_exceeds_the_supply() -> None:
     assert any("above the supply of 4.20 bar(a)" in message for message in told)
 
 
-@pytest.mark.parametrize("motion", ["constant", "noise"])
-def test_a_log_without_motion_is_refused(motion: str) -> None:
-    still = np.full(T.size, 0.1) + (1e-5 * np.random.default_rng(2).standard_normal(T.size) if motion == "noise" else 0)
-    log = Experiment(Trajectory(T, {"position": still, "force": np.sin(T)}), {"position": 1e-5})
-    told = faults(log)
+@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("size", [0.0, 1e-5])
+def test_a_log_without_motion_is_refused(size: float, declared: bool) -> None:
+    still = 0.1 + size * np.random.default_rng(2).standard_normal(T.size)
+    noise = {"position": 1e-5} if declared else {}
+    told = faults(Experiment(Trajectory(T, {"position": still, "force": np.sin(T)}), noise))
     assert len(told) == 1
     assert "motion" in told[0]
+
+
+def test_a_constant_speed_is_motion_and_zero_is_none() -> None:
+    """A friction rig may well run at one speed."""
+    log = {"speed": np.full(T.size, 0.1), "force": 30 + np.random.default_rng(0).standard_normal(T.size)}
+    assert faults(Experiment(Trajectory(T, log))) == []
+    assert len(faults(Experiment(Trajectory(T, {**log, "speed": np.zeros(T.size)})))) == 1
 
 
 def test_slow_creep_is_motion() -> None:

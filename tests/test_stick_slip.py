@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from pneuopt.codegen import compiler
+from pneuopt.compiler import compiler
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -23,8 +23,8 @@ from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.simulate import StickSlipResult, simulate, simulate_stick_slip
-from pneuopt.stick_slip import DIRECTION, EventKind
-from pneuopt.system import System, define
+from pneuopt.stick_slip import EventKind
+from pneuopt.system import DIRECTION, System, define
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]

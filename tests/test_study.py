@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -28,7 +29,6 @@ from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.study import INTERRUPTED, grid, sweep
 from pneuopt.system import System, discretise
-from pneuopt.tune import evaluate
 
 RIG = ParameterSet(
     {

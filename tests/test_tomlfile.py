@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from pneuopt.errors import InputError
-from pneuopt.tomlfile import read_toml
+from pneuopt.tomlfile import Places, read_toml
 
 
 def written(folder: Path, text: str, name: str = "drive.toml") -> Path:
@@ -22,3 +22,28 @@ def test_a_syntax_error_names_file_and_line(tmp_path: Path) -> None:
     (tmp_path / "latin.toml").write_bytes("a = 'µ'".encode("latin-1"))
     with pytest.raises(InputError, match="UTF-8"):
         read_toml(tmp_path / "latin.toml")
+
+
+def test_places_are_found_whatever_the_style_of_the_table() -> None:
+    text = """# a drive
+[cylinder] # of mine
+  rod = { value = "4 mm", lower = "1 mm" }
+"bore" = "32 mm"
+[valve]
+rod = 2
+leak.lower = 0
+"""
+    places = Places("drive.toml", text)
+    found = {
+        ("cylinder", "rod"): 3,
+        ("cylinder", "bore"): 4,
+        ("valve", "rod"): 6,
+        ("valve", "leak"): 7,
+        ("valve", ""): 5,
+    }
+    assert {name: places.at(*name) for name in found} == {name: f"drive.toml:{line}" for name, line in found.items()}
+    assert places.at("valve", "span") == "drive.toml:5"
+    assert places.at("load", "mass") == str(places) == "drive.toml"
+    inline = 'load = { mass = "5 kg" }\nsupply.pressure = "6 bar(g)"'
+    assert Places("d", inline).at("load", "mass") == "d:1"
+    assert Places("d", inline).at("supply", "pressure") == "d:2"

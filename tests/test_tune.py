@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -16,9 +17,19 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.nlp.status import Code
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
-from pneuopt.tune import TuningResult, evaluate, tune
-from pneuopt.tuning.screening import Screening
+from pneuopt.requirements import (
+    MaxSensitivity,
+    Overshoot,
+    PeakControl,
+    Requirement,
+    SettlingTime,
+    Specification,
+    SteadyStateError,
+    specify,
+)
+from pneuopt.tune import TuningResult, tune
+from pneuopt.tuning.candidates import Simulator, span
+from pneuopt.tuning.screening import Screening, _Judge, screen
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
 
 STEP = Step(1.0)
@@ -260,3 +271,28 @@ def test_modes_too_fast_for_the_grid_are_refused() -> None:
     loop, parameters = benchmark()
     with pytest.raises(InputError, match=r"raise the lower one of pid\.Tf"):
         tune(loop, STEP, parameters.with_bounds({"pid.Tf": (1e-5, 0.05)}), minimise=SettlingTime())
+
+
+def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
+    """The points that cannot beat their rivals get a bound; the search finds what it found."""
+    loop, parameters = friction_loop()
+    space, references = span(loop, parameters), [Step(0.1, horizon=0.3)]
+    spec = specify(SettlingTime(), [Overshoot(0.05), MaxSensitivity(1.3)])
+    simulator, judged = Simulator(loop, references, space), list[int]()
+
+    class Counting:
+        def values(self, points: np.ndarray, asked: Specification) -> list[dict[str, float]]:
+            judged.append(len(points) * asked.concerns(MaxSensitivity))
+            return simulator.values(points, asked)
+
+    method = Screening(members=12, generations=3, refinements=0)
+    found, count = screen(Counting(), references, space, spec, method, space.start, lambda _: None)  # type: ignore[arg-type]
+    assert count == 12 * 4 * 4
+    assert sum(judged) < 0.7 * count
+
+    def plainly(judge: _Judge, unit: np.ndarray, rivals: np.ndarray) -> np.ndarray:
+        return judge(unit)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Judge, "race", plainly)
+        assert np.array_equal(found, screen(simulator, references, space, spec, method, space.start, lambda _: None)[0])

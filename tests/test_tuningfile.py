@@ -137,6 +137,15 @@ def test_the_loop_says_which_signals_where_the_plant_has_several(tmp_path: Path)
         read_tuning(written(tmp_path, text + signals.replace("position", "positon")), plant)
 
 
+def test_a_reference_may_start_elsewhere(tmp_path: Path) -> None:
+    path, drive = tmp_path / "tuning.toml", ForceDrive(Coulomb()).system()
+    text = (
+        '[pid]\nKp = "200 N*s/m"\n[[reference]]\nstep = "-0.1 m/s"\nhorizon = "1 s"\nstart = { position = "250 mm" }\n'
+    )
+    path.write_text(text + "[minimise]\nsettling_time = {}\n", encoding="utf-8")
+    assert read_tuning(path, drive).references == (Step(-0.1, start={"position": 0.25}),)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -160,6 +169,16 @@ def test_the_loop_says_which_signals_where_the_plant_has_several(tmp_path: Path)
         ('"160 Hz"', '"1000 rad/s"', "[dither] frequency: unit 'rad/s' does not measure 'Hz'; write it in Hz"),
         ("offset = ", "ofset = ", "[dither]: unknown key 'ofset'; did you mean 'offset'?"),
         ('waveform = "sine"', "analogue = 1", "[dither] analogue must be true or false"),
+        (
+            'horizon = "1 s"\n\n[[ref',
+            'horizon = "1 s"\nstart = "250 mm"\n[[ref',
+            '[[reference]] 1 start: write start = { position = "250 mm" }',
+        ),
+        (
+            'horizon = "1 s"\n\n[[ref',
+            'horizon = "1 s"\nstart = { positon = "250 mm" }\n[[ref',
+            "[[reference]] 1 start: unknown output 'positon'",
+        ),
         ("horizon", "horizn", "[[reference]] 1: unknown key 'horizn'; did you mean 'horizon'?"),
         ('horizon = "1 s"\n\n[[ref', "\n[[ref", "[[reference]] 1 says no horizon"),
         ('"0.2 m/s"\nhorizon', '"0 m/s"\nhorizon', "[[reference]] 1: Step: size must not be zero"),

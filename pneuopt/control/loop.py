@@ -15,9 +15,20 @@ from numpy.typing import NDArray
 
 from pneuopt.control.dither import Dither
 from pneuopt.control.pid import PID
+from pneuopt.control.rest import find_rest, sliding, wired
 from pneuopt.errors import ModelError, check_known, require
 from pneuopt.parameters import ParameterSet, Quantity
-from pneuopt.system import DiscreteSystem, Linearisation, Symbols, System, define, discretise, names, stacked, symbols
+from pneuopt.system import (
+    DiscreteSystem,
+    Linearisation,
+    Symbols,
+    System,
+    define,
+    discretise,
+    names,
+    stacked,
+    symbols,
+)
 
 Array = NDArray[np.float64]
 Signals = dict[str, ca.SX]
@@ -146,6 +157,7 @@ class ClosedLoop:
 
     def check(self, parameters: ParameterSet) -> None:
         """Refuse values that no loop can run with, whatever their bounds: `InputError` names the parameter."""
+        self.plant.check(parameters)
         value = dict(zip(self.parameters, self.numbers(parameters), strict=True))
         h = self.pid.sample_time
         if self.dither:
@@ -180,19 +192,23 @@ class ClosedLoop:
         *,
         reference: float = 0.0,
         command: float = 0.0,
+        start: Mapping[str, float] | None = None,
     ) -> Array:
-        """The loop at rest, before dither is switched on.
+        """The loop at rest, or in steady motion, before dither is switched on.
 
         Parameters
         ----------
         parameters : ParameterSet
         x_plant : array_like, shape (n_plant_states,), optional
             The plant's state. Without it the closed loop is solved for its equilibrium at `reference`, other inputs 0;
-            a plant that knows its rest stands there, and the controller takes over the command that holds it.
+            a plant that knows its rest stands there, or moves steadily, and the controller takes over the command that
+            keeps it so. A position on which nothing depends may move on.
         reference : float
             The reference so far [unit of the measured signal].
         command : float
             With `x_plant`: the command so far, which the controller takes over without a bump [unit of the command].
+        start : mapping of str to float, optional
+            Without `x_plant`: what else is known of the plant, by name, as for `Step`.
 
         Returns
         -------
@@ -201,15 +217,17 @@ class ClosedLoop:
         Raises
         ------
         ConvergenceError
-            If the closed loop has no equilibrium there (a position that moves, say); give `x_plant`.
+            If the closed loop has no equilibrium there (a spring that a motion loads, say); give `x_plant`.
         InputError
-            If a value cannot run (`check`), or the command at rest lies beyond the controller's limits.
+            If a value cannot run (`check`), the plant cannot move so, the command lies beyond the controller's limits,
+            or `start` names what this plant does not start from.
         """
         self.check(parameters)
+        parameters = sliding(self, parameters, reference)
         p = self.numbers(parameters)
         value = dict(zip(self.parameters, p, strict=True))
         if x_plant is None:
-            x, command = self._rest(parameters, reference)
+            x, command = find_rest(self, parameters, reference, start or {})
         else:
             x, shape = np.asarray(x_plant, dtype=float), (len(self.plant.states),)
             require(x.shape == shape, f"x_plant has shape {x.shape}, the plant's state has {shape}")
@@ -236,7 +254,7 @@ class ClosedLoop:
         """
         self.check(parameters)
         if x is None:
-            x, command = self._rest(parameters, 0.0)
+            x, command = find_rest(self, parameters, 0.0, {})
             u = {self.command.name: command, **(u or {})}
         plant = self.plant.linearise(x, u or {}, parameters)
         j, i = plant.inputs.index(self.command.name), plant.outputs.index(self.feedback.name)
@@ -289,27 +307,6 @@ class ClosedLoop:
         own = ("pid.integral", "pid.filter", "pid.hold")[: len(A)]
         return Linearisation(A, B, C, D, own, ("error",), ("control",))
 
-    def _rest(self, parameters: ParameterSet, reference: float) -> tuple[Array, float]:
-        """Plant state and command of the closed loop in equilibrium, without dither and clip."""
-        if self.plant.rest_finder is not None:
-            rest = self.plant.rest_finder(parameters, {self.feedback.name: reference})
-            x = np.array([rest.states.get(n, 0.0) for n in names(self.plant.states)])
-            return x, rest.inputs.get(self.command.name, 0.0)
-        integral = Quantity("pid.integral", self.command.unit, self.command.nominal)
-        p = self.numbers(parameters)
-        integrates = bool(p[list(self.parameters).index("pid.Ki")] != 0)
-        states = (*self.plant.states, *([integral] if integrates else []))
-        system = define(states, self.inputs, self.outputs, self.parameters, self._resting)
-        x = system.equilibrium({"reference": reference}, parameters)
-        u = [reference] + [0.0] * (len(system.inputs) - 1)
-        return x[: len(self.plant.states)], float(system.ode(0, x, u, p)[1][-1])
-
-    def _resting(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        y, r = self._measured(t, x, u, p), u["reference"]
-        command = p["pid.Kp"] * (p["pid.b"] * r - y) + x.get("pid.integral", 0.0)
-        xdot, outputs = self._plant(t, x, u, p, command)
-        return xdot | {n: p["pid.Ki"] * (r - y) for n in x if n == "pid.integral"}, outputs | {"control": command}
-
     def _continuous(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         rates, command = self.pid.rates(
             _part("pid", x), u["reference"], self._measured(t, x, u, p), self._dither(t, p), _part("pid", p)
@@ -336,13 +333,7 @@ class ClosedLoop:
         return self._plant(t, x, u, p, ca.SX(0))[1][self.feedback.name]
 
     def _plant(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
-        driven = {**u, self.command.name: command}
-        xs, us = (
-            ca.vertcat(*(v[n] for n in names(q))) for v, q in ((x, self.plant.states), (driven, self.plant.inputs))
-        )
-        xdot, y = self.plant.ode(t, xs, us, ca.vertcat(*(p[n] for n in self.plant.parameters)))
-        states, outputs = names(self.plant.states), names(self.plant.outputs)
-        return {n: xdot[k] for k, n in enumerate(states)}, {n: y[k] for k, n in enumerate(outputs)}
+        return wired(self.plant, self.command.name, t, x, u, p, command)
 
     @cached_property
     def _measure(self) -> ca.Function:

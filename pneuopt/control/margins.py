@@ -7,9 +7,10 @@ How a tuner limits the maximum sensitivity Ms::
     terms(p) >= 1 / Ms**2                                    # p in the order of loop.parameters: numbers, SX or MX
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from math import inf, nan
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,10 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
+from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import ModelError, require
 from pneuopt.parameters import ParameterSet
-from pneuopt.system import Array, Linearisation
+from pneuopt.system import Array, Linearisation, names
 
 ComplexArray = NDArray[np.complex128]
 
@@ -117,10 +119,7 @@ def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> Comple
     require(single, f"one input and one output expected, got D of shape {linearisation.D.shape}", ModelError)
     w = np.asarray(omega, dtype=float)
     require(bool(np.all(w > 0)), "frequencies must be positive [rad/s]")
-    resolvent = 1j * w[:, None, None] * np.eye(len(linearisation.A)) - linearisation.A
-    x = np.linalg.solve(resolvent, np.broadcast_to(linearisation.B.astype(complex), (len(w), *linearisation.B.shape)))
-    y: ComplexArray = np.asarray(linearisation.C @ x + linearisation.D, dtype=np.complex128)[:, 0, 0]
-    return y
+    return np.asarray(_solved(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0] + linearisation.D[0, 0])
 
 
 def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
@@ -169,14 +168,86 @@ def sensitivity_terms(
     require(not free, f"{', '.join(free)}: free, but the sensitivity takes the plant as fixed; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
     h = loop.pid.sample_time or 0.0
-    P = frequency_response(loop.linear_plant(parameters, x), w) * (1 - 0.25j * w * h) / (1 + 0.25j * w * h)
+    P = frequency_response(loop.linear_plant(parameters, x), w) * _hold(w, h)
     p = {n: ca.SX.sym(n) for n in loop.parameters}
     Kp, Ki, Kd, Tf = (p[f"pid.{n}"] for n in ("Kp", "Ki", "Kd", "Tf"))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
-    lag = 1 / (1 + (Tf * ws) ** 2)
-    a, b = Kp + Kd * Tf * ws**2 * lag, Kd * ws * lag - Ki / ws
+    a, b = _controller((Kp, Ki, Kd, Tf), ws)
     terms = (1 + a * re - b * im) ** 2 + (a * im + b * re) ** 2
     return ca.Function("sensitivity_terms", [ca.vertcat(*p.values())], [terms], ["p"], ["terms"])
+
+
+def sensitivities(loop: ClosedLoop, omega: ArrayLike) -> Callable[[Array, Array, Array], Array]:
+    """Ms on a grid of frequencies, for many gains and operating points at once.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    omega : array_like, shape (n,)
+        [rad/s], positive.
+
+    Returns
+    -------
+    callable
+        ``(p, x, command) -> Ms``, shapes (m, n_parameters) in the order of ``loop.parameters``, (m, n_plant_states),
+        (m,) and (m,); the plant's other inputs are zero. What is impossible is not checked. Tf > 0.
+    """
+    plant, w, h = loop.plant, np.asarray(omega, dtype=float), loop.pid.sample_time or 0.0
+    x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
+    command, output = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
+    xdot, y = plant.ode(0, x, u, q)
+    scale = ca.DM([s.nominal for s in plant.states])  # which makes the eigenvectors' matrix well conditioned
+    inward, outward = ca.diag(1 / scale), ca.diag(scale)
+    A, B = (inward @ ca.jacobian(xdot, v) for v in (x, u[command]))
+    C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
+    matrices = compiled(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
+    n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
+    shapes = ((n, n), (n,), (n,), (1,))
+    own, gains = [position[name] for name in plant.parameters], [position[f"pid.{k}"] for k in ("Kp", "Ki", "Kd", "Tf")]
+
+    def largest(p: Array, x: Array, commands: Array) -> Array:
+        us = np.zeros((len(p), u.numel()))
+        us[:, command] = commands
+        found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
+        A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
+        P = (_responses(A, B, C, w) + D) * _hold(w, h)
+        a, b = _controller((p[:, [k]] for k in gains), w)
+        return np.asarray(1 / np.abs(1 + P * (a + 1j * b)).min(axis=1))
+
+    return largest
+
+
+def _responses(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
+    """``C (jw I - A)^-1 B`` of m systems by partial fractions, shape (m, n); solved where those are inexact."""
+    try:
+        poles, V = np.linalg.eig(A)
+        parts = (C[:, None] @ V)[:, 0] * np.linalg.solve(V, B[..., None].astype(complex))[..., 0]
+    except np.linalg.LinAlgError:
+        return _solved(A, B, C, w)
+    found: ComplexArray = (parts[:, None] / (1j * w[:, None] - poles[:, None])).sum(axis=-1)
+    probe = [0, len(w) // 2, len(w) - 1]
+    off = np.abs(found[:, probe] / _solved(A, B, C, w[probe]) - 1)
+    bad = ~(off < 1e-6).all(axis=1)
+    found[bad] = _solved(A[bad], B[bad], C[bad], w)
+    return found
+
+
+def _solved(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
+    resolvent = 1j * w[:, None, None] * np.eye(A.shape[-1]) - A[:, None]
+    x = np.linalg.solve(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
+    return np.asarray((C[:, None, None] @ x)[..., 0, 0])
+
+
+def _controller(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
+    """Real and imaginary part of the PID's response, numbers or symbols; gains Kp, Ki, Kd, Tf."""
+    Kp, Ki, Kd, Tf = gains
+    lag = 1 / (1 + (Tf * w) ** 2)
+    return Kp + Kd * Tf * w**2 * lag, Kd * w * lag - Ki / w
+
+
+def _hold(w: Array, h: float) -> ComplexArray:
+    """Half a sample of delay, as `ClosedLoop.open_loop` has it."""
+    return np.asarray((1 - 0.25j * w * h) / (1 + 0.25j * w * h))
 
 
 def _crossings(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:

@@ -1,6 +1,7 @@
 """References that a loop shall follow."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import isfinite
 
 import numpy as np
@@ -20,18 +21,23 @@ class Step:
     at : float
         Instant [s].
     initial : float
-        Value before [unit of the measured signal].
+        Value before [unit of the measured signal]: where it is a speed, the plant moves steadily when the step comes.
     horizon : float
         End of the experiment [s].
+    start : mapping of str to float
+        What else is known of the plant at time 0, by output: {"position": 0.25} [SI]. A `PneumaticDrive` also takes
+        "pressure_b", as in its `rest`.
     """
 
     size: float
     at: float = 0.0
     initial: float = 0.0
     horizon: float = 1.0
+    start: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         values = {"size": self.size, "at": self.at, "initial": self.initial, "horizon": self.horizon}
+        values |= {f"start[{n!r}]": value for n, value in self.start.items()}
         for name, value in values.items():
             require(isfinite(value), f"Step: {name} must be a finite number, got {value}")
         require(self.size != 0, "Step: size must not be zero, there would be nothing to follow")
@@ -42,6 +48,17 @@ class Step:
     def final(self) -> float:
         """Value after the step [unit of the measured signal]."""
         return self.initial + self.size
+
+    @property
+    def label(self) -> str:
+        """How a table heads it.
+
+        Examples
+        --------
+        >>> Step(-0.2, start={"position": 0.25}).label
+        '0 to -0.2, position 0.25'
+        """
+        return ", ".join([f"{self.initial:g} to {self.final:g}", *(f"{n} {v:g}" for n, v in self.start.items())])
 
     def trajectory(self, step: float) -> Trajectory:
         """The column "reference" on the grid 0, step, 2 step, ... to the horizon, held from sample to sample.

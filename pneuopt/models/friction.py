@@ -216,6 +216,18 @@ class PressureDependent:
         return self.base.force(v, z, u, {**p, **raised})
 
 
+def friction_ladder() -> dict[str, FrictionModel]:
+    """From the simplest to the richest, by name: candidates for `select_model`."""
+    return {
+        "viscous": Viscous(),
+        "coulomb": Coulomb(),
+        "asymmetric coulomb": Asymmetric(Coulomb()),
+        "stribeck": Stribeck(),
+        "asymmetric stribeck": Asymmetric(Stribeck()),
+        "lugre": LuGre(),
+    }
+
+
 def turned(v: ca.SX, p: Symbols, width: str = "smoothing") -> ca.SX:
     """The sign of the speed, smooth over the parameter `width`; a `direction` among p (`Karnopp`) is taken as it is."""
     return p["direction"] if "direction" in p else ca.tanh(v / p[width])

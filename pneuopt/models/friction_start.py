@@ -4,8 +4,9 @@ Given the Stribeck velocity, a drive's force is linear in its other parameters; 
 bounded linear least squares gives a candidate, in milliseconds (NUMERICS section 3, steps 1 and 2).
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
 from pneuopt.errors import LogError, require
+from pneuopt.models.load import GRAVITY
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.system import Log, Start
 from pneuopt.trajectories import Trajectory
@@ -24,6 +26,7 @@ SLIDING_SPEED = 4e-3  # [m/s] slower samples say nothing of sliding friction
 STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recipe
 RIDGE = 1e-2  # on columns of unit length: sliding one way only, Coulomb friction and a constant force are one
 LEAST_EXCESS = 0.03  # of static friction over Coulomb's, as a fraction of it (step 2)
+JUDGED = 2000  # samples of a log, about, by which a valve is judged
 SLOW_SPEED = 1e-2  # [m/s] below it friction comes near its static level, and bristles still bend
 
 
@@ -38,11 +41,8 @@ def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
     rows = {}
     for name, (measured, parameters) in logs.items():
         position, speed, acceleration = motion(measured)
-        inertia = {"load.mass": acceleration, "load.force": np.ones(len(measured))}
-        if "load.stiffness" in parameters:
-            inertia["load.stiffness"] = position - parameters.value("load.rest_position")
-        states = {"position": position, "speed": speed}
-        rows[name] = Rows(measured, parameters, speed, measured["force"], inertia, states)
+        columns, states = load_columns(parameters, position, acceleration), {"position": position, "speed": speed}
+        rows[name] = Rows(measured, parameters, speed, measured["force"], columns, states)
     return candidates(rows)
 
 
@@ -57,6 +57,15 @@ def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
             rig["rig.area_bias"] = push
         rows[name] = Rows(measured, parameters, measured["speed"], force, rig, {})
     return candidates(rows)
+
+
+def load_columns(parameters: ParameterSet, position: Array, acceleration: Array) -> dict[str, Array]:
+    """What multiplies each of the load's parameters in the force that moves it."""
+    sine = math.sin(parameters.value("load.inclination")) if "load.inclination" in parameters else 0.0
+    columns = {"load.mass": acceleration + GRAVITY * sine, "load.force": np.ones_like(position)}
+    if "load.stiffness" in parameters:
+        columns["load.stiffness"] = position - parameters.value("load.rest_position")
+    return columns
 
 
 def motion(measured: Trajectory) -> tuple[Array, Array, Array]:
@@ -104,9 +113,10 @@ def candidates(logs: Mapping[str, Rows]) -> Sequence[Start]:
         tried = np.clip(STRIBECK_VELOCITIES, bounds.lower, bounds.upper).tolist()
     starts = []
     for velocity in dict.fromkeys(tried) if searched else (given,):
-        values = _regress(logs, parameters, velocity)
+        values, _ = _regress(logs, parameters, velocity)
+        own = {n: rows.parameters for n, rows in logs.items()}
         if searched:
-            values |= _named("friction.stribeck_velocity", velocity, logs)
+            values |= named("friction.stribeck_velocity", velocity, own)
         label = f"stribeck velocity {velocity:g} m/s" if searched else "equation error"
         bristles = _bristles(logs, values)
         states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
@@ -114,28 +124,49 @@ def candidates(logs: Mapping[str, Rows]) -> Sequence[Start]:
     return starts
 
 
-def _named(name: str, value: float, logs: Mapping[str, Rows]) -> dict[str, float]:
+def misfit(logs: Mapping[str, Rows]) -> float:
+    """Mean size of the force that no friction explains, of all that the sliding samples show [N]."""
+    thinned = {name: _thinned(rows) for name, rows in logs.items()}
+    parameters = next(iter(logs.values())).parameters
+    if not all(np.isfinite(rows.force).all() for rows in thinned.values()):
+        return math.inf
+    return float(np.mean(np.abs(_regress(thinned, parameters, STRIBECK_VELOCITIES[0])[1])))
+
+
+def named(name: str, value: float, logs: Mapping[str, ParameterSet]) -> dict[str, float]:
     """A start value, for each log where the parameter is each log's own."""
-    per_log = any(rows.parameters[name].per_log for rows in logs.values())
+    per_log = any(parameters[name].per_log for parameters in logs.values())
     return (
-        {f"{name}[{log}]": value for log, rows in logs.items() if rows.parameters[name].free}
+        {f"{name}[{log}]": value for log, parameters in logs.items() if parameters[name].free}
         if per_log
         else {name: value}
     )
 
 
-def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float) -> dict[str, float]:
-    """Bounded linear least squares over all logs' sliding samples, with four Cauchy reweights."""
+def _thinned(rows: Rows) -> Rows:
+    """At most about `JUDGED` of the samples."""
+    every = slice(None, None, max(1, len(rows.measured) // JUDGED))
+    measured = Trajectory(rows.measured.t[every], {n: rows.measured[n][every] for n in rows.measured})
+    columns, states = ({n: c[every] for n, c in part.items()} for part in (rows.columns, rows.states))
+    return replace(
+        rows, measured=measured, speed=rows.speed[every], force=rows.force[every], columns=columns, states=states
+    )
+
+
+def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float) -> tuple[dict[str, float], Array]:
+    """Bounded linear least squares over all logs' sliding samples, with four Cauchy reweights; and what is left [N]."""
     parts = [_log_columns(name, rows, velocity) for name, rows in logs.items()]
     free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
-    if not free:
-        return {}
-    A = np.vstack([np.column_stack([columns.get(n, np.zeros(len(y))) for n in free]) for columns, y in parts])
+    A = np.vstack(
+        [np.array([columns.get(n, np.zeros(len(y))) for n in free]).reshape(-1, len(y)).T for columns, y in parts]
+    )
     y = np.concatenate([y for _, y in parts])
     known = np.isfinite(y)
     speed = np.abs(np.concatenate([rows.speed for rows in logs.values()]))
     sliding = known & (speed > SLIDING_SPEED)
     rows = sliding if np.count_nonzero(sliding) > 10 * len(free) else known
+    if not free:
+        return {}, y[rows]
     bases = {n: parameters[n.split("[")[0]] for n in free}
     lower, upper = _bounds(bases, float(np.median(np.abs(y[rows]))))
     x = _robust(A[rows], y[rows], lower, upper)
@@ -144,7 +175,7 @@ def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float
         own = name.replace("static", "coulomb")
         coulomb = values.get(own, values.get("friction.coulomb", parameters.value("friction.coulomb")))
         values[name] = coulomb + max(values[name], LEAST_EXCESS * coulomb)
-    return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}
+    return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}, y[rows] - A[rows] @ x
 
 
 def _log_columns(name: str, rows: Rows, velocity: float) -> tuple[dict[str, Array], Array]:
@@ -218,7 +249,7 @@ def _bristles(logs: Mapping[str, Rows], values: dict[str, float]) -> dict[str, d
         slope = _presliding_slope(logs, friction, 0.6 * number("friction.coulomb"))
         low, high = max(STIFFNESS_RANGE[0], stiffness.lower), min(STIFFNESS_RANGE[1], stiffness.upper)
         found = float(np.clip(slope, low, high))
-        values |= _named("friction.bristle_stiffness", found, logs)
+        values |= named("friction.bristle_stiffness", found, {n: rows.parameters for n, rows in logs.items()})
     else:
         found = stiffness.value
     limit = number("friction.static") / found

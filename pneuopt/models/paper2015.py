@@ -16,12 +16,16 @@ Sign: K_cb is positive here, ``M_b = K_mb x_v + K_cb p_b``; the paper carries it
 """
 
 from dataclasses import dataclass
-from math import sqrt
+from math import pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.errors import ModelError, require
+from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import SecondOrder
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.valve import Spool
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import System
 
@@ -67,6 +71,63 @@ class OperatingPoint:
     T_s: float = 293.15
     M_L: float = 12.0
     k_v: float = 200.0
+
+
+def operating_point(drive: PneumaticDrive, parameters: ParameterSet, half_travel: float) -> OperatingPoint:
+    """The paper's symbols read off a nonlinear drive at rest, by AD: equations (3), (4) and (9) to (11) backwards.
+
+    Parameters
+    ----------
+    drive : PneumaticDrive
+        Rodless, with viscous friction and a spool without lag, of which alone the paper speaks.
+    parameters : ParameterSet
+    half_travel : float
+        The spool's way from its centre to full opening [m].
+
+    Returns
+    -------
+    OperatingPoint
+
+    Raises
+    ------
+    ModelError
+        If it is another drive.
+
+    Examples
+    --------
+    >>> from pneuopt.models.catalog import r25
+    >>> point = operating_point(*r25(), half_travel=1e-3)
+    >>> round(point.K_ma, 4), round(point.K_ca * 1e9, 4)
+    (12.3856, 2.6593)
+    """
+    p = {n: parameters.value(n) for n in drive.parameters}
+    suited = isinstance(drive.friction, Viscous) and drive.valve.spool is Spool.RIGID and p["cylinder.rod"] == 0
+    require(
+        suited and "chamber.exponent" in p,
+        "the paper's drive is rodless, with Viscous() friction, Spool.RIGID and Polytropic() chambers; this is another",
+        ModelError,
+    )
+    rest = drive.rest(parameters)
+    linear = drive.system().linearise(np.array(list(rest.states.values())), rest.inputs, parameters)
+    a, b = (linear.states.index(f"pressure_{side}") for side in "ab")
+    area, y = pi / 4 * p["cylinder.bore"] ** 2, rest.states["position"]
+    volume_a = p["cylinder.dead_volume_a"] + area * y
+    volume_b = p["cylinder.dead_volume_b"] + area * (p["cylinder.stroke"] - y)
+    heat = p["chamber.exponent"] * p["gas.constant"] * p["ambient.temperature"]
+    per_metre = p["valve.span"] / half_travel
+    return OperatingPoint(
+        K_ma=float(linear.B[a, 0]) * per_metre * volume_a / heat,
+        K_mb=-float(linear.B[b, 0]) * per_metre * volume_b / heat,
+        K_ca=-float(linear.A[a, a]) * volume_a / heat,
+        K_cb=-float(linear.A[b, b]) * volume_b / heat,
+        A_a=area,
+        m=volume_b / volume_a,
+        p_ai=rest.states["pressure_a"],
+        V_0a=volume_a,
+        T_s=p["ambient.temperature"],
+        M_L=p["load.mass"],
+        k_v=p["friction.viscous"],
+    )
 
 
 def spool_gain(point: OperatingPoint) -> float:

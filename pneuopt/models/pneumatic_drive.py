@@ -1,30 +1,32 @@
 """`PneumaticDrive`: supply, proportional valve, cylinder and load, wired by hand into one ODE."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import inf
-from typing import NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import brentq
+from numpy.typing import NDArray
 
-from pneuopt.errors import InputError, require
-from pneuopt.models.chamber import VACUUM, ChamberModel, Inflow, Polytropic, Surroundings
+from pneuopt.errors import require
+from pneuopt.models.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.drive import AMBIENT, POSITION, SPEED, gauge, part, renamed
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.gas import GAS_CONSTANT
+from pneuopt.models.hardware import check_hardware, check_start, guards
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import Load
+from pneuopt.models.pneumatic_rest import BALANCED, Glide, steady
 from pneuopt.models.pneumatic_start import PneumaticStarts
 from pneuopt.models.valve import Port, ProportionalValve
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import Rest, System, define, names, vector
+from pneuopt.system import Rest, System, define, names, stacked, vector
+from pneuopt.trajectories import Trajectory
 
+Array = NDArray[np.float64]
 Symbols = Mapping[str, ca.SX]
-Residual = Callable[[float, float, float], tuple[float, float, float]]
 SIDES = ("a", "b")
 PRESSURES = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
 
@@ -83,36 +85,48 @@ class PneumaticDrive:
         """Wire the parts."""
         return self._system
 
-    def check(self, parameters: ParameterSet) -> None:
-        """Refuse impossible hardware, whatever its bounds.
+    def check(self, parameters: ParameterSet, start: Mapping[str, float] | None = None) -> None:
+        """Refuse impossible hardware, whatever its bounds, and a start outside the stroke.
 
         Parameters
         ----------
         parameters : ParameterSet
             A missing one counts with its default.
+        start : mapping of state to value, optional
 
         Raises
         ------
         InputError
             Naming parameter, value, source and what would be possible.
         """
-        used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
-        for name, limit in _limits(used).items():
-            if name in used and not limit.allows(used.value(name)):
-                shown, source = used[name], f" (source: {used[name].source})" if used[name].source else ""
-                raise InputError(f"{name} = {shown.value:g} {shown.unit}{source} is impossible; {limit.remedy}")
+        own = self.parameters
+        used = own | parameters.select(n for n in parameters if n in own)
+        check_hardware(used)
+        if start is not None:
+            check_start(used, start)
 
-    def rest(self, parameters: ParameterSet, *, position: float | None = None, pressure_b: float | None = None) -> Rest:
-        """Where the drive stands still, friction unloaded.
+    def rest(
+        self,
+        parameters: ParameterSet,
+        *,
+        position: float | None = None,
+        speed: float = 0.0,
+        pressure_b: float | None = None,
+    ) -> Rest:
+        """Where the drive stands still, friction unloaded, or moves steadily.
 
         No air flows on balance and the forces cancel: a cylinder with a rod, or under load, needs a spool a little off
-        its centre for that. It is an equilibrium of the ODE, whatever the friction.
+        its centre for that. It is an equilibrium of the ODE, whatever the friction. In motion every rate but that of
+        the position is zero, wherever the piston is: the valve feeds and drains what the piston sweeps, the bristles
+        are as bent as they stay. The end stops, whose force depends on the position, count with that at the start.
 
         Parameters
         ----------
         parameters : ParameterSet
         position : float, optional
             [m]; by default cylinder.start of the stroke.
+        speed : float
+            [m/s]
         pressure_b : float, optional
             The air that a closed valve has trapped, absolute [Pa]: the spool stays centred, chamber a balances the
             forces, and what leaks past the edges makes this a rest for a while only.
@@ -125,32 +139,49 @@ class PneumaticDrive:
         Raises
         ------
         InputError
-            If the hardware is impossible, the position lies outside the stroke, or no spool position balances the load.
+            If the hardware is impossible, the position lies outside the stroke, or no spool position balances the load,
+            at this speed.
         """
         self.check(parameters)
         used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
         stroke = used.value("cylinder.stroke")
         y = used.value("cylinder.start") * stroke if position is None else position
         require(0 <= y <= stroke, f"a start at position = {y:g} m lies outside the stroke, 0 to {stroke:g} m")
-        rates = self._standing(used, y)
-        if pressure_b is None:
-            spool, *pressures = _balanced(rates, used)
-        else:
-            spool, pressures = 0.0, [_balancing(rates, used, pressure_b), pressure_b]
-        return Rest(self._state(used, y, spool, *pressures), {VALVE_VOLTAGE.name: spool * used.value("valve.span")})
+        states, voltage = steady(Glide(self._glide, vector(self.parameters, used), y, speed), used, pressure_b)
+        return Rest(dict(zip(names(self.states), states, strict=True)), {VALVE_VOLTAGE.name: voltage})
+
+    def push(self, measured: Trajectory, parameters: ParameterSet) -> Array:
+        """Force of the air on the piston, from both logged pressures: the input "force" of a `ForceDrive`.
+
+        Parameters
+        ----------
+        measured : Trajectory
+            pressure_a and pressure_b, absolute [Pa].
+        parameters : ParameterSet
+            A missing one counts with its default.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            A_a (p_a - p_o) - A_b (p_b - p_o) [N]; the pressures' noise is in it.
+        """
+        self.check(parameters)
+        used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
+        numbers = {n: q.value for n, q in used.items()}
+        return np.asarray(_push(numbers, *(measured[q.name] for q in PRESSURES)))
 
     @cached_property
     def _system(self) -> System:
         outputs = (POSITION, SPEED, *PRESSURES)
-        starts = PneumaticStarts(self.system, _areas)
-        return define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._rest_for_loop)
+        starts = PneumaticStarts(self.system, _push)
+        system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._rest_for_loop)
+        return replace(system, checker=self.check, guards=guards(self.cylinder.stops))
 
     def _rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG002 - no time in it
         y, v, a, b = (x[n] for n in ("position", "speed", "pressure_a", "pressure_b"))
         friction = self.friction.force(v, part(x, "friction"), gauge(self.friction, x, p), part(p, "friction"))
-        push_a, push_b = (area * (q - p["ambient.pressure"]) for area, q in zip(_areas(p), (a, b), strict=True))
         stop = self.cylinder.stop_force(y, v, part(p, "cylinder"))
-        acceleration = self.load.acceleration(push_a - push_b - friction.value + stop, y, part(p, "load"))
+        acceleration = self.load.acceleration(_push(p, a, b) - friction.value + stop, y, part(p, "load"))
         spool = self.valve.rates(u["valve_voltage"], part(x, "valve"), part(p, "valve"))
         rates = {"position": v, "speed": acceleration, **self._air(x, u, p)}
         rates |= {f"valve.{n}": rate for n, rate in spool.items()}
@@ -178,45 +209,29 @@ class PneumaticDrive:
             rates |= {f"{name}_{side}": rate for name, rate in own.items()}
         return rates
 
-    def _state(self, p: ParameterSet, y: float, spool: float, a: float, b: float) -> dict[str, float]:
-        """All states of the drive standing still."""
-        state = dict.fromkeys(names(self.states), 0.0)
-        known = {"position": y, "pressure_a": a, "pressure_b": b, "valve.spool": spool}
-        known |= dict.fromkeys(("temperature_a", "temperature_b"), p.value("ambient.temperature"))
-        return state | {n: value for n, value in known.items() if n in state}
+    @cached_property
+    def _glide(self) -> ca.Function:
+        """``(y, v, spool, a, b, p) -> (rates of pressure_a, pressure_b and speed; states)``, the friction's own steady.
 
-    def _standing(self, p: ParameterSet, y: float) -> Residual:
-        """Rates of both pressures [Pa/s] and of the speed [m/s^2] at a spool position and two pressures."""
-        system, values, span = self.system(), vector(self.parameters, p), p.value("valve.span")
-        rows = [names(system.states).index(n) for n in ("pressure_a", "pressure_b", "speed")]
-
-        def rates(spool: float, a: float, b: float) -> tuple[float, float, float]:
-            x = list(self._state(p, y, spool, a, b).values())
-            found = np.array(system.ode(0, x, [spool * span], values)[0]).ravel()[rows]
-            return float(found[0]), float(found[1]), float(found[2])
-
-        return rates
+        Bristles' rates are linear in their deflections: one Newton step from zero finds where they stay.
+        """
+        given = {n: ca.SX.sym(n) for n in ("position", "speed", "valve.spool", "pressure_a", "pressure_b")}
+        p = {n: ca.SX.sym(n) for n in self.parameters}
+        warm = dict.fromkeys(("temperature_a", "temperature_b"), p["ambient.temperature"])
+        inner = {f"friction.{q.name}": ca.SX.sym(q.name) for q in self.friction.states}
+        known = {**given, **warm, **inner}
+        x = {n: known.get(n, ca.SX(0)) for n in names(self.states)}
+        rates, _ = self._rhs(ca.SX(0), x, {VALVE_VOLTAGE.name: given["valve.spool"] * p["valve.span"]}, p)
+        z, zdot = stacked(inner), stacked({n: rates[n] for n in inner})
+        steady = ca.substitute(-ca.solve(ca.jacobian(zdot, z), zdot), z, 0) if inner else z
+        found = [ca.vertcat(*(rates[n] for n in BALANCED)), stacked(x)]
+        arguments = [*given.values(), stacked(p)]
+        return ca.Function("glide", arguments, ca.substitute(found, [z], [steady]) if inner else found)
 
     def _rest_for_loop(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
-        if outputs.keys() <= {"position"}:
-            return self.rest(parameters, position=outputs.get("position"))
-        require(
-            outputs == {"speed": 0.0},
-            f"a cylinder does not rest at {dict(outputs)}; start a loop at speed 0, or give x_plant",
-        )
-        return self.rest(parameters)
-
-
-class _Limit(NamedTuple):
-    """What a parameter may be at all."""
-
-    remedy: str
-    lower: float = -inf
-    upper: float = inf
-    open: bool = True
-
-    def allows(self, value: float) -> bool:
-        return self.lower < value < self.upper or (not self.open and value in (self.lower, self.upper))
+        others = ", ".join(sorted(outputs.keys() - {"position", "speed", "pressure_b"}))
+        require(not others, f"a cylinder's start is told by position, speed and pressure_b, not by {others}")
+        return self.rest(parameters, **outputs)
 
 
 _AIR = ParameterSet(
@@ -225,87 +240,12 @@ _AIR = ParameterSet(
         "gas.constant": Parameter(GAS_CONSTANT, "J/(kg*K)", 250.0, 320.0, source="dry air"),
     }
 )
-_POSITIVE = {
-    "cylinder.bore": "a bore is positive",
-    "cylinder.stroke": "a stroke is positive",
-    "cylinder.dead_volume_a": "ports and hoses always hold some air: a few percent of the swept volume are usual",
-    "cylinder.dead_volume_b": "ports and hoses always hold some air: a few percent of the swept volume are usual",
-    "valve.conductance": "a conductance is positive, about 2e-8 m^3/(s*Pa) for 500 l/min(ANR)",
-    "valve.rounding": "edges are round: 1e-4 is very sharp",
-    "valve.span": "give the voltage of full opening, 5 V for a 0-10 V valve",
-    "valve.bandwidth": "a bandwidth is positive, or take a valve without a lag",
-    "valve.damping": "a damping ratio is positive, 0.5 to 0.8 for most valves",
-    "ambient.temperature": "an absolute temperature is positive",
-    "gas.constant": "air has 287.05 J/(kg*K)",
-    "load.mass": "the piston alone weighs something",
-}
-_NOT_NEGATIVE = {
-    "cylinder.leak": "no leakage is 0",
-    "cylinder.stop_stiffness": "no stop is 0, or Cylinder(stops=False)",
-    "cylinder.stop_damping": "no damping is 0",
-    "valve.leak": "no leakage is 0",
-    "chamber.wall_conductance": "no heat transfer is 0",
-}
 
 
-def _limits(p: ParameterSet) -> dict[str, _Limit]:
-    bore, ambient = p.value("cylinder.bore"), p.value("ambient.pressure")
-    exponents = {
-        n: _Limit("1 is isothermal, 1.4 adiabatic", 0.0) for n in p if n.startswith("chamber.") and "exponent" in n
-    }
-    return {
-        **{n: _Limit(remedy, 0.0) for n, remedy in _POSITIVE.items()},
-        **{n: _Limit(remedy, 0.0, open=False) for n, remedy in _NOT_NEGATIVE.items()},
-        **exponents,
-        "cylinder.rod": _Limit(f"a rod is thinner than the bore, {bore:g} m; rodless is 0", -1e-300, bore),
-        "cylinder.start": _Limit("a start lies within the stroke, 0 to 1", 0.0, 1.0, open=False),
-        "valve.critical_ratio": _Limit(
-            "a critical pressure ratio lies between 0 and 1, 0.2 to 0.5 for most valves", -1e-300, 1.0
-        ),
-        "ambient.pressure": _Limit("an absolute pressure is positive; sea level is 101325 Pa(a)", VACUUM),
-        "supply.pressure": _Limit(f"the supply lies above the ambient pressure, {ambient:g} Pa(a)", ambient),
-    }
-
-
-def _balanced(rates: Residual, p: ParameterSet) -> tuple[float, float, float]:
-    """Spool and pressures at which nothing changes: nested bisections, each on a monotone function."""
-    low, high = p.value("ambient.pressure"), p.value("supply.pressure")
-
-    def pressures(spool: float) -> tuple[float, float]:
-        def b(a: float) -> float:
-            return _root(lambda b: rates(spool, a, b)[1], low, high)
-
-        if p.value("cylinder.leak") == 0:
-            return _root(lambda a: rates(spool, a, low)[0], low, high), b(low)
-        a = _root(lambda a: rates(spool, a, b(a))[0], low, high)
-        return a, b(a)
-
-    def push(spool: float) -> float:
-        return rates(spool, *pressures(spool))[2]
-
-    mass = p.value("load.mass")
-    ends = [push(end) * mass for end in (-1.0, 1.0)]
-    message = (
-        f"no equilibrium exists: beyond the load the cylinder pushes with {ends[0]:.4g} to {ends[1]:.4g} N "
-        f"at supply.pressure = {high:g} Pa(a), never with 0; lower the load, raise the supply or the bore"
-    )
-    require(ends[0] <= 0 <= ends[1], message)
-    spool = 0.0 if abs(push(0.0)) * mass < 1e-9 else _root(push, -1.0, 1.0)
-    return spool, *pressures(spool)
-
-
-def _balancing(rates: Residual, p: ParameterSet, b: float) -> float:
-    """The pressure in chamber a that balances pressure b; the force is linear in it."""
-    require(b > VACUUM, f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {VACUUM:g} Pa")
-    low, high = p.value("ambient.pressure"), p.value("supply.pressure")
-    at_low, at_high = (rates(0.0, a, b)[2] for a in (low, high))
-    a = low - at_low * (high - low) / (at_high - at_low)
-    require(a > VACUUM, f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more")
-    return a
-
-
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    return float(brentq(function, low, high, xtol=1e-14 * (high - low), rtol=1e-15))
+def _push(p: Mapping[str, Any], a: Any, b: Any) -> Any:
+    """Force of the air on the piston [N], from symbols or numbers."""
+    area_a, area_b = areas(p["cylinder.bore"], p["cylinder.rod"])
+    return area_a * (a - p["ambient.pressure"]) - area_b * (b - p["ambient.pressure"])
 
 
 def _areas(p: Symbols) -> tuple[ca.SX, ca.SX]:

@@ -1,170 +1,203 @@
 """Where the identification of a `PneumaticDrive` starts, without a guess from the user: equation error on the logs.
 
-The pressures' rates are linear in the valve's conductance and in conductance times leak, with everything else known or
-given; the force that both pressures give makes friction the same regression as for a known force (NUMERICS section 3,
-steps 1 and 2). A pressure that is not logged is integrated from the logged motion.
+What is not logged (a pressure, the spool, a temperature) is integrated along the logged motion. A logged pressure's
+rate is linear in the valve's conductance and in conductance times leak; where no pressure is logged, the valve is
+searched with which the forces balance best. Friction is then the same regression as for a known force (NUMERICS
+section 3, steps 1 and 2).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
-from pneuopt.codegen import compiled
-from pneuopt.models.friction_start import Rows, candidates, filtered, motion
+from pneuopt.models.following import PRESSURES, Follower
+from pneuopt.models.friction_start import Rows, candidates, filtered, load_columns, misfit, motion, named
+from pneuopt.models.gas import REFERENCE_DENSITY
 from pneuopt.parameters import ParameterSet
-from pneuopt.system import Log, Start, System, names, vector
-from pneuopt.trajectories import Trajectory
+from pneuopt.system import Log, Start, System
 
 Array = NDArray[np.float64]
-PRESSURES = ("pressure_a", "pressure_b")
+Values = Mapping[str, float]
+Push = Callable[[Mapping[str, Any], Any, Any], Any]
 CONDUCTANCE, LEAK = "valve.conductance", "valve.leak"
+SHAPES = {"valve.critical_ratio": (0.15, 0.3, 0.45), "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2)}  # tried, if free
+LEAKS = (0.003, 0.01, 0.03, 0.1)  # tried, where no pressure is logged
+CONDUCTANCES = 2.0 ** np.arange(-1, 5)  # likewise, times what the logged speed needs at half the supply pressure
+LEAST_LEAK = 1e-4  # at zero the search would begin on a bound
+ZOOM = {CONDUCTANCE: 1.4, LEAK: 1.8, "valve.critical_ratio": 0.08, "valve.dead_zone": 0.02}  # factors, then steps
+ZOOMS = 5  # each halves the step
 
 
 @dataclass(frozen=True, eq=False)
 class PneumaticStarts:
     """The start finder of a pneumatic drive.
 
+    A log without position takes it as the integral of the speed, from cylinder.start of the stroke: a log that begins
+    elsewhere needs that as its condition.
+
     Parameters
     ----------
     system : callable
         Returns the drive's System (not held: it holds this).
-    areas : callable
-        From the parameters' mapping to both piston areas [m^2].
+    push : callable
+        From the parameters' mapping and both pressures [Pa] to the force of the air on the piston [N].
     """
 
     system: Callable[[], System]
-    areas: Callable[[Mapping[str, Any]], tuple[Any, Any]]
+    push: Push
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates: one valve, friction for each of the Stribeck velocities tried."""
-        rates = _Rates(self.system())
-        states = {name: self._known_states(log, rates) for name, log in logs.items()}
-        valve = _valve(logs, states, rates)
-        rows = {name: self._rows(log, states[name], valve, rates) for name, log in logs.items()}
-        starts = candidates(rows)
-        return [Start(s.states, {**s.parameters, **valve}, s.label) for s in starts]
-
-    def _known_states(self, log: Log, rates: "_Rates") -> dict[str, Array]:
-        measured, parameters = log
-        position, speed, acceleration = motion(measured)
-        found = {"position": position, "speed": speed, "acceleration": acceleration}
-        found |= _spool(rates.system, measured, parameters)
-        return found | {n: filtered(measured, n, 0) for n in PRESSURES if n in measured}
-
-    def _rows(self, log: Log, states: dict[str, Array], valve: Mapping[str, float], rates: "_Rates") -> Rows:
-        measured, parameters = log
-        if not all(n in states for n in PRESSURES):
-            states |= {
-                n: p
-                for n, p in rates.pressures(measured, states, parameters.with_values(valve)).items()
-                if n not in states
-            }
-        force, areas = np.zeros(len(measured)), self.areas({n: q.value for n, q in parameters.items()})
-        for area, sign, name in zip(areas, (1.0, -1.0), PRESSURES, strict=True):
-            force = force + sign * area * (states[name] - parameters.value("ambient.pressure"))
-        inertia = {"load.mass": states["acceleration"], "load.force": np.ones(len(measured))}
-        kept = {n: states[n] for n in names(rates.system.states) if n in states}
-        with_pressures = measured.with_columns({n: states[n] for n in PRESSURES})
-        return Rows(with_pressures, parameters, states["speed"], force, inertia, kept)
+        followers = functools.cache(functools.partial(Follower, self.system()))
+        runs = {name: _Run(log, followers, self.push) for name, log in logs.items()}
+        valve = _valve(runs)
+        starts = candidates({name: run.balance(valve) for name, run in runs.items()})
+        own: dict[str, float] = {}
+        for name, value in valve.items():
+            own |= named(name, value, {n: log.parameters for n, log in logs.items()})
+        return [Start(s.states, {**s.parameters, **own}, s.label) for s in starts]
 
 
-class _Rates:
-    """The drive's ODE along logs."""
+class _Run:
+    """One log: its filtered motion and pressures, and what follows from them with any valve."""
 
-    def __init__(self, system: System) -> None:
-        self.system = system
-        self._ode = compiled(system.ode)
-        self._names = names(system.states)
+    def __init__(self, log: Log, followers: Callable[[tuple[str, ...]], Follower], push: Push) -> None:
+        self.measured, self.parameters = log
+        self._followers, self._push = followers, push
+        position, speed, self._acceleration = motion(self.measured)
+        if "position" not in self.measured:
+            position = position + self._begin(position)
+        self.logged = tuple(n for n in PRESSURES if n in self.measured)
+        self.led = {"position": position, "speed": speed, **{n: filtered(self.measured, n, 0) for n in self.logged}}
+        self._given = self.measured.select(["valve_voltage"]).with_columns(self.led)
 
-    def of_pressures(self, measured: Trajectory, states: Mapping[str, Array], parameters: ParameterSet) -> Array:
-        """Rates of both pressures at every sample [Pa/s], shape (n, 2)."""
-        x = np.column_stack([states.get(n, np.zeros(len(measured))) for n in self._names])
-        u, p = measured.matrix(names(self.system.inputs)), vector(self.system.parameters, parameters)
-        rows = [self._names.index(n) for n in PRESSURES]
-        return np.array([self._ode(t, xk, uk, p)[0][rows] for t, xk, uk in zip(measured.t, x, u, strict=True)])
+    def _begin(self, travel: Array) -> float:
+        """The position where a log without one begins [m]: cylinder.start, or the nearest that keeps to the stroke."""
+        stroke = self.parameters.value("cylinder.stroke")
+        lowest, highest = -float(travel.min()), stroke - float(travel.max())
+        return min(max(self.parameters.value("cylinder.start") * stroke, lowest), max(lowest, highest))
 
-    def pressures(
-        self, measured: Trajectory, states: Mapping[str, Array], parameters: ParameterSet
-    ) -> dict[str, Array]:
-        """Both pressures integrated along the logged motion, from half the supply; ten Euler steps a sample."""
-        x = np.column_stack([states.get(n, np.zeros(len(measured))) for n in self._names])
-        u, p = measured.matrix(names(self.system.inputs)), vector(self.system.parameters, parameters)
-        rows = [self._names.index(n) for n in PRESSURES]
-        now = np.array([(parameters.value("supply.pressure") + parameters.value("ambient.pressure")) / 2] * 2)
-        out = np.empty((len(measured), 2))
-        steps = np.append(np.diff(measured.t), 0.0) / 10
-        for k, h in enumerate(steps):
-            out[k] = now
-            for _ in range(10):
-                x[k, rows] = now
-                now = now + h * self._ode(measured.t[k], x[k], u[k], p)[0][rows]
-        return dict(zip(PRESSURES, out.T, strict=True))
+    def balance(self, valve: Values) -> Rows:
+        """The forces with this valve, for the regression of friction."""
+        return self.balances([valve])[0]
+
+    def balances(self, valves: Sequence[Values]) -> list[Rows]:
+        """The forces with each of several valves."""
+        columns = load_columns(self.parameters, self.led["position"], self._acceleration)
+        out = []
+        for follow in self._follow(valves):
+            states = {**self.led, **follow}
+            measured = self.measured.with_columns({n: states[n] for n in PRESSURES})
+            force = self._push({n: q.value for n, q in self.parameters.items()}, *(states[n] for n in PRESSURES))
+            out.append(Rows(measured, self.parameters, states["speed"], force, columns, states))
+        return out
+
+    def rates(self, valves: Sequence[Values]) -> Array:
+        """Rates of the logged pressures with each of several valves [Pa/s], shape (len(valves), n * len(logged))."""
+        given = self._given.with_columns(self._as_given)
+        rates = self._followers((*self.led, *self._as_given)).pressure_rates(given, self._with(valves))
+        return rates[:, :, [PRESSURES.index(n) for n in self.logged]].reshape(len(valves), -1)
+
+    def logged_rates(self) -> Array:
+        """The same, as logged."""
+        return np.column_stack([filtered(self.measured, n, 1) for n in self.logged]).ravel()
+
+    def conductance_needed(self) -> float:
+        """Of an open edge, choked, to feed the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
+        fastest = float(np.quantile(np.abs(self.led["speed"]), 0.99))
+        gas = self.parameters.value("gas.constant") * self.parameters.value("ambient.temperature")
+        area = math.pi / 4 * self.parameters.value("cylinder.bore") ** 2
+        return max(area * fastest * 0.5 / (REFERENCE_DENSITY * gas), 1e-10)
+
+    @functools.cached_property
+    def _as_given(self) -> dict[str, Array]:
+        """What follows with the valve's given values."""
+        return self._follow([{}])[0]
+
+    def _follow(self, valves: Sequence[Values]) -> list[dict[str, Array]]:
+        return self._followers(tuple(self.led)).states_along(self._given, self._with(valves))
+
+    def _with(self, valves: Iterable[Values]) -> list[ParameterSet]:
+        """The log's parameters with other valves, and no bounds on those."""
+        return [
+            self.parameters.with_bounds(dict.fromkeys(valve, (-np.inf, np.inf))).with_values(valve) for valve in valves
+        ]
 
 
-def _valve(logs: Mapping[str, Log], states: Mapping[str, Mapping[str, Array]], rates: _Rates) -> dict[str, float]:
-    """Conductance and leak, as far as they are free, from the logs that have both pressures."""
-    parameters = next(iter(logs.values())).parameters
-    free = [n for n in (CONDUCTANCE, LEAK) if n in parameters.free_names]
-    parts = [_valve_rows(log, states[n], rates) for n, log in logs.items() if all(p in log.measured for p in PRESSURES)]
-    if not free or not parts:
+def _valve(runs: Mapping[str, _Run]) -> dict[str, float]:
+    """What is free of conductance, leak, critical ratio and dead zone."""
+    parameters = next(iter(runs.values())).parameters
+    free = [n for n in (CONDUCTANCE, LEAK, *SHAPES) if any(n in run.parameters.free_names for run in runs.values())]
+    if not free:
         return {}
-    A, y = np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts])
-    if free == [CONDUCTANCE]:
-        A = (A[:, 0] + parameters.value(LEAK) * A[:, 1])[:, None]
-    if free == [LEAK]:
-        y, A = y - parameters.value(CONDUCTANCE) * A[:, 0], A[:, 1:] * parameters.value(CONDUCTANCE)
-    found = np.linalg.lstsq(A, y, rcond=None)[0]
-    if len(free) == 2:
-        found = np.array([found[0], found[1] / found[0] if found[0] > 0 else 0.0])
-    bounds = [parameters[n] for n in free]
-    floor = 1e-4 if LEAK in free else 0.0
-    values = {n: float(np.clip(v, b.lower, b.upper)) for n, v, b in zip(free, found, bounds, strict=True)}
-    return values | ({LEAK: max(values[LEAK], floor)} if LEAK in values else {})
+    if any(run.logged for run in runs.values()):
+        shapes = {n: tried for n, tried in SHAPES.items() if n in free}
+        best = _searched(shapes, parameters, lambda values: [_by_pressure(runs, free, v)[1] for v in values])
+        return best | _by_pressure(runs, free, best)[0]
+    needed = max(run.conductance_needed() for run in runs.values())
+    tried = {CONDUCTANCE: tuple(needed * CONDUCTANCES), LEAK: LEAKS}
+    tried = {n: tried.get(n, (parameters.value(n),)) for n in free}
+    return _searched(tried, parameters, lambda values: _by_force(runs, values))
 
 
-def _valve_rows(log: Log, states: Mapping[str, Array], rates: _Rates) -> tuple[Array, Array]:
-    """What multiplies C and C * leak in the pressures' rates, and the rates less what no valve gives [Pa/s]."""
-    measured, parameters = log
-    unit = 1e-8
-
-    def at(conductance: float, leak: float) -> Array:
-        return rates.of_pressures(measured, states, _forced(parameters, {CONDUCTANCE: conductance, LEAK: leak}))
-
-    closed = at(1e-12, 0.0)
-    edges, leaking = at(unit, 0.0) - closed, at(unit, 0.01) - closed
-    target = np.column_stack([filtered(measured, n, 1) for n in PRESSURES]) - closed
-    A = np.stack([edges / unit, (leaking - edges) / (0.01 * unit)], axis=-1).reshape(-1, 2)
-    return A, target.ravel()
-
-
-def _forced(parameters: ParameterSet, values: Mapping[str, float]) -> ParameterSet:
-    """With other values and no bounds on them."""
-    return parameters.with_bounds(dict.fromkeys(values, (-np.inf, np.inf))).with_values(values)
-
-
-def _spool(system: System, measured: Trajectory, parameters: ParameterSet) -> dict[str, Array]:
-    """The spool's states from the command, held over each sample; the lag is linear up to the clip."""
-    mine = [n for n in names(system.states) if n.startswith("valve.")]
-    if not mine:
+def _searched(
+    tried: Mapping[str, Sequence[float]],
+    parameters: ParameterSet,
+    misfits: Callable[[Sequence[Values]], Sequence[float]],
+) -> dict[str, float]:
+    """The values of least misfit: the best of a grid, then of ever closer ones around the best."""
+    if not tried:
         return {}
-    rows = [names(system.states).index(n) for n in mine]
-    span = parameters.value("valve.span")
-    line = system.linearise(_middle(system), {}, parameters)
-    A, B = line.A[np.ix_(rows, rows)], line.B[rows]
-    h = float(np.median(np.diff(measured.t)))
-    block = expm(h * np.block([[A, B], [np.zeros((1, len(mine) + 1))]]))
-    Ad, Bd = block[:-1, :-1], block[:-1, -1]
-    z, out = np.zeros(len(mine)), np.empty((len(measured), len(mine)))
-    for k, u in enumerate(np.clip(measured["valve_voltage"], -span, span)):
-        out[k] = z
-        z = Ad @ z + Bd * u
-    return dict(zip(mine, out.T, strict=True))
+    names = list(tried)
+    logarithmic = np.array([n in (CONDUCTANCE, LEAK) for n in names])
+    lower, upper = (np.array([getattr(parameters[n], b) for n in names]) for b in ("lower", "upper"))
+
+    def best(grid: Array) -> Array:
+        grid = np.clip(grid, lower, upper)
+        found = misfits([dict(zip(names, point, strict=True)) for point in grid.tolist()])
+        return np.asarray(grid[np.argmin(np.nan_to_num(found, nan=np.inf))])
+
+    point = best(np.array(list(itertools.product(*tried.values()))))
+    step = np.array([ZOOM[n] for n in names])
+    moves = np.array([m for m in itertools.product((0, -1, 1), repeat=len(names)) if np.count_nonzero(m) <= 2])
+    for k in range(ZOOMS):
+        near = moves * 0.5**k
+        point = best(np.where(logarithmic, point * step**near, point + step * near))
+    return dict(zip(names, point.tolist(), strict=True))
 
 
-def _middle(system: System) -> Array:
-    """A state at which the ODE is defined: nominal pressures and temperatures, everything else zero."""
-    return np.array([q.nominal if q.name.startswith(("pressure", "temperature")) else 0.0 for q in system.states])
+def _by_pressure(runs: Mapping[str, _Run], free: Sequence[str], shape: Values) -> tuple[dict[str, float], float]:
+    """Conductance and leak, as far as free, by linear regression; and the squares that are left [Pa^2/s^2]."""
+    parameters, unit = next(iter(runs.values())).parameters, 1e-8
+    probes = [{**shape, CONDUCTANCE: c, LEAK: leak} for c, leak in ((1e-12, 0.0), (unit, 0.0), (unit, 0.01))]
+    logged = [run for run in runs.values() if run.logged]
+    closed, edges, leaking = np.concatenate([run.rates(probes) for run in logged], axis=1)
+    y = np.concatenate([run.logged_rates() for run in logged]) - closed
+    A = np.column_stack([edges - closed, (leaking - edges) / 0.01]) / unit  # of conductance, and of it times leak
+    known, basis = _affine(parameters.value(CONDUCTANCE), parameters.value(LEAK), CONDUCTANCE in free, LEAK in free)
+    known = known + basis @ np.linalg.lstsq(A @ basis, y - A @ known, rcond=None)[0]
+    leak = float(known[1] / known[0]) if known[0] > 0 else 0.0
+    found = {CONDUCTANCE: float(known[0]), LEAK: max(leak, LEAST_LEAK)}
+    values = {n: float(np.clip(v, parameters[n].lower, parameters[n].upper)) for n, v in found.items() if n in free}
+    return values, float(np.sum((y - A @ known) ** 2))
+
+
+def _affine(conductance: float, leak: float, conductance_free: bool, leak_free: bool) -> tuple[Array, Array]:
+    """(C, C * leak) as a known part and a basis of what is free."""
+    if conductance_free:
+        return np.zeros(2), np.eye(2) if leak_free else np.array([[1.0], [leak]])
+    if leak_free:
+        return np.array([conductance, 0.0]), np.array([[0.0], [conductance]])
+    return np.array([conductance, conductance * leak]), np.empty((2, 0))
+
+
+def _by_force(runs: Mapping[str, _Run], valves: Sequence[Values]) -> list[float]:
+    """How badly the forces balance with each of several valves [N]."""
+    balances = {name: run.balances(valves) for name, run in runs.items()}
+    return [misfit({name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]

@@ -36,6 +36,8 @@ class Equations:
         Squared data residuals; half the sum of all squares; largest gap in nominal sizes.
     count : int
         Number of data residuals.
+    misfit : ndarray, shape (n_outputs,)
+        Root mean square of each output's residuals, in noise standard deviations; 0 where nothing was measured.
     """
 
     arrow: Arrow
@@ -48,6 +50,7 @@ class Equations:
     cost: float
     largest_gap: float
     count: int
+    misfit: Array
 
     @property
     def gap_share(self) -> float:
@@ -59,19 +62,23 @@ class Equations:
         square = np.ix_(keep, keep)
         return indistinct(reduced.schur[square], self.arrow.corner[square])
 
-    def covariance(self, keep: Mask) -> Array | None:
+    def covariance(self, keep: Mask, *, noisy_gaps: bool = False) -> Array | None:
         """Covariance of the parameters (own units, unit noise): the sandwich over true data noise only.
 
-        The gaps carry no noise, so the plain inverse is too wide (NUMERICS section 3, step 7). Rows of parameters that
-        are not kept are NaN; None where the data do not determine the kept ones.
+        True gaps carry no noise, so the plain inverse is too wide (NUMERICS section 3, step 7); it is right for gaps
+        that stand for noise of the states. Rows of parameters that are not kept are NaN; None where the data do not
+        determine the kept ones.
         """
         reduced = self.arrow.eliminate(0.0)
         if reduced is None or self.undetermined(reduced, keep).size:
             return None
         bread = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
+        out = np.full((len(keep), len(keep)), np.nan)
+        if noisy_gaps:
+            out[np.ix_(keep, keep)] = bread
+            return np.asarray(out * np.outer(self.chain, self.chain))
         E = np.concatenate([-reduced.eliminated, self.selection], axis=1)[:, :, keep]
         meat = np.einsum("mak,mab,mbl->kl", E, self.grams, E, optimize=True)
-        out = np.full((len(keep), len(keep)), np.nan)
         out[np.ix_(keep, keep)] = bread @ meat @ bread
         return np.asarray(out * np.outer(self.chain, self.chain))
 
@@ -124,7 +131,9 @@ def normal_equations(
     largest = float(np.max(np.abs(gaps), initial=0.0))
     finite = math.isfinite(cost) and bool(np.isfinite(grams).all())
     cost = cost if finite else math.inf
-    return Equations(arrow, grams, selection, ends, gaps, chain, chi_square, cost, largest, int(known.sum()))
+    counts = known.sum(axis=(0, 1))
+    misfit = np.sqrt(np.sum(residual**2, axis=(0, 1)) / np.maximum(counts, 1))
+    return Equations(arrow, grams, selection, ends, gaps, chain, chi_square, cost, largest, int(counts.sum()), misfit)
 
 
 def gaps_of(segments: Segments, nodes: Array, x_end: Array) -> Array:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Pieces, Rollout, Run
+from pneuopt.codegen import Rollout, Run
 from pneuopt.errors import ModelError, require
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription
 from pneuopt.system import DiscreteSystem, names
@@ -86,13 +86,12 @@ class Segments:
     @cached_property
     def sensitivities(self) -> Rollout:
         """The compiled run with sensitivities to start states and free parameters."""
-        pieces = Pieces(self.system.step, self.system.update)
-        return Rollout(pieces, wrt=self.columns.tolist(), start=True)
+        return Rollout(self.system.pieces, wrt=self.columns.tolist(), start=True)
 
     @cached_property
     def plain(self) -> Rollout:
         """The compiled run without sensitivities."""
-        return Rollout(Pieces(self.system.step, self.system.update))
+        return Rollout(self.system.pieces)
 
     def run(self, nodes: Array, q: Array, substeps: int, *, sensitivities: bool, states: bool = False) -> Run:
         """Integrate all segments from their nodes, shape (m, n_states), at the problem's parameter values q."""

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Pieces, Rollout
+from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_response
+from pneuopt.control.margins import sensitivities
 from pneuopt.control.metrics import About, step_metrics
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
@@ -221,12 +221,13 @@ class Simulator:
         self._loop, self._references, self._space = loop, tuple(references), space
         self._rest = [_rest(loop, space, r) for r in references]
         self._system = loop.discrete()
-        self._rollout = Rollout(Pieces(self._system.step, self._system.update))
+        self._rollout = Rollout(self._system.pieces)
         moving = [x for r, rest in zip(references, self._rest, strict=True) for x in self._visited(r, rest)]
         rate = fastest(loop, space, moving)
         self._substeps = [substeps(rate, spacing(loop, r)) for r in references]
         slowest = 1 / max(r.horizon for r in references)
         self._omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
+        self._sensitivities = sensitivities(loop, self._omega)
 
     def values(self, points: Array, spec: Specification) -> list[dict[str, float]]:
         """What the requirements read, the worst over the references, of each candidate.
@@ -256,42 +257,45 @@ class Simulator:
         starts, steps = self._starts(k, reference, sets), np.full((m, len(run)), h)
         with np.errstate(all="ignore"):
             found = self._rollout.run(starts, u, p, t, steps, substeps=self._substeps[k])
+            sound = (np.abs(found.y) < RUNAWAY).all(axis=(1, 2)) & np.isfinite(found.x_end).all(axis=1)
         outputs = names(self._loop.outputs)
-        responses = [Trajectory(run.t, dict(zip(outputs, y.T, strict=True))) for y in found.y]
-        ends = zip(sets, responses, found.x_end, strict=True)
-        return [self._read(s, reference, response, x, band, robust) for s, response, x in ends]
+        command = outputs.index("control")
+        metrics = [dict.fromkeys(LOST, np.inf) for _ in points]
+        for i in np.flatnonzero(sound).tolist():
+            response = Trajectory(run.t, dict(zip(outputs, found.y[i].T, strict=True)))
+            metrics[i] = self._read(sets[i], reference, response, band)
+        if robust and sound.any():
+            peaks = self._peaks(p[sound], found.x_end[sound], found.y[sound, -1, command])
+            for i, peak in zip(np.flatnonzero(sound).tolist(), peaks.tolist(), strict=True):
+                metrics[i]["MaxSensitivity"] = peak
+        return metrics
 
-    def _read(
-        self, parameters: ParameterSet, reference: Step, response: Trajectory, x_end: Array, band: float, robust: bool
-    ) -> dict[str, float]:
-        finite = all(bool(np.all(np.isfinite(c) & (np.abs(c) < RUNAWAY))) for c in response.values.values())
-        if not finite or not bool(np.all(np.isfinite(x_end))):
-            return dict.fromkeys(LOST, np.inf)
+    def _read(self, parameters: ParameterSet, reference: Step, response: Trajectory, band: float) -> dict[str, float]:
         metrics = measure(self._loop, parameters, reference, response, band)
         late = response.t >= 0.8 * reference.horizon + 0.2 * reference.at
         error = np.abs(response[self._loop.feedback.name][late] - reference.final)
         metrics["Excess"] = float(np.mean(error)) / abs(reference.size)
-        if robust:
-            metrics["MaxSensitivity"] = self._sensitivity(parameters, x_end, float(response["control"][-1]))
         return metrics
 
-    def _sensitivity(self, parameters: ParameterSet, x_end: Array, command: float) -> float:
-        """Ms on a grid, about the state in which the response ends."""
-        open_loop = cut(self._loop, parameters, x_end[: len(self._loop.plant.states)], command)
-        L = frequency_response(open_loop, self._omega)
-        return float(1 / np.min(np.abs(1 + L)))
+    def _peaks(self, p: Array, x_end: Array, commands: Array) -> Array:
+        """Ms on a grid, about the states in which the responses end; an absent filter counts as in `cut`."""
+        p, filtered = p.copy(), list(self._loop.parameters).index("pid.Tf")
+        p[:, filtered] = np.where(p[:, filtered] == 0, 0.5 * (self._loop.pid.sample_time or 0.0), p[:, filtered])
+        return self._sensitivities(p, x_end[:, : len(self._loop.plant.states)], commands)
 
     def _starts(self, k: int, reference: Step, sets: Sequence[ParameterSet]) -> Array:
         rest = self._rest[k]
         if rest is not None:
             return np.tile(rest, (len(sets), 1))
-        return np.array([self._loop.initial(s, reference=reference.initial) for s in sets])
+        return np.array([self._loop.initial(s, reference=reference.initial, start=reference.start) for s in sets])
 
     def _visited(self, reference: Step, rest: Array | None) -> list[Array]:
         """Some states along the response of the given gains, and the rest."""
         h = spacing(self._loop, reference)
         run = inputs(self._loop, reference, h)
-        start = self._loop.initial(self._space.parameters, reference=reference.initial) if rest is None else rest
+        start = rest
+        if start is None:
+            start = self._loop.initial(self._space.parameters, reference=reference.initial, start=reference.start)
         p, u = self._loop.numbers(self._space.parameters), run.matrix(names(self._loop.inputs))
         found = self._rollout.run(
             start[None], u[None], p, run.t[None], np.full((1, len(run)), h), substeps=MOST_SUBSTEPS, states=True
@@ -309,7 +313,8 @@ def worst(found: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array | None:
     """The loop's rest before the step where it does not depend on the gains."""
-    first = loop.initial(space.parameters, reference=reference.initial)
-    other = loop.initial(space.filled(space.draw(np.full(len(space.names), 0.7))), reference=reference.initial)
+    first = loop.initial(space.parameters, reference=reference.initial, start=reference.start)
+    other = space.filled(space.draw(np.full(len(space.names), 0.7)))
+    second = loop.initial(other, reference=reference.initial, start=reference.start)
     scale = np.array([q.nominal for q in loop.states])
-    return first if bool(np.all(np.abs(first - other) <= 1e-9 * scale)) else None
+    return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
-from pneuopt.requirements import Specification, name
+from pneuopt.requirements import MaxSensitivity, Specification, name
 from pneuopt.tuning.candidates import Simulator, Space, Tell
 
 Array = NDArray[np.float64]
@@ -102,8 +102,26 @@ class _Judge:
 
     def __call__(self, unit: Array) -> Array:
         self.count += len(unit)
-        found = self._simulator.values(self._space.draw(np.clip(unit, 0.0, 1.0)), self.spec)
-        return np.array([merit(values, self.spec, self._scale) for values in found])
+        return self._merits(unit, self.spec)
+
+    def race(self, unit: Array, rivals: Array) -> Array:
+        """The merit of each point that may beat its rival, and of the others a lower bound that does not.
+
+        The sensitivity, a frequency response a point, costs more than a simulation; as a limit it only adds.
+        """
+        quick = self.spec.without(MaxSensitivity)
+        if quick.limits == self.spec.limits or quick.concerns(MaxSensitivity):
+            return self(unit)
+        self.count += len(unit)
+        merits = self._merits(unit, quick)
+        ahead = merits <= rivals
+        if ahead.any():
+            merits[ahead] = self._merits(unit[ahead], self.spec)
+        return merits
+
+    def _merits(self, unit: Array, spec: Specification) -> Array:
+        found = self._simulator.values(self._space.draw(np.clip(unit, 0.0, 1.0)), spec)
+        return np.array([merit(values, spec, self._scale) for values in found])
 
 
 def _generation(population: Array, merits: Array, judge: _Judge, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -119,7 +137,7 @@ def _generation(population: Array, merits: Array, judge: _Judge, rng: np.random.
     kept = rng.random((m, n)) < 0.1
     kept[np.arange(m), rng.integers(n, size=m)] = False
     trial = np.where(kept, population, mutant)
-    found = judge(trial)
+    found = judge.race(trial, merits)
     better = found <= merits
     return np.where(better[:, None], trial, population), np.where(better, found, merits)
 

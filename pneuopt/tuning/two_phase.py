@@ -206,9 +206,10 @@ def _phases(loop: ClosedLoop, space: Space, i: int, reference: Step, method: Two
 
 
 def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array:
-    first = loop.initial(space.parameters, reference=reference.initial)
+    first = loop.initial(space.parameters, reference=reference.initial, start=reference.start)
     for share in (0.3, 0.8):
-        other = loop.initial(space.filled(space.draw(np.full(len(space.names), share))), reference=reference.initial)
+        gains = space.filled(space.draw(np.full(len(space.names), share)))
+        other = loop.initial(gains, reference=reference.initial, start=reference.start)
         scale = np.array([q.nominal for q in loop.states])
         require(
             bool(np.all(np.abs(first - other) <= 1e-9 * scale)),

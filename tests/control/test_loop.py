@@ -10,7 +10,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_response
 from pneuopt.control.pid import PID
-from pneuopt.errors import ConvergenceError, InputError, ModelError
+from pneuopt.errors import InputError, ModelError
 from pneuopt.parameters import ParameterSet, Quantity
 from pneuopt.system import System, define
 
@@ -173,10 +173,24 @@ def test_a_given_state_is_taken_over_without_a_bump(axis: System, pid: PID) -> N
     assert float(model.ode(0, x, [0.2, 0.0], loop.numbers(p))[1][-1]) == pytest.approx(5.0)
 
 
-def test_a_moving_position_has_no_rest(axis: System) -> None:
+@pytest.mark.parametrize("pid", [PID(), PID(sample_time=1e-3)])
+def test_a_position_may_move_on(axis: System, pid: PID) -> None:
+    loop = ClosedLoop(axis, pid, actuated="force")
+    p = loop.parameters.with_values({"pid.Ki": 1.0, "pid.Kp": 4.0, "pid.b": 0.5})
+    x = dict(zip([q.name for q in loop.states], loop.initial(p, reference=0.2, start={"position": 0.3}), strict=True))
+    assert (x["position"], x["speed"]) == pytest.approx((0.3, 0.2))
+    assert x["pid.integral"] == pytest.approx(3.0 + 10.0 * 0.2 + 4.0 * 0.5 * 0.2)
+
+
+def test_where_a_loop_can_start_is_told(axis: System) -> None:
     loop = ClosedLoop(axis, PID(), actuated="force")
-    with pytest.raises(ConvergenceError, match="position"):
-        loop.initial(loop.parameters.with_values({"pid.Ki": 1.0}), reference=0.2)
+    with pytest.raises(InputError, match="this plant cannot start from pressure, only from position"):
+        loop.initial(loop.parameters, start={"pressure": 1.0})
+    with pytest.raises(InputError, match="start: 'speed' is what the loop controls; give it as initial="):
+        loop.initial(loop.parameters, start={"speed": 1.0})
+    position = ClosedLoop(axis, PID(), actuated="force", measured="position")
+    with pytest.raises(InputError, match="cannot start from speed, only from its rest"):
+        position.initial(position.parameters, start={"speed": 1.0})
     with pytest.raises(InputError, match=r"x_plant has shape \(3,\)"):
         loop.initial(loop.parameters, [0.0, 0.0, 0.0])
 

@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_grid, frequency_response, margins, sensitivity_terms
+from pneuopt.control.margins import (
+    _responses,
+    frequency_grid,
+    frequency_response,
+    margins,
+    sensitivities,
+    sensitivity_terms,
+)
 from pneuopt.control.pid import PID
 from pneuopt.errors import ModelError
+from pneuopt.models.catalog import s32
 from pneuopt.system import Linearisation, System
 
 
@@ -131,3 +140,30 @@ def test_one_input_and_positive_frequencies() -> None:
         frequency_response(wide, [1.0])
     with warnings.catch_warnings(), pytest.raises(ValueError, match="must be positive"):
         frequency_response(linearised([1.0], [1, 1]), [0.0])
+
+
+@pytest.mark.parametrize("measured", ["speed", "position"])
+@pytest.mark.parametrize("sample_time", [None, 1e-3])
+def test_many_sensitivities_are_those_of_one_loop_after_another(measured: str, sample_time: float | None) -> None:
+    drive, rig = s32()
+    loop = ClosedLoop(drive.system(), PID(sample_time=sample_time), measured=measured)
+    rng, omega = np.random.default_rng(0), np.geomspace(1, 1e4, 60)
+    rest = drive.rest(rig)
+    states = np.array([rest.states.get(q.name, 0.0) for q in loop.plant.states])
+    points = states * (1 + 0.1 * rng.random((5, len(states))))
+    commands = rng.uniform(-0.5, 0.5, 5)
+    sets = [
+        (loop.parameters | rig.fixed("*")).with_values({"pid.Kp": Kp, "pid.Ki": 40.0, "pid.Kd": 0.1, "pid.Tf": 0.01})
+        for Kp in (1.0, 3.0, 10.0, 20.0, 60.0)
+    ]
+    found = sensitivities(loop, omega)(np.array([loop.numbers(p) for p in sets]), points, commands)
+    for p, x, command, Ms in zip(sets, points, commands, found, strict=True):
+        L = frequency_response(loop.open_loop(p, x, {loop.command.name: command}), omega)
+        assert_allclose(Ms, 1 / np.abs(1 + L).min(), rtol=1e-6)
+
+
+def test_systems_without_a_basis_of_modes_are_solved_instead() -> None:
+    chain = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    omega = np.array([0.1, 1.0, 10.0])
+    found = _responses(np.stack([chain, chain - np.eye(3)]), np.eye(3)[[2, 2]], np.eye(3)[[0, 0]], omega)
+    assert_allclose(found, [1 / (1j * omega) ** 3, 1 / (1j * omega + 1) ** 3], rtol=1e-9)

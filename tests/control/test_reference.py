@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,13 @@ def test_the_grid_reaches_the_horizon() -> None:
     assert Step(1.0, horizon=1.0).trajectory(0.3).t[-1] == pytest.approx(1.2)
 
 
+def test_labels_tell_steps_apart() -> None:
+    steps = [Step(-0.2), Step(-0.2, initial=0.2), Step(-0.2, start={"position": 0.25, "pressure_b": 4e5})]
+    assert [s.label for s in steps] == ["0 to -0.2", "0.2 to 0", "0 to -0.2, position 0.25, pressure_b 400000"]
+    assert len({hash(s) for s in steps}) == 2
+    assert steps[0] != steps[2]
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -31,9 +39,10 @@ def test_the_grid_reaches_the_horizon() -> None:
         ({"size": 1.0, "at": -0.1}, "at must not be negative"),
         ({"size": 1.0, "at": 2.0}, "horizon 1 s must lie after the step at 2 s"),
         ({"size": 1.0, "horizon": math.inf}, "horizon must be a finite"),
+        ({"size": 1.0, "start": {"position": math.nan}}, r"start\['position'\] must be a finite number"),
     ],
 )
-def test_impossible_steps_are_refused(fields: dict[str, float], message: str) -> None:
+def test_impossible_steps_are_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         Step(**fields)
 

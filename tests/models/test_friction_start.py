@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -5,7 +7,7 @@ from pneuopt.codegen import Pieces, Rollout
 from pneuopt.errors import LogError
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
-from pneuopt.models.friction_start import motion
+from pneuopt.models.friction_start import Rows, load_columns, misfit, motion
 from pneuopt.models.load import Load
 from pneuopt.parameters import ParameterSet
 from pneuopt.system import DiscreteSystem, Log, Start, discretise, names, vector
@@ -169,3 +171,22 @@ def test_a_short_log_takes_a_shorter_filter() -> None:
     position, speed, _ = motion(Trajectory(np.arange(6) * 1e-3, {"position": np.arange(6) * 1e-3}))
     assert speed == pytest.approx(np.ones(6))
     assert position == pytest.approx(np.arange(6) * 1e-3)
+
+
+def test_an_incline_adds_weight_to_the_mass() -> None:
+    columns = load_columns(ForceDrive(Coulomb(), Load(inclined=True)).parameters, np.zeros(3), np.ones(3))
+    assert columns["load.mass"] == pytest.approx(1 + 9.80665)
+    assert set(columns) == {"load.mass", "load.force"}
+
+
+def test_the_misfit_is_what_no_friction_explains() -> None:
+    t = np.arange(4000) * 1e-3
+    speed, wrong = 0.1 * np.sin(7 * t), 20 * np.cos(31 * t)
+    drive = ForceDrive(Coulomb())
+    given = drive.parameters.freed("friction.coulomb", "friction.viscous")
+    columns = load_columns(given, np.zeros(4000), 0.7 * np.cos(7 * t))
+    right = 33 * np.tanh(speed / 1e-3) + 50 * speed + given.value("load.mass") * columns["load.mass"]
+    rows = Rows(Trajectory(t, {"speed": speed}), given, speed, right, columns, {})
+    assert misfit({"run": rows}) < 1.0
+    assert misfit({"run": replace(rows, force=right + wrong)}) == pytest.approx(np.mean(np.abs(wrong)), rel=0.1)
+    assert misfit({"run": replace(rows, force=np.full(4000, np.nan))}) == np.inf

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from pneuopt.errors import ModelError
+from pneuopt.models.catalog import r25, s32
 from pneuopt.models.paper2015 import (
     KAPPA,
     OperatingPoint,
@@ -15,6 +17,7 @@ from pneuopt.models.paper2015 import (
     constant_term,
     leak_rate,
     natural_frequency,
+    operating_point,
     paper_plant,
     second_order,
     state_space,
@@ -123,3 +126,20 @@ def test_equation_16_as_printed() -> None:
     assert np.poly(linear.A) == pytest.approx([1.0, 17.5, 86.34])
     assert (linear.C @ linear.A @ linear.B).item() == pytest.approx(635.06)
     assert (system.inputs[0].unit, system.outputs[0].unit) == ("V", "V")
+
+
+def test_the_symbols_read_off_the_nonlinear_drive() -> None:
+    found, record = operating_point(*r25(), half_travel=1e-3), OperatingPoint()
+    for name in ("K_ma", "K_mb", "K_ca", "K_cb", "A_a", "n", "m", "p_ai", "V_0a", "T_s", "M_L", "k_v"):
+        assert getattr(found, name) == pytest.approx(getattr(record, name), rel=2e-9), name
+    drive, p = r25()
+    off = operating_point(drive, p.with_values({"cylinder.start": 0.3}), half_travel=1e-3)
+    assert off.m == pytest.approx((1.3051087903e-4 + 0.7 * record.A_a) / (1.3051087903e-4 + 0.3 * record.A_a))
+    assert off.K_ma == pytest.approx(record.K_ma, rel=1e-9)  # the valve knows no volume
+
+
+def test_another_drive_has_no_such_symbols() -> None:
+    with pytest.raises(ModelError, match="rodless, with Viscous"):
+        operating_point(*s32(), half_travel=1e-3)
+    with pytest.raises(ModelError, match="rodless, with Viscous"):
+        operating_point(*r25(lugre=True), half_travel=1e-3)

@@ -1,11 +1,17 @@
 """Starts of a pneumatic drive from its log alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pneuopt as po
 from pneuopt.models.catalog import b32
+from pneuopt.models.chamber import Thermal
+from pneuopt.models.load import Load
 from pneuopt.system import Log
+
+ALL = ("valve_voltage", "position", "pressure_a", "pressure_b")
 
 
 @pytest.fixture(scope="module")
@@ -19,6 +25,7 @@ def truth() -> tuple[po.System, po.ParameterSet, po.Trajectory]:
     rng = np.random.default_rng(0)
     noisy = {"position": run["position"] + 5e-6 * rng.standard_normal(1000)}
     noisy |= {n: run[n] + 1e3 * rng.standard_normal(1000) for n in ("pressure_a", "pressure_b")}
+    noisy["speed"] = run["speed"] + 2e-3 * rng.standard_normal(1000)
     return system, parameters, po.Trajectory(t, {"valve_voltage": voltage, **noisy, "true_speed": run["speed"]})
 
 
@@ -31,7 +38,7 @@ def blind(parameters: po.ParameterSet) -> po.ParameterSet:
 
 def test_valve_and_friction_start_near_the_truth(truth: tuple[po.System, po.ParameterSet, po.Trajectory]) -> None:
     system, parameters, log = truth
-    starts = system.starts({"run": Log(log, blind(parameters))})
+    starts = system.starts({"run": Log(log.select(ALL), blind(parameters))})
     assert len(starts) == 6
     for start in starts:
         assert start.parameters["valve.conductance"] == pytest.approx(2e-8, rel=0.1)
@@ -42,7 +49,7 @@ def test_valve_and_friction_start_near_the_truth(truth: tuple[po.System, po.Para
 
 def test_states_along_the_log_are_the_drives(truth: tuple[po.System, po.ParameterSet, po.Trajectory]) -> None:
     system, parameters, log = truth
-    states = system.starts({"run": Log(log, blind(parameters))})[0].states["run"]
+    states = system.starts({"run": Log(log.select(ALL), blind(parameters))})[0].states["run"]
     assert set(states.names) >= {"position", "speed", "pressure_a", "pressure_b", "valve.spool"}
     assert np.sqrt(np.mean((states["speed"] - log["true_speed"]) ** 2)) < 0.05 * np.abs(log["true_speed"]).max()
 
@@ -54,3 +61,76 @@ def test_without_pressures_they_are_integrated(truth: tuple[po.System, po.Parame
     late = log.t > 0.4
     for name in ("pressure_a", "pressure_b"):
         assert np.sqrt(np.mean((states[name] - log[name])[late] ** 2)) < 0.1 * np.ptp(log[name])
+
+
+@pytest.mark.parametrize("logged", [("position", "pressure_a"), ("position", "pressure_b"), ("position",), ("speed",)])
+def test_the_valve_starts_near_the_truth_from_fewer_channels(
+    truth: tuple[po.System, po.ParameterSet, po.Trajectory], logged: tuple[str, ...]
+) -> None:
+    system, parameters, log = truth
+    kept = log.select(["valve_voltage", *logged])
+    start = system.starts({"run": Log(kept, blind(parameters))})[0]
+    assert start.parameters["valve.conductance"] == pytest.approx(2e-8, rel=0.15)
+    assert 0 < start.parameters["valve.leak"] < 0.1
+    assert set(start.states["run"].names) >= {q.name for q in system.states}
+
+
+def test_dead_zone_and_critical_ratio_are_told_from_the_pressures() -> None:
+    drive, parameters = b32()
+    parameters = parameters.with_values({"valve.dead_zone": 0.06, "valve.critical_ratio": 0.4})
+    t = np.arange(1500) * 1e-3
+    voltage = 0.35 * np.cos(2 * np.pi * 3.0 * t) * np.cos(2 * np.pi * 0.4 * t)
+    rest = drive.rest(parameters, position=0.1)
+    inputs = po.Trajectory(t, {"valve_voltage": voltage})
+    run = po.simulate(drive.system(), inputs, parameters, initial=rest.states, rtol=1e-8)
+    log = run.with_columns({"valve_voltage": voltage}).select(ALL)
+    shape = {"valve.dead_zone": 0.0, "valve.critical_ratio": 0.3}
+    start = drive.system().starts({"run": Log(log, blind(parameters).with_values(shape).freed(*shape))})[0]
+    assert start.parameters["valve.dead_zone"] == pytest.approx(0.06, abs=0.01)
+    assert start.parameters["valve.critical_ratio"] == pytest.approx(0.4, abs=0.1)
+    assert start.parameters["valve.conductance"] == pytest.approx(2e-8, rel=0.1)
+
+
+def test_a_log_without_position_begins_where_it_is_said_to(
+    truth: tuple[po.System, po.ParameterSet, po.Trajectory],
+) -> None:
+    system, parameters, log = truth
+    speed = log.select(["valve_voltage", "speed"])
+    highest = 0.2 - (log["position"] - log["position"][0]).max()
+    for start, begins in {0.5: 0.1, 0.48: 0.096, 1.0: highest}.items():
+        given = parameters.with_values({"cylinder.start": start}).freed("friction.coulomb")
+        position = system.starts({"run": Log(speed, given)})[0].states["run"]["position"]
+        assert position[0] == pytest.approx(begins, abs=1e-3)
+        assert position.max() <= 0.2 + 1e-9
+
+
+def test_each_log_gets_its_own_valve_value(truth: tuple[po.System, po.ParameterSet, po.Trajectory]) -> None:
+    system, parameters, log = truth
+    own = blind(parameters).per_log("valve.leak")
+    start = system.starts({n: Log(log.select(ALL), own) for n in "ab"})[0]
+    assert {"valve.leak[a]", "valve.leak[b]", "valve.conductance"} <= set(start.parameters)
+
+
+def test_a_spring_is_told_from_friction_here_too() -> None:
+    drive, values = b32()
+    drive = replace(drive, load=Load(spring=True))
+    sprung = {"load.stiffness": 800.0, "load.rest_position": 0.1}
+    parameters = (drive.parameters | values).with_values(sprung)
+    t = np.arange(1500) * 1e-3
+    voltage = 0.25 * np.cos(2 * np.pi * 4.0 * t)
+    rest = drive.rest(parameters, position=0.1)
+    run = po.simulate(drive.system(), po.Trajectory(t, {"valve_voltage": voltage}), parameters, initial=rest.states)
+    log = run.with_columns({"valve_voltage": voltage}).select(ALL)
+    free = parameters.freed("load.stiffness", "friction.coulomb")
+    start = drive.system().starts({"run": Log(log, free)})[0]
+    assert start.parameters["load.stiffness"] == pytest.approx(800, rel=0.1)
+    assert start.parameters["friction.coulomb"] == pytest.approx(40, rel=0.2)
+
+
+def test_the_airs_temperatures_start_along_the_log(truth: tuple[po.System, po.ParameterSet, po.Trajectory]) -> None:
+    drive, parameters = b32()
+    drive, log = replace(drive, chamber=Thermal()), truth[2]
+    known = drive.parameters | parameters.select(n for n in parameters if n in drive.parameters)
+    states = drive.system().starts({"run": Log(log.select(ALL), known.freed("friction.coulomb"))})[0].states["run"]
+    for name in ("temperature_a", "temperature_b"):
+        assert 200 < states[name].min() < states[name].max() < 400

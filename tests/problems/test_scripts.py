@@ -3,14 +3,18 @@
 from pathlib import Path
 
 import b32
+import b32_partial
 import emps
 import pandas as pd
 import pytest
 import rig_demo
 import seal_friction
+import simulation_speed
 import step_response
 import stick_slip
 import supply_and_load
+import t32
+import tune_drive
 
 DATASETS = Path(__file__).parents[3] / "shared" / "datasets"
 measured = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no measured logs in {DATASETS}")
@@ -56,8 +60,18 @@ def test_supply_and_load(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_simulation_speed() -> None:
+    assert failed(simulation_speed.main()) == []
+
+
+@pytest.mark.slow
 def test_b32() -> None:
     assert failed(b32.main()) == []
+
+
+@pytest.mark.slow
+def test_b32_partial() -> None:
+    assert failed(b32_partial.main()) == []
 
 
 @pytest.mark.slow
@@ -66,3 +80,19 @@ def test_stick_slip(tmp_path: Path) -> None:
     assert failed(stick_slip.main(job)) == []
     stick_slip.figure(job).savefig(tmp_path / "runs.png")
     assert (tmp_path / "runs.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_tune_drive(tmp_path: Path) -> None:
+    job = tune_drive.run()
+    assert failed(tune_drive.main(job)) == []
+    tune_drive.figure(job).savefig(tmp_path / "steps.png")
+    assert (tmp_path / "steps.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_t32(tmp_path: Path) -> None:
+    job = t32.run()
+    assert failed(t32.main(job)) == []
+    t32.figure(job).savefig(tmp_path / "merit.png")
+    assert (tmp_path / "merit.png").stat().st_size > 10_000

@@ -1,0 +1,125 @@
+"""`evaluate`: what a loop's gains are worth, by a simulation that shares nothing with the search; or on a rig."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import margins
+from pneuopt.control.reference import Step
+from pneuopt.errors import ModelError, require
+from pneuopt.parameters import ParameterSet
+from pneuopt.rig import Rig, record
+from pneuopt.simulate import simulate
+from pneuopt.trajectories import Trajectory
+from pneuopt.tuning.candidates import cut, inputs, measure, spacing
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FINE = 4  # points of the record a sample of the search's
+
+
+def evaluate(
+    loop: ClosedLoop | Rig, references: Step | Sequence[Step], parameters: ParameterSet, *, band: float = 0.02
+) -> "pd.DataFrame":
+    """Certified metrics: by the tight independent simulation, at the given parameters.
+
+    Parameters
+    ----------
+    loop : ClosedLoop or Rig
+        A rig's loop runs behind the rig's actuator and sensors (`record`, seed 0); what is measured is the plant's
+        true signal at the controller's samples, not what the controller saw, and PeakControl is what gets through the
+        actuator. Margins are those of a smooth loop: a rig has none.
+    references : Step or sequence of Step
+        Each from rest, or from steady motion.
+    parameters : ParameterSet
+    band : float
+        Half width of the settling band around the reference, a fraction of the step.
+
+    Returns
+    -------
+    DataFrame
+        A row a metric, a column a reference ("0 to 0.25"): those of `step_metrics`, then, not for a rig,
+        MaxSensitivity, GainMargin and PhaseMargin [deg] about the state in which the response ends.
+
+    Raises
+    ------
+    ConvergenceError
+        If the simulation stops.
+
+    Warns
+    -----
+    PhysicsWarning
+        If the piston reaches an end stop, or a chamber is emptied.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.instruments import Sensor
+    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.friction import Viscous
+    >>> loop = ClosedLoop(ForceDrive(Viscous()).system(), PID(sample_time=1e-3))
+    >>> values = loop.parameters.with_values({"pid.Kp": 300.0, "pid.Ki": 4000.0})
+    >>> smooth = evaluate(loop, Step(0.1), values)
+    >>> real = evaluate(Rig(loop, {"position": Sensor(resolution=1e-5)}), Step(0.1), values)
+    >>> [(found["0 to 0.1"]["Overshoot"] < 1).item() for found in (smooth, real)]
+    [True, True]
+    >>> ["MaxSensitivity" in found.index for found in (smooth, real)]
+    [True, False]
+    """
+    import pandas as pd
+
+    steps = [references] if isinstance(references, Step) else list(references)
+    check_labels(steps)
+    return pd.DataFrame({r.label: _certified(loop, r, respond(loop, r, parameters), parameters, band) for r in steps})
+
+
+def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
+    """The response that `evaluate` measures, from rest or from steady motion.
+
+    Parameters
+    ----------
+    loop : ClosedLoop or Rig
+    reference : Step
+    parameters : ParameterSet
+
+    Returns
+    -------
+    Trajectory
+        Of a loop states and outputs, simulated tightly, on a grid finer than the search's; of a rig the truth.
+    """
+    inner = loop.model if isinstance(loop, Rig) else loop
+    if not isinstance(inner, ClosedLoop):
+        raise ModelError("this rig is a plant alone, which follows no reference; give it a ClosedLoop")
+    run = inputs(inner, reference, spacing(inner, reference))
+    start = inner.initial(parameters, reference=reference.initial, start=reference.start)
+    if isinstance(loop, Rig):
+        return record(loop, run, parameters, initial=start).truth
+    fine = np.linspace(run.t[0], run.t[-1], FINE * (len(run) - 1) + 1)
+    return simulate(inner, run, parameters, initial=start, t_out=fine)
+
+
+def check_labels(references: Sequence[Step]) -> None:
+    """Refuse references that tables could not tell apart."""
+    labels = [r.label for r in references]
+    twice = next((n for n in labels if labels.count(n) > 1), "")
+    require(not twice, f"two references are {twice!r}, and tables tell them by that; leave one out")
+
+
+def _certified(
+    loop: ClosedLoop | Rig, reference: Step, response: Trajectory, parameters: ParameterSet, band: float
+) -> dict[str, float]:
+    inner = loop.model if isinstance(loop, Rig) else loop
+    assert isinstance(inner, ClosedLoop)
+    metrics = measure(inner, parameters, reference, response, band)
+    if isinstance(loop, Rig):
+        return metrics
+    x = np.array([response[q.name][-1] for q in inner.plant.states])
+    robust = margins(cut(inner, parameters, x, float(response["control"][-1])))
+    return metrics | {
+        "MaxSensitivity": robust.max_sensitivity if robust.stable else np.inf,
+        "GainMargin": robust.gain_margin,
+        "PhaseMargin": robust.phase_margin,
+    }

@@ -1,0 +1,277 @@
+"""`averaged`: what a fast dither makes of a plant, without the dither's own oscillation.
+
+Every state swings about its mean, ``x = m + X(theta)``; the means obey ``dm/dt = mean over theta of f(m + X, u + A sin
+theta)``. That smooths at once what the spool's ripple does to the openings and the piston's to its friction. X is the
+first harmonic (`ripple`), about one operating point. Valid where the dither is fast against the loop: the error is of
+the order of its period. Zames & Shneydor, IEEE Trans. Autom. Control 21(5), 1976.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import pi
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.errors import ConvergenceError, check_known, require
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.system import Symbols, System, define, names, stacked, symbols, vector
+
+Array = NDArray[np.float64]
+AMPLITUDE, OFFSET, FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
+RISE = np.geomspace(1e-3, 1.0, 13)  # fractions of the amplitude, where the whole is too much at once
+ITERATIONS, TOLERANCE, SHORTEST = 50, 1e-9, 1e-3
+
+
+def averaged(
+    model: System | ClosedLoop,
+    parameters: ParameterSet,
+    *,
+    at: Mapping[str, float] | None = None,
+    reference: float = 0.0,
+    actuated: str | None = None,
+    nodes: int = 64,
+) -> System:
+    """The mean motion of a plant, or of a loop, under dither.
+
+    Parameters
+    ----------
+    model : System or ClosedLoop
+        A plant; or a loop with dither and a continuous controller, which then reacts to its own ripple, and is clipped
+        on its average.
+    parameters : ParameterSet
+        With "dither.amplitude" and "dither.frequency" [Hz], as of the loop. The amplitude stays a parameter: the ripple
+        grows with it in proportion. The frequency, and the operating point, are built in.
+    at : mapping of state or input to value, optional
+        The operating point of the ripple; absent ones are zero. By default the steady motion at `reference`.
+    reference : float
+        [unit of the measured signal, a plant's speed]; dry friction at rest leaves next to no ripple of the speed.
+    actuated : str, optional
+        Of a plant: the input that is dithered; by default its only one.
+    nodes : int
+        Phases over which is averaged; a function of the sine alone sees the half as many nodes of Gauss and Chebyshev,
+        ``A cos((2 i - 1) pi / nodes)``.
+
+    Returns
+    -------
+    System
+        States and outputs are means. Of a plant it has "dither.amplitude" and "dither.offset", too:
+        ``ClosedLoop(averaged(plant, p), pid)`` takes the parameters of the dithered loop.
+
+    Raises
+    ------
+    InputError
+        If the parameters say no dither, or the loop has none or a sampled controller.
+    ConvergenceError
+        If no ripple is found; give another operating point.
+
+    Examples
+    --------
+    A dead zone of 0.2 under a sine of 0.4 passes (2/pi) acos(0.2/0.4) = 2/3 of the slope:
+
+    >>> from pneuopt.models.valve import opening
+    >>> from pneuopt.parameters import Quantity
+    >>> x, u = Quantity("level", "1"), Quantity("spool", "1")
+    >>> edge = {"dead_zone": 0.2, "rounding": 0.02, "leak": 0.0}
+    >>> flow = lambda t, x, u, p: ({"level": opening(u["spool"], edge) - opening(-u["spool"], edge)}, dict(x))
+    >>> given = ParameterSet({"dither.amplitude": Parameter(0.4, "1"), "dither.frequency": Parameter(100.0, "Hz")})
+    >>> mean = averaged(define([x], [u], [x], ParameterSet(), flow), given)
+    >>> round(float(mean.linearise(np.zeros(1), {}, given).B[0, 0]), 2)
+    0.67
+    """
+    dithered = _dithered(model, parameters, actuated)
+    given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
+    swing = _first_harmonic(dithered, given, _point(model, dithered, given, at, reference), nodes)
+    return dithered.mean(swing / given.value(AMPLITUDE), nodes)
+
+
+def ripple(
+    model: System | ClosedLoop,
+    parameters: ParameterSet,
+    *,
+    at: Mapping[str, float] | None = None,
+    reference: float = 0.0,
+    actuated: str | None = None,
+    nodes: int = 64,
+) -> dict[str, complex]:
+    """How every state swings under dither: the balance of the first harmonic, with friction and openings as they are.
+
+    Parameters and errors as for `averaged`.
+
+    Returns
+    -------
+    dict of str to complex
+        By state: the peak, and the phase by which it leads the sine.
+    """
+    dithered = _dithered(model, parameters, actuated)
+    given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
+    swing = _first_harmonic(dithered, given, _point(model, dithered, given, at, reference), nodes)
+    return dict(zip(names(dithered.system.states), swing.tolist(), strict=True))
+
+
+def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Array:
+    """Where the means begin if the dither is switched on, at the sine's zero, in state x.
+
+    The swing starts at its phase, not at zero, so the mean starts beside x; without this, what spool and chambers
+    gain in the first half period is missing for as long as they remember it.
+
+    Parameters
+    ----------
+    swing : mapping of state to complex
+        As `ripple` gives it.
+    x : array_like, shape (n_states,)
+
+    Returns
+    -------
+    ndarray, shape (n_states,)
+
+    Examples
+    --------
+    >>> mean_start({"level": 3 - 1j}, [5.0]).tolist()
+    [6.0]
+    """
+    begun: Array = np.asarray(x, dtype=float) - np.array([amplitude.imag for amplitude in swing.values()])
+    return begun
+
+
+@dataclass(frozen=True, eq=False)
+class _Dithered:
+    """A system and where the sine enters: an input, or, of a loop, the dither's offset."""
+
+    system: System
+    parameters: ParameterSet
+    frequency: float
+    entrance: str | None
+
+    def rates(self, t: ca.SX, x: ca.SX, u: Symbols, p: Symbols, sine: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Rates and outputs while the sine has this value."""
+        own = {n: p[n] for n in self.system.parameters}
+        if self.entrance is None:
+            own |= {AMPLITUDE: ca.SX(0), OFFSET: p[OFFSET] + sine}
+        else:
+            u = {**u, self.entrance: u[self.entrance] + p[OFFSET] + sine}
+        xdot, y = self.system.ode(t, x, stacked(u), stacked(own))
+        return xdot, y
+
+    def mean(self, unit: NDArray[np.complex128], nodes: int) -> System:
+        """The system of the means, for a ripple of `unit` per amplitude."""
+        system = self.system
+
+        def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
+            at = [(np.sin(phase), unit.real * np.sin(phase) + unit.imag * np.cos(phase)) for phase in _phases(nodes)]
+            found = [self.rates(t, stacked(x) + p[AMPLITUDE] * swing, u, p, p[AMPLITUDE] * sine) for sine, swing in at]
+            rates, outputs = (sum(column, start=ca.SX(0)) / nodes for column in zip(*found, strict=True))
+            return _named(system.states, rates), _named(system.outputs, outputs)
+
+        mean = define(system.states, system.inputs, system.outputs, self.parameters, rhs)
+        return replace(mean, rest_finder=system.rest_finder, checker=system.checker, guards=system.guards)
+
+    def imbalance(self, nodes: int) -> ca.Function:
+        """``(a, b; x, u, p) -> first harmonic of the rates, less that of the swing a sin theta + b cos theta``."""
+        n, w = len(self.system.states), 2 * pi * self.frequency
+        a, b, x = (ca.SX.sym(k, n) for k in "abx")
+        u, p = symbols(self.system.inputs), {n: ca.SX.sym(n) for n in self.parameters}
+        inphase, quadrature = ca.SX(n, 1), ca.SX(n, 1)
+        for phase in _phases(nodes):
+            sine, cosine = np.sin(phase), np.cos(phase)
+            rate = self.rates(ca.SX(0), x + a * sine + b * cosine, u, p, p[AMPLITUDE] * sine)[0]
+            inphase, quadrature = inphase + 2 / nodes * sine * rate, quadrature + 2 / nodes * cosine * rate
+        unknown, left = ca.vertcat(a, b), ca.vertcat(quadrature - w * a, inphase + w * b) / w
+        values = [unknown, x, stacked(u), stacked(p)]
+        return ca.Function("imbalance", values, [left, ca.jacobian(left, unknown)])
+
+
+def _dithered(model: System | ClosedLoop, parameters: ParameterSet, actuated: str | None) -> _Dithered:
+    for name in (AMPLITUDE, FREQUENCY):
+        positive = name in parameters and parameters.value(name) > 0
+        require(positive, f"averaging needs a dither: parameters with {name} > 0")
+    frequency = parameters.value(FREQUENCY)
+    if isinstance(model, ClosedLoop):
+        sampled = "the controller is sampled; average the plant, ClosedLoop(averaged(plant, parameters), pid)"
+        require(model.dither is not None, "averaging needs a loop with dither: ClosedLoop(plant, pid, Dither())")
+        require(model.pid.sample_time is None, sampled)
+        return _Dithered(model.system(), model.parameters, frequency, None)
+    inputs = {q.name: q for q in model.inputs}
+    name = actuated or next(iter(inputs), "")
+    require(actuated is not None or len(inputs) == 1, f"the plant has the inputs {', '.join(inputs)}; choose actuated=")
+    check_known("input", [name], inputs, "averaged: actuated")
+    own = {n: Parameter(0.0, inputs[name].unit) for n in (AMPLITUDE, OFFSET)}
+    return _Dithered(model, model.parameters | ParameterSet(own), frequency, name)
+
+
+def _point(
+    model: System | ClosedLoop,
+    dithered: _Dithered,
+    parameters: ParameterSet,
+    at: Mapping[str, float] | None,
+    reference: float,
+) -> tuple[Array, Array]:
+    """The operating point: states and inputs."""
+    states, inputs = names(dithered.system.states), names(dithered.system.inputs)
+    if at is not None:
+        check_known("state or input", at, [*states, *inputs], "averaged: at")
+        return np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
+    if isinstance(model, ClosedLoop):
+        x = model.initial(parameters, reference=reference)
+        return x, np.array([reference if n == "reference" else 0.0 for n in inputs])
+    if model.rest_finder is None:
+        return np.zeros(len(states)), np.zeros(len(inputs))
+    rest = model.rest_finder(parameters, {"speed": reference})
+    return (
+        np.array([rest.states.get(n, 0.0) for n in states]),
+        np.array([rest.inputs.get(n, 0.0) for n in inputs]),
+    )
+
+
+def _first_harmonic(
+    dithered: _Dithered, parameters: ParameterSet, point: tuple[Array, Array], nodes: int
+) -> NDArray[np.complex128]:
+    """Newton's method; where it fails, the amplitude is raised step by step."""
+    require(nodes >= 8, f"nodes must be at least 8, got {nodes}")
+    imbalance, full = dithered.imbalance(nodes), parameters.value(AMPLITUDE)
+    scale = np.tile([q.nominal for q in dithered.system.states], 2)
+
+    def harmonic(fraction: float, start: Array) -> Array | None:
+        p = vector(dithered.parameters, parameters.with_values({AMPLITUDE: fraction * full}))
+        return _root(lambda z: imbalance(z * scale, *point, p), scale, start)
+
+    found = harmonic(1.0, np.zeros_like(scale))
+    if found is None:
+        found, before = np.zeros_like(scale), RISE[0]
+        for fraction in RISE:
+            found, before = harmonic(fraction, found * fraction / before), fraction
+            where = f"for a dither of {fraction * full:g} at {dithered.frequency:g} Hz"
+            if found is None:
+                raise ConvergenceError(f"no ripple found {where}; give another operating point, or more nodes")
+    a, b = np.split(found * scale, 2)
+    return np.asarray(a + 1j * b)
+
+
+def _root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: Array) -> Array | None:
+    """A zero by Newton's method with halved steps; None where it does not come."""
+
+    def at(z: Array) -> tuple[Array, Array]:
+        left, slope = function(z)
+        return left.full().ravel() / scale, slope.full() * scale / scale[:, None]
+
+    left, slope = at(z)
+    for _ in range(ITERATIONS):
+        step, size, part = np.linalg.solve(slope, -left), np.abs(left).max(), 1.0
+        while not np.abs(at(z + part * step)[0]).max() < size and part > SHORTEST:
+            part /= 2
+        z = z + part * step
+        if part * np.abs(step).max() <= TOLERANCE * np.abs(z).max():
+            return z
+        left, slope = at(z)
+    return None
+
+
+def _phases(nodes: int) -> Array:
+    """Midway between the turning points of the sine, so that no node lies on one."""
+    return (2 * np.arange(1, nodes + 1) - 1) * pi / nodes
+
+
+def _named(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
+    return {q.name: column[k] for k, q in enumerate(quantities)}

@@ -1,0 +1,108 @@
+"""Where a loop rests, or moves steadily: the equilibrium of plant and controller, without dither and clip."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import ConvergenceError, require
+from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.system import DIRECTION, Symbols, System, define, names, vector
+
+if TYPE_CHECKING:
+    from pneuopt.control.loop import ClosedLoop
+
+Array = NDArray[np.float64]
+Signals = dict[str, ca.SX]
+INTEGRAL = "pid.integral"
+
+
+def find_rest(
+    loop: "ClosedLoop", parameters: ParameterSet, reference: float, start: Mapping[str, float]
+) -> tuple[Array, float]:
+    """The plant's state and the command.
+
+    A plant that knows its rest is asked for it. Else the equilibrium is solved for, where a state on which no rate and
+    not the measured output depends, the position of a servo axis, may run on.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+    reference : float
+        [unit of the measured signal]
+    start : mapping of str to float
+        What else is known of the plant.
+
+    Raises
+    ------
+    ConvergenceError
+        If there is no equilibrium.
+    InputError
+        If the plant refuses, or does not start from what `start` names.
+    """
+    plant, measured = loop.plant, loop.feedback.name
+    require(measured not in start, f"start: {measured!r} is what the loop controls; give it as initial=")
+    if plant.rest_finder is not None:
+        rest = plant.rest_finder(parameters, {measured: reference, **start})
+        return np.array([rest.states.get(n, 0.0) for n in names(plant.states)]), rest.inputs.get(loop.command.name, 0.0)
+    free = drifting(plant, measured)
+    others = ", ".join(sorted(start.keys() - free))
+    require(not others, f"start: this plant cannot start from {others}, only from {', '.join(free) or 'its rest'}")
+    system = _resting(loop, free, parameters)
+    guess = {measured: reference} if measured in names(system.states) else {}
+    try:
+        x = system.equilibrium({"reference": reference}, parameters, guess)
+    except ConvergenceError as error:
+        message = f"the loop neither rests nor moves steadily at {measured} {reference:g} {loop.feedback.unit}: {error}"
+        raise ConvergenceError(f"{message}, or give x_plant", error.solution) from None
+    found = {**start, **dict(zip(names(system.states), x.tolist(), strict=True))}
+    u = [reference] + [0.0] * (len(system.inputs) - 1)
+    command = float(system.ode(0, x, u, vector(system.parameters, parameters))[1][-1])
+    return np.array([found.get(n, 0.0) for n in names(plant.states)]), command
+
+
+def sliding(loop: "ClosedLoop", parameters: ParameterSet, reference: float) -> ParameterSet:
+    """The parameters with which a loop begins: Karnopp's friction already slides where the plant moves."""
+    if loop.feedback.name != "speed" or DIRECTION not in loop.parameters:
+        return parameters
+    return (loop.parameters | parameters).with_values({DIRECTION: float(np.sign(reference))})
+
+
+def drifting(plant: System, measured: str) -> tuple[str, ...]:
+    """States on which no rate and not the measured output depends."""
+    t, x, u, p = (ca.SX.sym(k, plant.ode.size1_in(i)) for i, k in enumerate("txup"))
+    xdot, y = plant.ode(t, x, u, p)
+    what = ca.vertcat(xdot, y[names(plant.outputs).index(measured)])
+    matters = ca.which_depends(what, x, 1)
+    return tuple(n for n, counts in zip(names(plant.states), matters, strict=True) if not counts)
+
+
+def wired(
+    plant: System, actuated: str, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX
+) -> tuple[Signals, Signals]:
+    """Rates and outputs of the plant under a command."""
+    driven = {**u, actuated: command}
+    xs, us = (ca.vertcat(*(v[n] for n in names(q))) for v, q in ((x, plant.states), (driven, plant.inputs)))
+    xdot, y = plant.ode(t, xs, us, ca.vertcat(*(p[n] for n in plant.parameters)))
+    states, outputs = names(plant.states), names(plant.outputs)
+    return {n: xdot[k] for k, n in enumerate(states)}, {n: y[k] for k, n in enumerate(outputs)}
+
+
+def _resting(loop: "ClosedLoop", free: tuple[str, ...], parameters: ParameterSet) -> System:
+    """The loop with the integral as its controller's only state, and without the plant's free ones."""
+    plant, Ki = loop.plant, (loop.parameters | parameters).value("pid.Ki")
+    integral = [Quantity(INTEGRAL, loop.command.unit, loop.command.nominal)] if Ki else []
+    states = [*(q for q in plant.states if q.name not in free), *integral]
+
+    def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+        moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
+        y = wired(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1][loop.feedback.name]
+        command = p["pid.Kp"] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL, 0.0)
+        rates, outputs = wired(plant, loop.command.name, t, moving, u, p, command)
+        rates |= {INTEGRAL: p["pid.Ki"] * (u["reference"] - y)}
+        return {n: rates[n] for n in x}, outputs | {"control": command}
+
+    return define(states, loop.inputs, loop.outputs, loop.parameters, rhs)

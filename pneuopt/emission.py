@@ -1,0 +1,173 @@
+"""C for SIMD lanes from SX Functions: every operation on a vector of lanes, what changes rarely computed rarely.
+
+Each value is computed at the rarest of three rates that its inputs allow: once a segment (parameters), once a sample
+(held inputs, step size), or at every call. What divides twice, or changes less often than what it divides, does so by a
+reciprocal computed once: that moves a result by a rounding.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import casadi as ca
+
+RATES = ("segment", "sample", "call")
+OPERATORS = {
+    ca.OP_ASSIGN: "{0}",
+    ca.OP_ADD: "{0} + {1}",
+    ca.OP_SUB: "{0} - {1}",
+    ca.OP_MUL: "{0} * {1}",
+    ca.OP_DIV: "{0} / {1}",
+    ca.OP_NEG: "-{0}",
+    ca.OP_SQ: "{0} * {0}",
+    ca.OP_TWICE: "{0} + {0}",
+    ca.OP_INV: "ALL(1.0) / {0}",
+    ca.OP_CONSTPOW: "v_pow({0}, {1})",
+}
+UNARY = (
+    "sqrt exp log log1p expm1 sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh erf fabs floor ceil sign not"
+)
+BINARY = "pow atan2 hypot fmod copysign fmin fmax lt le eq ne and or if_else_zero"
+FUNCTIONS = {getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}})" for name in UNARY.split()}
+FUNCTIONS |= {getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}}, {{1}})" for name in BINARY.split()}
+DIVISIONS = (ca.OP_DIV, ca.OP_INV)
+
+
+class Kernel(NamedTuple):
+    """One Function to emit.
+
+    Parameters
+    ----------
+    name : str
+    function : casadi.Function
+        SX, with dense results.
+    inputs, outputs : sequence of str
+        The members of the C struct that hold its arguments and results.
+    """
+
+    name: str
+    function: ca.Function
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+
+
+class Instruction(NamedTuple):
+    """One operation of an SX Function: its kind, whence, where to, and the number if it is a constant."""
+
+    operation: int
+    sources: Sequence[int]
+    target: Sequence[int]
+    constant: float
+
+
+class Value(NamedTuple):
+    """A number in C, and how often it changes."""
+
+    rate: int
+    text: str
+
+
+def emit(kernel: Kernel, rates: Mapping[str, int]) -> tuple[str, int]:
+    """C functions ``NAME_segment``, ``NAME_sample`` and ``NAME_call`` on a struct ``Segment *s``.
+
+    Parameters
+    ----------
+    kernel : Kernel
+    rates : mapping of str to int
+        How often each input changes: an index into `RATES`.
+
+    Returns
+    -------
+    text : str
+    kept : int
+        How many values the struct's member ``NAME_kept`` has to hold.
+
+    Raises
+    ------
+    NotImplementedError
+        For an operation that has no form here.
+    """
+    writer = _Writer(kernel, rates)
+    functions = []
+    for rate, statements in zip(RATES, writer.statements, strict=True):
+        body = "".join(f"  {line}\n" for line in statements)
+        functions.append(f"static void {kernel.name}_{rate}(Segment *s) {{\n{body}}}\n")
+    return "\n".join(functions), len(writer.kept)
+
+
+class _Writer:
+    """The statements of one kernel."""
+
+    def __init__(self, kernel: Kernel, rates: Mapping[str, int]) -> None:
+        self.kernel, self.rates = kernel, rates
+        self.statements: tuple[list[str], ...] = tuple([] for _ in RATES)
+        self.kept: dict[str, str] = {}  # what a rarer rate hands on, and its place
+        self.values: dict[int, Value] = {}
+        self.reciprocals: dict[int, Value] = {}
+        instructions = list(_instructions(kernel.function))
+        self.divisors = Counter(i.sources[-1] for i in instructions if i.operation in DIVISIONS)
+        for instruction in instructions:
+            self._add(instruction)
+
+    def _add(self, i: Instruction) -> None:
+        if i.operation == ca.OP_OUTPUT:
+            result = self._read(self.values[i.sources[0]], len(RATES) - 1)
+            self.statements[-1].append(f"s->{self.kernel.outputs[i.target[0]]}[{i.target[1]}] = {result};")
+            return
+        if i.operation == ca.OP_INPUT:
+            name = self.kernel.inputs[i.sources[0]]
+            value = Value(self.rates[name], f"s->{name}[{i.sources[1]}]")
+        elif i.operation == ca.OP_CONST:
+            value = Value(0, f"ALL({_literal(i.constant)})")
+        else:
+            value = self._computed(i)
+        self.values[i.target[0]] = value
+
+    def _computed(self, i: Instruction) -> Value:
+        values, operation = [self.values[k] for k in i.sources], i.operation
+        if operation in DIVISIONS:
+            rarer = values[-1].rate < max(v.rate for v in values)
+            if operation == ca.OP_INV or rarer or self.divisors[i.sources[-1]] > 1:
+                values[-1] = self._reciprocal(i.sources[-1])
+                operation = ca.OP_ASSIGN if operation == ca.OP_INV else ca.OP_MUL
+        return self._assigned(f"a{i.target[0]}", operation, values)
+
+    def _reciprocal(self, divisor: int) -> Value:
+        if divisor not in self.reciprocals:
+            self.reciprocals[divisor] = self._assigned(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
+        return self.reciprocals[divisor]
+
+    def _assigned(self, name: str, operation: int, values: Sequence[Value]) -> Value:
+        form = OPERATORS.get(operation) or FUNCTIONS.get(operation)
+        if form is None:
+            raise NotImplementedError(f"CasADi's operation {operation}")
+        rate = max(v.rate for v in values)
+        expression = form.format(*(self._read(v, rate) for v in values))
+        self.statements[rate].append(f"const Lanes {name} = {expression};")
+        return Value(rate, name)
+
+    def _read(self, value: Value, rate: int) -> str:
+        """The value as a statement of this rate sees it."""
+        if value.rate == rate or not value.text.isidentifier():
+            return value.text
+        if value.text not in self.kept:
+            self.kept[value.text] = f"s->{self.kernel.name}_kept[{len(self.kept)}]"
+            self.statements[value.rate].append(f"{self.kept[value.text]} = {value.text};")
+        return self.kept[value.text]
+
+
+def _instructions(function: ca.Function) -> Iterator[Instruction]:
+    """The Function's operations, each result in a place of its own."""
+    symbols = function.sx_in()
+    f = ca.Function(function.name(), symbols, function.call(symbols), {"live_variables": False, "cse": True})
+    for k in range(f.n_instructions()):
+        operation = f.instruction_id(k)
+        constant = f.instruction_constant(k) if operation == ca.OP_CONST else math.nan
+        yield Instruction(operation, f.instruction_input(k), f.instruction_output(k), constant)
+
+
+def _literal(constant: float) -> str:
+    if math.isnan(constant):
+        return "NAN"
+    return repr(constant) if math.isfinite(constant) else "INFINITY" if constant > 0 else "-INFINITY"

@@ -1,0 +1,153 @@
+"""Which hardware can exist, and where a simulation leaves what its model describes: end stops, empty chambers."""
+
+from collections.abc import Mapping
+from functools import partial
+from math import inf
+from typing import NamedTuple
+
+from pneuopt.errors import HardwareError, require
+from pneuopt.guards import Guard
+from pneuopt.models.chamber import VACUUM
+from pneuopt.models.cylinder import STOP_ROUNDING
+from pneuopt.parameters import ParameterSet
+from pneuopt.units import write_value
+
+EMPTY = 0.5  # of the ambient pressure: lip seals let air in long before
+STRAY = 0.01  # of the stroke, by which a piston that presses into a stop may stand outside
+_SIDES = {"a": "rear", "b": "front"}
+
+
+def check_hardware(p: ParameterSet) -> None:
+    """Refuse impossible hardware, whatever its bounds.
+
+    Parameters
+    ----------
+    p : ParameterSet
+        All parameters of a `PneumaticDrive`.
+
+    Raises
+    ------
+    HardwareError
+        Naming parameter, value, source and what would be possible.
+    """
+    for name, limit in _limits(p).items():
+        if name in p and not limit.allows(p.value(name)):
+            source = f" (source: {p[name].source})" if p[name].source else ""
+            shown = write_value(p.value(name), p[name].unit)
+            raise HardwareError(f"{name} = {shown}{source} is impossible; {limit.remedy}", name, limit.remedy)
+
+
+def check_start(p: ParameterSet, start: Mapping[str, float]) -> None:
+    """Refuse a start outside the stroke; a piston that presses into a stop stands a little outside.
+
+    Parameters
+    ----------
+    p : ParameterSet
+    start : mapping of state to value
+
+    Raises
+    ------
+    InputError
+    """
+    stroke, y = p.value("cylinder.stroke"), start.get("position", 0.0)
+    inside = -STRAY * stroke <= y <= (1 + STRAY) * stroke
+    shown = write_value(y, "m"), write_value(stroke, "m")
+    require(inside, f"a start at position = {shown[0]} lies outside the stroke, 0 to {shown[1]}")
+
+
+def guards(stops: bool) -> tuple[Guard, ...]:
+    """What a simulation of a cylinder watches.
+
+    Parameters
+    ----------
+    stops : bool
+        Whether the covers act.
+
+    Returns
+    -------
+    tuple of Guard
+        Both ends of the stroke, and both chambers at half the ambient pressure.
+    """
+    return (*(_end(side, stops) for side in _SIDES), *(_empty(side) for side in _SIDES))
+
+
+def _end(side: str, stops: bool) -> Guard:
+    what = f"reached the {_SIDES[side]} end stop" if stops else f"left the stroke at the {_SIDES[side]}"
+    meaning = "the response is the stop's" if stops else "the model, which has no stops, means nothing"
+    limit, margin = (_front if side == "b" else _rear), (STOP_ROUNDING if stops else 0.0)
+    return Guard("position", partial(limit, margin), 1 if side == "b" else -1, f"the piston {what}", meaning)
+
+
+def _empty(side: str) -> Guard:
+    meaning = "real seals let air in, the model does not"
+    return Guard(f"pressure_{side}", _half_ambient, -1, f"chamber {side} was emptied", meaning)
+
+
+def _front(margin: float, p: ParameterSet) -> float:
+    return p.value("cylinder.stroke") - margin
+
+
+def _rear(margin: float, p: ParameterSet) -> float:  # noqa: ARG001 - as `_front`
+    return margin
+
+
+def _half_ambient(p: ParameterSet) -> float:
+    return EMPTY * p.value("ambient.pressure")
+
+
+class _Limit(NamedTuple):
+    """What a parameter may be at all."""
+
+    remedy: str
+    lower: float = -inf
+    upper: float = inf
+    open: bool = True
+
+    def allows(self, value: float) -> bool:
+        return self.lower < value < self.upper or (not self.open and value in (self.lower, self.upper))
+
+
+_POSITIVE = {
+    "cylinder.bore": "a bore is positive",
+    "cylinder.stroke": "a stroke is positive",
+    "cylinder.dead_volume_a": "ports and hoses always hold some air: a few percent of the swept volume are usual",
+    "cylinder.dead_volume_b": "ports and hoses always hold some air: a few percent of the swept volume are usual",
+    "valve.conductance": "a conductance is positive, about 2e-8 m^3/(s*Pa) for 500 l/min(ANR)",
+    "valve.rounding": "edges are round: 1e-4 is very sharp",
+    "valve.span": "give the voltage of full opening, 5 V for a 0-10 V valve",
+    "valve.bandwidth": "a bandwidth is positive, or take a valve without a lag",
+    "valve.damping": "a damping ratio is positive, 0.5 to 0.8 for most valves",
+    "ambient.temperature": "an absolute temperature is positive",
+    "gas.constant": "air has 287.05 J/(kg*K)",
+    "load.mass": "the piston alone weighs something",
+}
+_NOT_NEGATIVE = {
+    "cylinder.leak": "no leakage is 0",
+    "cylinder.stop_stiffness": "no stop is 0, or Cylinder(stops=False)",
+    "cylinder.stop_damping": "no damping is 0",
+    "valve.leak": "no leakage is 0",
+    "chamber.wall_conductance": "no heat transfer is 0",
+}
+
+
+def _limits(p: ParameterSet) -> dict[str, _Limit]:
+    bore, ambient = (write_value(p.value(n), p[n].unit) for n in ("cylinder.bore", "ambient.pressure"))
+    exponents = {
+        n: _Limit("1 is isothermal, 1.4 adiabatic", 0.0) for n in p if n.startswith("chamber.") and "exponent" in n
+    }
+    return {
+        **{n: _Limit(remedy, 0.0) for n, remedy in _POSITIVE.items()},
+        **{n: _Limit(remedy, 0.0, open=False) for n, remedy in _NOT_NEGATIVE.items()},
+        **exponents,
+        "cylinder.rod": _Limit(
+            f"a rod is thinner than the bore, {bore}; rodless is 0", -1e-300, p.value("cylinder.bore")
+        ),
+        "cylinder.start": _Limit("a start lies within the stroke, 0 to 1", 0.0, 1.0, open=False),
+        "valve.critical_ratio": _Limit(
+            "a critical pressure ratio lies between 0 and 1, 0.2 to 0.5 for most valves", -1e-300, 1.0
+        ),
+        "ambient.pressure": _Limit("an absolute pressure is positive; sea level is 101325 Pa(a)", VACUUM),
+        "supply.pressure": _Limit(
+            f"the supply lies above the ambient pressure, {ambient}", p.value("ambient.pressure")
+        ),
+    }

@@ -1,0 +1,134 @@
+"""Where a `PneumaticDrive` stands still, or moves steadily: spool and pressures at which nothing else changes."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from pneuopt.errors import require
+from pneuopt.models.chamber import VACUUM
+from pneuopt.parameters import ParameterSet
+
+Array = NDArray[np.float64]
+BALANCED = ("pressure_a", "pressure_b", "speed")
+CROWDED = 20.0  # times the supply's pressure: the most that a moving piston may compress a chamber to
+
+
+class Glide(NamedTuple):
+    """A drive at a position [m] and a speed [m/s], over its spool's position and both pressures.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        ``(position, speed, spool, pressure_a, pressure_b, p) -> (rates of BALANCED; states)``.
+    p : ndarray
+    position, speed : float
+    """
+
+    function: ca.Function
+    p: Array
+    position: float
+    speed: float
+
+    def rates(self, spool: float, a: float, b: float) -> tuple[float, float, float]:
+        """Of both pressures [Pa/s] and of the speed [m/s^2]."""
+        rate_a, rate_b, acceleration = self.function(self.position, self.speed, spool, a, b, self.p)[0].nonzeros()
+        return rate_a, rate_b, acceleration
+
+    def states(self, spool: float, a: float, b: float) -> list[float]:
+        """All of them."""
+        found: list[float] = self.function(self.position, self.speed, spool, a, b, self.p)[1].full().ravel().tolist()
+        return found
+
+
+def steady(glide: Glide, p: ParameterSet, pressure_b: float | None) -> tuple[list[float], float]:
+    """The states, and the valve's voltage, at which no rate but that of the position is left.
+
+    Parameters
+    ----------
+    glide : Glide
+    p : ParameterSet
+        The drive's, complete.
+    pressure_b : float, optional
+        What a closed valve has trapped [Pa(a)]; chamber a balances it.
+
+    Raises
+    ------
+    InputError
+        If no spool position does, or there is no such motion.
+    """
+    if glide.speed:
+        _check_motion(p, glide.speed, pressure_b)
+    if pressure_b is None:
+        spool, a, b = _balanced(glide, p)
+    else:
+        spool, a, b = 0.0, _balancing(glide, p, pressure_b), pressure_b
+    return glide.states(spool, a, b), spool * p.value("valve.span")
+
+
+def _check_motion(p: ParameterSet, speed: float, pressure_b: float | None) -> None:
+    words = f"no steady motion at speed = {speed:g} m/s: "
+    require(pressure_b is None, words + "trapped air (pressure_b) holds a drive still; give one of both")
+    spring = p.value("load.stiffness") if "load.stiffness" in p else 0.0
+    require(spring == 0, words + f"load.stiffness = {spring:g} N/m pulls more the farther it goes; start at rest")
+
+
+def _balanced(glide: Glide, p: ParameterSet) -> tuple[float, float, float]:
+    """Spool and pressures at which nothing changes: nested bisections, each on a function with one zero.
+
+    In motion a chamber may hold more than the supply's pressure: the piston pumps, the spool throttles.
+    """
+    low, high, rates = p.value("ambient.pressure"), p.value("supply.pressure"), glide.rates
+    if glide.speed:
+        low, high = VACUUM, CROWDED * high
+
+    def pressures(spool: float) -> tuple[float, float]:
+        def b(a: float) -> float:
+            return _fall(lambda b: rates(spool, a, b)[1], low, high)
+
+        if p.value("cylinder.leak") == 0:
+            return _fall(lambda a: rates(spool, a, low)[0], low, high), b(low)
+        a = _fall(lambda a: rates(spool, a, b(a))[0], low, high)
+        return a, b(a)
+
+    def push(spool: float) -> float:
+        return rates(spool, *pressures(spool))[2]
+
+    mass = p.value("load.mass")
+    ends = [push(end) * mass for end in (-1.0, 1.0)]
+    what = f"no steady motion at speed = {glide.speed:g} m/s" if glide.speed else "no equilibrium exists"
+    require(
+        ends[0] <= 0 <= ends[1],
+        f"{what}: beyond {'friction and ' if glide.speed else ''}load the cylinder pushes with {ends[0]:.4g} to "
+        f"{ends[1]:.4g} N at supply.pressure = {p.value('supply.pressure'):g} Pa(a), never with 0; "
+        f"lower the {'speed or the ' if glide.speed else ''}load, raise the supply or the bore",
+    )
+    spool = 0.0 if abs(push(0.0)) * mass < 1e-9 else _root(push, -1.0, 1.0)
+    a, b = pressures(spool)
+    inside = not glide.speed or (low < min(a, b) and max(a, b) < high)
+    require(inside, f"{what}: a chamber would need {a if low < b < high else b:g} Pa(a); lower the speed")
+    return spool, a, b
+
+
+def _balancing(glide: Glide, p: ParameterSet, b: float) -> float:
+    """The pressure in chamber a that balances pressure b; the force is linear in it."""
+    require(b > VACUUM, f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {VACUUM:g} Pa")
+    low, high = p.value("ambient.pressure"), p.value("supply.pressure")
+    at_low, at_high = (glide.rates(0.0, a, b)[2] for a in (low, high))
+    a = low - at_low * (high - low) / (at_high - at_low)
+    require(a > VACUUM, f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more")
+    return a
+
+
+def _fall(rate: Callable[[float], float], low: float, high: float) -> float:
+    """Where a pressure's rate falls through zero; an end where it does not."""
+    if rate(high) >= 0:
+        return high
+    return low if rate(low) <= 0 else _root(rate, low, high)
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    return float(brentq(function, low, high, xtol=1e-14 * (high - low), rtol=1e-15))

@@ -1,0 +1,92 @@
+/* The run of one sampled system over many segments, a segment a lane, around the C that `emission` writes for its pieces.
+
+   NX, NU, NP, NY and NS are the sizes of the state, input, parameter and output vectors and the number of sensitivity
+   columns S = dx/d(start, parameters). All arrays are C-contiguous with the segment first; a null pointer leaves that
+   result out. */
+
+#ifdef _WIN32
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT
+#endif
+#define LENGTH(n) ((n) > 0 ? (n) : 1)
+
+typedef struct {
+  Lanes t[1], h[1], x[LENGTH(NX)], u[LENGTH(NU)], p[LENGTH(NP)], S[LENGTH(NX * NS)];
+  Lanes x_next[LENGTH(NX)], S_next[LENGTH(NX * NS)], y[LENGTH(NY)], dy[LENGTH(NY * NS)];
+  Lanes step_kept[LENGTH(STEP_KEPT)], output_kept[LENGTH(OUTPUT_KEPT)], update_kept[LENGTH(UPDATE_KEPT)];
+} Segment;
+
+#include PIECES
+
+const int rollout_lanes = LANES;
+
+typedef long long Count;
+
+static void gather(Lanes *v, const double *from, const Count *row, Count size) {
+  for (int lane = 0; lane < LANES; lane++)
+    for (Count i = 0; i < size; i++) PUT(v[i], lane, from[row[lane] * size + i]);
+}
+
+static void scatter(const Lanes *v, double *to, const Count *row, Count size, int lanes) {
+  if (!to) return;
+  for (int lane = 0; lane < lanes; lane++)
+    for (Count i = 0; i < size; i++) to[row[lane] * size + i] = GET(v[i], lane);
+}
+
+static void advance(Segment *s) {
+  memcpy(s->x, s->x_next, sizeof(Lanes) * NX);
+  memcpy(s->S, s->S_next, sizeof(Lanes) * NX * NS);
+}
+
+static void start(Segment *s) {
+  memset(s->S, 0, sizeof(s->S));
+  for (int c = 0; c < STARTS; c++) s->S[c * NX + c] = ALL(1.0);
+#if HAS_UPDATE
+  update_segment(s);
+#endif
+  output_segment(s), step_segment(s);
+}
+
+static void read_sample(Segment *s) {
+#if HAS_UPDATE
+  update_sample(s), update_call(s), advance(s);
+#endif
+  output_sample(s), output_call(s);
+}
+
+static void step_through(Segment *s, int substeps) {
+  const Lanes t = s->t[0];
+  s->h[0] = s->h[0] / ALL(substeps);
+  step_sample(s);
+  for (int k = 0; k < substeps; k++) {
+    s->t[0] = t + ALL(k) * s->h[0];
+    step_call(s);
+    advance(s);
+  }
+}
+
+EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stride,
+                                  const double *x0, const double *u, const double *p, const double *t, const double *h,
+                                  double *y, double *dy, double *x, double *x_end, double *dx_end) {
+  Segment s;
+  for (Count i = first; i < last; i += LANES) {
+    const int lanes = last - i < LANES ? (int)(last - i) : LANES;
+    Count row[LANES], sample[LANES];
+    /* idle lanes repeat the last segment and write nothing */
+    for (int lane = 0; lane < LANES; lane++) row[lane] = i + (lane < lanes ? lane : lanes - 1);
+    gather(s.x, x0, row, NX);
+    for (int lane = 0; lane < LANES; lane++)
+      for (int k = 0; k < NP; k++) PUT(s.p[k], lane, p[row[lane] * p_stride + k]);
+    start(&s);
+    for (Count j = 0; j < n; j++) {
+      for (int lane = 0; lane < LANES; lane++) sample[lane] = row[lane] * n + j;
+      gather(s.u, u, sample, NU), gather(s.t, t, sample, 1), gather(s.h, h, sample, 1);
+      scatter(s.x, x, sample, NX, lanes);
+      read_sample(&s);
+      scatter(s.y, y, sample, NY, lanes), scatter(s.dy, dy, sample, NY * NS, lanes);
+      step_through(&s, substeps);
+    }
+    scatter(s.x, x_end, row, NX, lanes), scatter(s.S, dx_end, row, NX * NS, lanes);
+  }
+}

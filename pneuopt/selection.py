@@ -1,0 +1,223 @@
+"""`select_model`: which of several models a set of logs supports, by likelihood, by parsimony, by held-out runs."""
+
+import fnmatch
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+from pneuopt.errors import ConvergenceError, UnknownNameError, require
+from pneuopt.experiments import Experiment
+from pneuopt.identify import IdentificationResult, identify, validate
+from pneuopt.nlp.least_squares import LeastSquares
+from pneuopt.parameters import ParameterSet
+from pneuopt.statistics import bayes_information, likelihood_ratio_p
+from pneuopt.system import System, names
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LEVEL = 0.01  # of a nested test: a simpler model is given up below this probability
+WORSE = 1.02  # held-out NRMSE, relative to a simpler model's, from which the richer one is not believed
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSelection:
+    """What `select_model` found.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's),
+        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse, message.
+    recommended : str
+        A candidate's name.
+    reason : str
+        One sentence.
+    fits : mapping of str to IdentificationResult
+        Of every candidate, whatever its status.
+    """
+
+    table: "pd.DataFrame"
+    recommended: str
+    reason: str
+    fits: Mapping[str, IdentificationResult]
+
+    def __repr__(self) -> str:
+        return f"ModelSelection {self.reason}\n{self.table.drop(columns='message').to_string()}"
+
+
+def select_model(
+    candidates: Mapping[str, System],
+    experiments: Sequence[Experiment],
+    parameters: ParameterSet,
+    *,
+    free: Sequence[str],
+    held_out: Sequence[Experiment] = (),
+    method: LeastSquares | None = None,
+) -> ModelSelection:
+    """Fit every candidate and recommend one.
+
+    Parameters
+    ----------
+    candidates : mapping of str to System
+        By name, say ``{n: ForceDrive(f).system() for n, f in friction_ladder().items()}``.
+    experiments : sequence of Experiment
+    parameters : ParameterSet
+        Known values; a candidate takes those that it has. What is free among them stays so.
+    free : sequence of str
+        Names, or patterns, freed in each candidate that has them.
+    held_out : sequence of Experiment
+        Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
+    method : LeastSquares, optional
+
+    Returns
+    -------
+    ModelSelection
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two candidates, or a parameter or pattern belongs to none.
+    ConvergenceError
+        If no candidate converged; `solution` maps each name to its marked result.
+
+    Notes
+    -----
+    The deviance is the squared residuals over their variance in the best candidate, and over their correlation time: as
+    if only independent samples counted. Between nested candidates it falls as chi-square with the extra parameters
+    (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978).
+    """
+    require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
+    given = {name: _given(system, parameters, free) for name, system in candidates.items()}
+    _check_known(given, parameters, free)
+    fits = {n: identify(s, experiments, given[n], method=method, throw=False) for n, s in candidates.items()}
+    converged = [n for n, fit in fits.items() if fit.status.converged]
+    if not converged:
+        told = "; ".join(f"{n}: {fit.status.message}" for n, fit in fits.items())
+        raise ConvergenceError(f"none of the candidates converged: {told}", fits)
+    predicted = {n: _predicted(candidates[n], held_out, fits[n]) for n in converged}
+    rows = _judged(candidates, fits, predicted)
+    chosen, passed_over = _chosen(rows)
+    return ModelSelection(_tabulated(rows), chosen, _reason(rows, chosen, passed_over), fits)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A row of the table."""
+
+    converged: bool
+    free: int
+    deviance: float
+    bic: float
+    contains: str
+    p_value: float
+    held_out_nrmse: float
+    message: str
+
+
+def _given(system: System, parameters: ParameterSet, free: Sequence[str]) -> ParameterSet:
+    own = system.parameters | parameters.select(n for n in parameters if n in system.parameters)
+    matched = [n for n in own if any(fnmatch.fnmatch(n, pattern) for pattern in free)]
+    return own.freed(*matched) if matched else own
+
+
+def _check_known(given: Mapping[str, ParameterSet], parameters: ParameterSet, free: Sequence[str]) -> None:
+    every = sorted({n for own in given.values() for n in own})
+    for name in parameters:
+        if name not in every:
+            raise UnknownNameError("parameter", name, every)
+    for pattern in free:
+        if not fnmatch.filter(every, pattern):
+            raise UnknownNameError("parameter", pattern, every)
+
+
+def _tabulated(rows: Mapping[str, _Judged]) -> "pd.DataFrame":
+    import pandas as pd
+
+    table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
+    table.insert(4, "bic_above", table["bic"] - table["bic"].min())
+    return table
+
+
+def _predicted(system: System, held_out: Sequence[Experiment], fit: IdentificationResult) -> float:
+    """Mean NRMSE over the held-out runs and channels; NaN without any."""
+    if not held_out:
+        return math.nan
+    return float(validate(system, held_out, fit.parameters)["nrmse"].mean())
+
+
+def _judged(
+    candidates: Mapping[str, System], fits: Mapping[str, IdentificationResult], predicted: Mapping[str, float]
+) -> dict[str, _Judged]:
+    """What the figures say of each candidate, the lowest BIC first, those that did not converge last."""
+    best = min(predicted, key=lambda n: _chi_square(fits[n]))
+    scale = _variance(fits[best]) * fits[best].stats["correlation_time"]
+    count = _samples(fits[best]) / fits[best].stats["correlation_time"]
+    rows = {}
+    for name, fit in fits.items():
+        k, deviance = len(fit.estimates), _chi_square(fit) / scale
+        inside, p, bic = "", math.nan, math.nan
+        if name in predicted:
+            inside, bic = _contained(name, candidates, fits, predicted), bayes_information(deviance, k, count)
+        if inside:
+            p = likelihood_ratio_p(_chi_square(fits[inside]) / scale - deviance, k - len(fits[inside].estimates))
+        held_out = predicted.get(name, math.nan)
+        rows[name] = _Judged(fit.status.converged, k, deviance, bic, inside, p, held_out, fit.status.message)
+    return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
+
+
+def _contained(
+    name: str,
+    candidates: Mapping[str, System],
+    fits: Mapping[str, IdentificationResult],
+    converged: Mapping[str, float],
+) -> str:
+    """The richest converged candidate whose free parameters and states are among this one's; "" if there is none."""
+    own, states = set(fits[name].estimates.index), set(names(candidates[name].states))
+    simpler = [
+        n for n in converged if set(fits[n].estimates.index) < own and set(names(candidates[n].states)) <= states
+    ]
+    return max(simpler, key=lambda n: len(fits[n].estimates), default="")
+
+
+def _chi_square(fit: IdentificationResult) -> float:
+    """Squared residuals in the variances of the stated noise."""
+    return float(((fit.fit["rmse"] / fit.fit["noise"]) ** 2 * fit.fit["samples"]).sum())
+
+
+def _variance(fit: IdentificationResult) -> float:
+    return _chi_square(fit) / max(1.0, _samples(fit) - len(fit.estimates))
+
+
+def _samples(fit: IdentificationResult) -> float:
+    return float(fit.fit["samples"].sum())
+
+
+def _chosen(rows: Mapping[str, _Judged]) -> tuple[str, str]:
+    """The lowest BIC that is no chance and predicts as well as what it contains; and what had to be passed over."""
+    passed_over, name = "", next(iter(rows))
+    while inside := rows[name].contains:
+        row = rows[name]
+        if row.p_value <= LEVEL and not row.held_out_nrmse > WORSE * rows[inside].held_out_nrmse:
+            break
+        passed_over, name = passed_over or name, inside
+    return name, passed_over
+
+
+def _reason(rows: Mapping[str, _Judged], chosen: str, passed_over: str) -> str:
+    """One sentence: what speaks for the choice, and what against its neighbours."""
+    row, good = rows[chosen], [n for n, r in rows.items() if r.converged]
+    told = f"{chosen}, of {len(good)} converged candidates"
+    if passed_over:
+        p = rows[passed_over].p_value
+        why = f"may be chance (p = {p:.2g})" if p > LEVEL else "predict the held-out runs worse"
+        told += f", for {passed_over}'s extra terms {why}"
+    elif len(good) > 1:
+        told += f", has the lowest BIC, {rows[good[1]].bic - row.bic:.4g} below {good[1]}"
+    if row.contains:
+        told += f"; {row.contains}, which it contains, is refuted (p = {row.p_value:.2g})"
+    if math.isfinite(row.held_out_nrmse):
+        told += f"; it predicts held-out runs with an NRMSE of {row.held_out_nrmse:.2%}"
+    failed = [n for n in rows if n not in good]
+    return told + (f"; not converged: {', '.join(failed)}" if failed else "")

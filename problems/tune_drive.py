@@ -1,0 +1,146 @@
+"""PID and dither tuned together on a pneumatic drive, beside the PID alone: on the smooth model and on a rig.
+
+    python problems/tune_drive.py [--json FILE] [--out DIR]
+
+The drive is a 32 mm cylinder of the catalogue (LuGre friction) under a speed PID sampled at 1 kHz. It is tuned for four
+steps at once: small and large, forwards and backwards, from rest and from motion; the controller sees the speed through
+the lag of an encoder (difference over a sample, 5 ms of filter). The rig has what the model leaves out: Karnopp
+friction of the same levels, 0.4 % of hysteresis in the valve, an encoder of 10 um. Its figures are those of the true
+speed.
+"""
+
+import sys
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from claims import METRICS, Claim, arguments, design, finish, frame
+
+import pneuopt as po
+from pneuopt.models.catalog import s32
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+SLOW, FRONT = {"position": 0.05}, {"position": 0.25}  # [m] of 0.3
+STEPS = [
+    po.Step(0.10, horizon=0.6, start=SLOW),
+    po.Step(0.25, horizon=0.6, start=SLOW),
+    po.Step(-0.20, horizon=0.6, start=FRONT),
+    po.Step(0.15, initial=0.10, horizon=0.6, start=SLOW),
+]
+HAND = {"pid.Kp": 1.0, "pid.Ki": 10.0, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
+RANGES = {
+    "pid.Kp": (0.2, 60.0),
+    "pid.Ki": (0.5, 400.0),
+    "pid.Kd": (0.0, 0.5),
+    "pid.Tf": (0.002, 0.05),
+    "dither.amplitude": (0.0, 2.0),
+    "dither.offset": (-1.5, 1.5),
+}
+# What `tune` finds on the same drive where the controller sees the true speed at once.
+BLIND = {"pid.Kp": 2.462, "pid.Ki": 86.18, "pid.Kd": 0.0561, "pid.Tf": 0.002714, "dither.offset": -0.08653}
+LIMITS = (po.Overshoot(0.05), po.MaxSensitivity(1.6))
+SMOOTH = {"settling_time": "<= 0.16", "overshoot": "<= 5", "max_sensitivity": "<= 1.6"}
+REAL = {"settling_time": "<= 0.3", "overshoot": "<= 15"}
+SAMPLE, HYSTERESIS, COUNT, FILTER = 1e-3, 0.04, 1e-5, 5e-3  # [s], [V] of 10 V, [m], [s]
+COLOURS = {"hand": GREY, "pid_only": ORANGE, "tuned": BLUE}
+VALVE: dict[str, Any] = {"pid_only": {"lw": 1.4, "zorder": 3}, "tuned": {"lw": 0.8, "alpha": 0.6}}
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """The smooth loop and the rig; each design's gains, and its figures on both."""
+
+    loop: po.ClosedLoop
+    rig: po.Rig
+    designs: dict[str, po.ParameterSet]
+    smooth: dict[str, "pd.DataFrame"]
+    real: dict[str, "pd.DataFrame"]
+    seconds: dict[str, float]
+
+
+def run() -> Job:
+    loop, rig, given = loops()
+    designs, seconds, smooth = {"hand": given}, {}, {}
+    for name, free in (("pid_only", given.fixed("dither.amplitude")), ("tuned", given)):
+        begin = time.perf_counter()
+        best = po.tune(loop, STEPS, free, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)
+        designs[name], smooth[name], seconds[name] = best.parameters, best.certified, time.perf_counter() - begin
+    smooth["hand"] = po.evaluate(loop, STEPS, given)
+    shown = designs | {"blind": given.with_values(BLIND)}
+    return Job(loop, rig, designs, smooth, {n: po.evaluate(rig, STEPS, p) for n, p in shown.items()}, seconds)
+
+
+def loops() -> tuple[po.ClosedLoop, po.Rig, po.ParameterSet]:
+    """The loop as it is tuned, the rig that it is tried on, the hand tuning with its ranges."""
+    drive, hardware = s32()
+    pid, dither = po.PID(sample_time=SAMPLE), po.Dither(frequency=100.0)
+    seen = po.Rig(drive.system(), {"speed": po.Sensor(lag=FILTER + SAMPLE / 2)}).sensed
+    loop = po.ClosedLoop(seen, pid, dither, measured="sensor.speed")
+    sticking = replace(drive, friction=po.Karnopp(po.Stribeck()))
+    rig = po.Rig(
+        po.ClosedLoop(sticking.system(), pid, dither, measured="speed"),
+        {"position": po.Sensor(resolution=COUNT)},
+        po.Actuator(hysteresis=HYSTERESIS),
+        po.Encoder(filter_time=FILTER),
+    )
+    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
+    return loop, rig, (hardware.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
+
+
+def main(job: Job) -> "pd.DataFrame":
+    claims = []
+    for name, parameters in job.designs.items():
+        claims += design(name, parameters, job.smooth[name], SMOOTH if name == "tuned" else {})
+        claims += on_rig(name, job.real[name], REAL if name == "tuned" else {})
+    claims += on_rig("blind", job.real["blind"], {})
+    claims += [Claim(f"{name}.seconds", value, "s") for name, value in job.seconds.items()]
+    alone, both = (worst(job.real[n], "SettlingTime") for n in ("pid_only", "tuned"))
+    return frame([*claims, Claim("rig.settling_time.saved_by_dither", 1 - both / alone, "1", None, ">= 0.25")])
+
+
+def on_rig(name: str, found: "pd.DataFrame", bounds: dict[str, str]) -> list[Claim]:
+    """The worst over the steps of each figure; NaN where one never settles."""
+    rows = {row: metric for row, metric in METRICS.items() if metric[0] in found.index}
+    return [
+        Claim(f"{name}.rig.{row}", worst(found, metric), unit, None, bounds.get(row, ""))
+        for row, (metric, unit) in rows.items()
+    ]
+
+
+def worst(found: "pd.DataFrame", metric: str) -> float:
+    return float(np.max(found.loc[metric].to_numpy(dtype=float)))
+
+
+def figure(job: Job) -> "Figure":
+    picture, grid = axes_grid(3, len(STEPS), (2.2, 2.2, 1.5), sharex="col", width=13.0)
+    for column, step in zip(zip(*grid, strict=True), STEPS, strict=True):
+        for model, axes, label in ((job.loop, column[0], "smooth model"), (job.rig, column[1], "rig")):
+            for name, parameters in job.designs.items():
+                response = po.respond(model, step, parameters)
+                axes.plot(1e3 * response.t, 1e3 * response["speed"], color=COLOURS[name], lw=1.1, label=name)
+                if model is job.rig and name != "hand":
+                    column[2].plot(1e3 * response.t, response["control"], color=COLOURS[name], **VALVE[name])
+            axes.axhline(1e3 * step.final, color=RED, lw=0.8, ls="--")
+            low, high = sorted([1e3 * step.initial, 1e3 * step.final])
+            axes.set_ylim(low - 0.15 * (high - low), high + 0.45 * (high - low))
+            if step.size < 0:
+                axes.set_ylim(low - 0.45 * (high - low), high + 0.15 * (high - low))
+            axes.set(ylabel=f"speed, {label} [mm/s]", xlim=(0, 1e3 * step.horizon))
+        column[0].set_title(f"{1e3 * step.initial:g} to {1e3 * step.final:g} mm/s", fontsize=9)
+        column[2].set(xlabel="time [ms]", ylabel="valve, rig [V]")
+    for row in grid:
+        for axes in row[1:]:
+            axes.set_ylabel("")
+    legend_above(picture, grid[0][0])
+    return picture
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__).parse_args()
+    job = run()
+    sys.exit(finish(main(job), options, lambda: {"tune_drive": figure(job)}))

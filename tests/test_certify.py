@@ -1,0 +1,136 @@
+"""Certificates: either direction, from rest and from motion, on the smooth loop and on a rig."""
+
+from math import exp
+
+import pytest
+
+from pneuopt.certify import evaluate, respond
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
+from pneuopt.instruments import Actuator, Encoder, Sensor
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
+from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.load import Load
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.nlp.status import Code
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import SettlingTime
+from pneuopt.rig import Rig
+from pneuopt.tune import tune
+from pneuopt.tuning.screening import Screening
+
+GAINS = {"pid.Kp": 150.0, "pid.Ki": 8000.0, "pid.lower": -60.0, "pid.upper": 60.0}
+VALVE = {"pid.Kp": 1.0, "pid.Ki": 20.0, "pid.Kd": 0.03, "pid.Tf": 3e-3, "pid.lower": -5.0, "pid.upper": 5.0}
+
+
+def axis(friction: FrictionModel) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(ForceDrive(friction).system(), PID(sample_time=1e-3), Dither(100.0))
+    return loop, loop.parameters.with_values(GAINS)
+
+
+def cylinder(friction: FrictionModel) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(PneumaticDrive(friction=friction).system(), PID(sample_time=1e-3), Dither(100.0))
+    return loop, loop.parameters.with_values(VALVE)
+
+
+@pytest.mark.parametrize("friction", [Stribeck(), LuGre(), Karnopp(Stribeck())])
+def test_the_force_in_motion_is_the_friction(friction: FrictionModel) -> None:
+    loop, p = axis(friction)
+    x = loop.initial(p, reference=-0.03)
+    sliding = 30.0 + 15.0 * exp(-((0.03 / 0.02) ** 2)) + 70.0 * 0.03
+    assert x[-1] == pytest.approx(-sliding, rel=1e-8)
+    still = respond(loop, Step(0.1, at=0.02, initial=-0.03, horizon=0.04), p)
+    assert still["speed"][still.t < 0.02] == pytest.approx(-0.03, abs=1e-9)
+
+
+def test_a_spring_lets_no_motion_be_steady() -> None:
+    loop = ClosedLoop(ForceDrive(Viscous(), Load(spring=True)).system(), PID())
+    p = loop.parameters.with_values({"pid.Ki": 10.0, "load.stiffness": 100.0})
+    with pytest.raises(ConvergenceError, match=r"neither rests nor moves steadily at speed 0.2 m/s: .*give x_plant"):
+        evaluate(loop, Step(0.1, initial=0.2), p)
+
+
+@pytest.mark.parametrize(("size", "initial"), [(0.1, 0.0), (0.3, 0.05), (-0.1, 0.2), (-0.3, 0.1)])
+def test_a_mirrored_step_has_the_same_metrics(size: float, initial: float) -> None:
+    """From rest and from motion, braking and through zero, with the command at its limits."""
+    loop, p = axis(Stribeck())
+    one, other = (
+        evaluate(loop, Step(sign * size, initial=sign * initial, horizon=0.5), p).iloc[:, 0] for sign in (1, -1)
+    )
+    mirrored = ["SettlingMin", "SettlingMax", "Peak", "SteadyStateValue"]
+    same = one.index.difference(mirrored)
+    assert one[same].to_numpy() == pytest.approx(other[same].to_numpy(), rel=1e-5, abs=1e-6, nan_ok=True)
+    assert one["Peak"] == pytest.approx(-other["Peak"], rel=1e-6)
+    assert one["SettlingMin"] == pytest.approx(-other["SettlingMax"], rel=1e-6)
+    assert one["SettlingTime"] < 0.5
+    assert one["Overshoot"] > 1
+    if abs(size) > 0.2:
+        assert one["PeakControl"] == 60.0
+
+
+def test_a_cylinder_brakes_reverses_and_runs_back() -> None:
+    loop, p = cylinder(LuGre())
+    steps = [
+        Step(-0.2, initial=0.2, horizon=0.4, start={"position": 0.05}),
+        Step(-0.4, initial=0.2, horizon=0.4, start={"position": 0.12}),
+        Step(-0.2, horizon=0.4, start={"position": 0.15}),
+    ]
+    found = evaluate(loop, steps, p, band=0.1)
+    assert bool((found.loc["SettlingTime"] < 0.4).all())
+    assert found.loc["SteadyStateValue"].to_numpy() == pytest.approx([0.0, -0.2, -0.2], abs=0.02)
+    assert bool((found.loc["PeakControl"] > 0.5).all())
+    assert respond(loop, steps[2], p)["position"][0] == 0.15
+
+
+def test_an_ideal_rig_certifies_what_the_simulation_does() -> None:
+    loop, p = axis(Karnopp(Stribeck()))
+    p = p.with_values({"dither.amplitude": 5.0})
+    rig = Rig(loop, {"speed": Sensor()})
+    steps = [Step(0.1, horizon=0.3), Step(-0.15, initial=0.1, horizon=0.3)]
+    real, smooth = evaluate(rig, steps, p), evaluate(loop, steps, p)
+    for n in ("Overshoot", "SteadyStateError", "PeakControl"):
+        assert real.loc[n].to_numpy() == pytest.approx(smooth.loc[n].to_numpy(), rel=0.02, abs=0.1), n
+    assert "MaxSensitivity" not in real.index
+    assert "MaxSensitivity" in smooth.index
+
+
+def test_a_rig_is_certified_by_the_truth_and_starts_in_motion() -> None:
+    """Its encoder knows the speed at which it starts; hysteresis and counts make it worse than the simulation."""
+    loop, p = cylinder(Karnopp(Stribeck()))
+    rig = Rig(loop, {"position": Sensor(resolution=1e-5)}, Actuator(hysteresis=0.04), Encoder(filter_time=5e-3))
+    step = Step(0.1, at=0.1, initial=0.1, horizon=0.5, start={"position": 0.05})
+    run = respond(rig, step, p)
+    assert run["position"][0] == 0.05
+    assert run["speed"][run.t <= 0.1] == pytest.approx(0.1, abs=0.01)
+    real, ideal = (evaluate(model, step, p)[step.label] for model in (rig, loop))
+    assert real["Overshoot"] > ideal["Overshoot"]
+    assert real["SteadyStateValue"] == pytest.approx(0.2, abs=0.01)
+
+
+def test_an_end_stop_is_no_certificate() -> None:
+    loop, p = cylinder(Stribeck())
+    step = Step(0.3, horizon=0.6)
+    with pytest.warns(PhysicsWarning, match=r"front end stop .* at t = 0\.[34]"):
+        evaluate(loop, step, p)
+    free = p.with_bounds({"pid.Kp": (0.5, 2.0)}).freed("pid.Kp")
+    method = Screening(members=5, generations=1, refinements=0)
+    result = tune(loop, step, free, minimise=SettlingTime(0.5), method=method, throw=False)
+    assert result.status.code is Code.NOT_CERTIFIED
+    assert "front end stop" in result.status.message
+    assert "shorten the horizon" in result.status.message
+    assert result.parameters.value("pid.Kp") == 1.0
+    assert result.stats["contacts"] >= 1
+
+
+def test_bad_input_is_named() -> None:
+    loop, p = axis(Stribeck())
+    with pytest.raises(ModelError, match="follows no reference"):
+        evaluate(Rig(loop.plant, {"speed": Sensor()}), Step(0.1), p)
+    with pytest.raises(InputError, match=r"two references are '0 to 0.1'"):
+        evaluate(loop, [Step(0.1), Step(0.1, horizon=0.5)], p)
+    with pytest.raises(InputError, match="told by position, speed and pressure_b, not by valve"):
+        evaluate(cylinder(Stribeck())[0], Step(0.1, start={"valve": 0.0}), p)

@@ -1,0 +1,108 @@
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from pneuopt.errors import ConvergenceError, InputError, UnknownNameError
+from pneuopt.experiments import Experiment
+from pneuopt.models.drive import MotionDrive
+from pneuopt.models.friction import FrictionModel, friction_ladder
+from pneuopt.parameters import ParameterSet
+from pneuopt.selection import ModelSelection, select_model
+from pneuopt.system import System
+from pneuopt.trajectories import Trajectory
+
+FREE = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity", "friction.*_asymmetry")
+PAIR = ("friction.coulomb", "friction.viscous", "friction.*_asymmetry")
+STATIC = {name: model for name, model in friction_ladder().items() if not model.states}
+
+
+def systems() -> dict[str, System]:
+    return {name: MotionDrive(model, chamber=False).system() for name, model in STATIC.items()}
+
+
+def moved(model: FrictionModel, seed: int, n: int = 1500, values: Mapping[str, float] | None = None) -> Experiment:
+    """Speeds of both directions, slow and fast, and the friction force with 0.5 N of noise."""
+    rng = np.random.default_rng(seed)
+    v = np.sign(np.sin(np.arange(n) / 40)) * np.exp(rng.uniform(np.log(1e-3), np.log(0.3), n))
+    drive = MotionDrive(model, chamber=False)
+    truth = drive.parameters.with_values(values or {})
+    p = [truth.value(name) for name in drive.system().parameters]
+    force = np.array([float(drive.system().ode(0, [], [speed], p)[1]) for speed in v])
+    t = np.arange(n) * 1e-3
+    return Experiment(Trajectory(t, {"speed": v, "force": force + 0.5 * rng.standard_normal(n)}), {"force": 0.5})
+
+
+def chosen(model: FrictionModel, values: Mapping[str, float] | None = None, held_out: bool = False) -> ModelSelection:
+    runs = [moved(model, seed, values=values) for seed in (1, 2)]
+    others = [moved(model, 3, values=values)] if held_out else []
+    return select_model(systems(), runs, ParameterSet(), free=FREE, held_out=others)
+
+
+@pytest.mark.parametrize(
+    ("truth", "values"),
+    [
+        ("coulomb", {}),
+        ("asymmetric coulomb", {"friction.coulomb_asymmetry": 0.1}),
+        ("stribeck", {}),
+        ("asymmetric stribeck", {"friction.coulomb_asymmetry": 0.1, "friction.viscous_asymmetry": -0.2}),
+    ],
+)
+def test_the_model_that_made_the_log_is_recommended(truth: str, values: dict[str, float]) -> None:
+    found = chosen(STATIC[truth], values, held_out=True)
+    assert found.recommended == truth
+    assert found.reason.startswith(f"{truth}, of ")
+    columns = found.table.to_dict()
+    assert columns["converged"][truth]
+    assert columns["bic_above"][truth] == 0
+    # its residuals are noise: as many squares as independent samples
+    assert columns["deviance"][truth] == pytest.approx(3000, rel=0.1)
+
+
+def test_what_is_left_out_is_refuted_in_numbers() -> None:
+    found = chosen(STATIC["stribeck"])
+    columns = found.table.to_dict()
+    assert columns["contains"]["stribeck"] == "coulomb"
+    assert columns["p_value"]["stribeck"] < 1e-6
+    assert "coulomb, which it contains, is refuted" in found.reason
+    assert columns["deviance"]["coulomb"] > 2 * columns["deviance"]["stribeck"]
+
+
+def test_idle_terms_are_rarely_believed() -> None:
+    """On Coulomb data the test of nested models errs about as rarely as its level says."""
+    drives = {n: MotionDrive(STATIC[n], chamber=False).system() for n in ("coulomb", "asymmetric coulomb")}
+    picked = [
+        select_model(drives, [moved(STATIC["coulomb"], seed, 300)], ParameterSet(), free=PAIR).recommended
+        for seed in range(20)
+    ]
+    assert picked.count("coulomb") >= 18  # at 1 %, three errors in 20 have a probability of 0.1 %
+
+
+def test_a_richer_model_that_predicts_worse_is_passed_over() -> None:
+    made, other = STATIC["asymmetric coulomb"], {"friction.coulomb_asymmetry": -0.2}
+    pair = {n: MotionDrive(STATIC[n], chamber=False).system() for n in ("coulomb", "asymmetric coulomb")}
+    run = moved(made, 1, values={"friction.coulomb_asymmetry": 0.2})
+    found = select_model(pair, [run], ParameterSet(), free=PAIR, held_out=[moved(made, 2, values=other)])
+    assert found.recommended == "coulomb"
+    assert "predict the held-out runs worse" in found.reason
+
+
+def test_bad_input_is_named() -> None:
+    run, two = (
+        moved(STATIC["coulomb"], 1, 100),
+        {n: MotionDrive(STATIC[n], chamber=False).system() for n in ("viscous", "coulomb")},
+    )
+    with pytest.raises(InputError, match="1 candidate leaves nothing to select"):
+        select_model({"coulomb": two["coulomb"]}, [run], ParameterSet(), free=FREE[:2])
+    with pytest.raises(UnknownNameError, match=r"friction\.colomb"):
+        select_model(two, [run], ParameterSet(), free=["friction.colomb"])
+
+
+def test_none_converged_is_an_error_with_every_result() -> None:
+    """At one speed no level can be told from a slope."""
+    pair = {n: MotionDrive(STATIC[n], chamber=False).system() for n in ("coulomb", "stribeck")}
+    run = moved(STATIC["coulomb"], 1, 100)
+    steady = Experiment(Trajectory(run.trajectory.t, {**run.trajectory.values, "speed": np.full(100, 0.1)}), run.noise)
+    with pytest.raises(ConvergenceError, match="none of the candidates converged: coulomb: ") as caught:
+        select_model(pair, [steady], ParameterSet(), free=PAIR[:2])
+    assert set(caught.value.solution) == {"coulomb", "stribeck"}
