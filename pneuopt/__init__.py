@@ -5,6 +5,7 @@ The concept map, in the order in which data flow:
     read_log(path)                    -> Experiment: a measured Trajectory, its noise and conditions
     read_drive(path)                  -> a drive and its ParameterSet; or build one: ForceDrive(Stribeck())
     identify(system, logs, freed)     -> IdentificationResult: estimates with confidence intervals
+    select_model(systems, logs, ...)  -> which of several models the logs support, and why
     validate(system, logs, fitted)    -> how well a held-out log is predicted
     ClosedLoop(system, PID, Dither)   -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
