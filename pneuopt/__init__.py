@@ -63,6 +63,7 @@ _HOME = {
     "pneuopt.tuning.two_phase": ("TwoPhase",),
     "pneuopt.certify": ("evaluate", "respond"),
     "pneuopt.tune": ("TuningResult", "tune"),
+    "pneuopt.scenarios": ("corners", "draws", "samples"),
     "pneuopt.selection": ("ModelSelection", "select_model"),
     "pneuopt.study": ("grid", "sweep"),
     "pneuopt.files": ("read_drive", "write_fit"),

@@ -37,6 +37,7 @@ from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.plotting import plot_bode, plot_fit, plot_friction, plot_map, plot_prediction, plot_steps, save_figure
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
 from pneuopt.rig import Rig, record
+from pneuopt.scenarios import corners, draws, samples
 from pneuopt.selection import ModelSelection, select_model
 from pneuopt.simulate import contacts, simulate, simulate_stick_slip
 from pneuopt.study import grid, sweep
@@ -103,9 +104,11 @@ __all__ = [
     "Viscous",
     "averaged",
     "contacts",
+    "corners",
     "define",
     "differentiate",
     "discretise",
+    "draws",
     "evaluate",
     "friction_ladder",
     "grid",
@@ -126,6 +129,7 @@ __all__ = [
     "resample",
     "respond",
     "ripple",
+    "samples",
     "save_figure",
     "select_model",
     "simulate",

@@ -1,0 +1,184 @@
+"""Scenarios: the plants that a design has to live with: corners, samples of a box, samples of a fit's covariance.
+
+Each is a mapping from a name to the values that differ, as `sweep` takes it.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import InputError, check_known, require
+from pneuopt.parameters import ParameterSet
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Names = str | tuple[str, ...]
+Spread = float | tuple[float, float]
+Spreads = Mapping[str, Spread] | Mapping[Names, Spread]
+Cases = dict[str, dict[str, float]]
+MOST_CORNERS = 4096
+MOST_DRAWS = 1000  # for each sample that has to lie within the bounds
+
+
+def corners(parameters: ParameterSet, spreads: Spreads) -> Cases:
+    """Every combination of least and greatest: 2^n plants for n axes.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        The nominal values, and the bounds.
+    spreads : mapping of str, or tuple of str, to float or pair
+        An axis each: parameters, or patterns, that move together, and by how much: a fraction of each one's value, 0.3
+        for +-30 %, or the least and the greatest value [SI].
+
+    Returns
+    -------
+    dict of str to dict of str to float
+
+    Raises
+    ------
+    InputError
+        If a name is unknown or on two axes, a spread is empty or leaves the bounds, or there are too many corners.
+
+    Examples
+    --------
+    >>> from pneuopt.parameters import Parameter
+    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "friction.coulomb": Parameter(40.0, "N")})
+    >>> corners(rig, {"load.mass": 0.2, "friction.*": (30.0, 60.0)})["load.mass low, friction.* high"]
+    {'load.mass': 4.0, 'friction.coulomb': 60.0}
+    """
+    ends = _axes(parameters, spreads)
+    count = 2 ** len(ends)
+    require(count <= MOST_CORNERS, f"{len(ends)} axes have {count} corners, more than {MOST_CORNERS}; draw samples")
+    sides = {axis: [(f"{axis} low", low), (f"{axis} high", high)] for axis, (low, high) in ends.items()}
+    return {
+        ", ".join(label for label, _ in corner): _joined(values for _, values in corner)
+        for corner in itertools.product(*sides.values())
+    }
+
+
+def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int = 0) -> Cases:
+    """Plants drawn uniformly from the box whose corners `corners` gives; errors as there.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+    spreads : mapping
+        As for `corners`: what shares an axis moves together.
+    count : int
+    seed : int
+
+    Returns
+    -------
+    dict of str to dict of str to float
+        "sample 1" and so on.
+    """
+    require(count >= 1, f"count must be at least 1, got {count}")
+    ends, rng = _axes(parameters, spreads), np.random.default_rng(seed)
+    out = {}
+    for number in range(1, count + 1):
+        shares = rng.random(len(ends)).tolist()
+        out[f"sample {number}"] = _joined(
+            {n: low[n] + share * (high[n] - low[n]) for n in low}
+            for share, (low, high) in zip(shares, ends.values(), strict=True)
+        )
+    return out
+
+
+def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, seed: int = 0) -> Cases:
+    """Plants drawn from a fit's covariance: what the logs leave open, correlations included.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        The estimates, and the bounds, within which every draw lies.
+    covariance : DataFrame
+        Of `IdentificationResult`: rows and columns by parameter. One searched by its logarithm is drawn so.
+    count : int
+    seed : int
+
+    Returns
+    -------
+    dict of str to dict of str to float
+        "draw 1" and so on.
+
+    Raises
+    ------
+    InputError
+        If the covariance holds a parameter that the set has not, or no number: the data did not determine it.
+    """
+    require(count >= 1, f"count must be at least 1, got {count}")
+    names = [str(n) for n in covariance.index]
+    check_known("parameter", names, parameters, "covariance")
+    matrix = covariance.to_numpy(dtype=float)
+    unknown = [n for n, row in zip(names, matrix, strict=True) if not np.isfinite(row).all()]
+    told = f"{' and '.join(unknown)} have no covariance: the fit did not determine them; give corners instead"
+    require(not unknown, told)
+    centre = np.array([parameters.value(n) for n in names])
+    log = np.array([parameters[n].log for n in names])
+    scale = np.where(log, centre, 1.0)
+    mean = np.where(log, np.log(np.where(log, centre, 1.0)), centre)
+    rng, factor = np.random.default_rng(seed), _square_root(matrix / np.outer(scale, scale))
+
+    def draw() -> Array:
+        z = mean + factor @ rng.standard_normal(len(names))
+        return np.asarray(np.where(log, np.exp(np.where(log, z, 0.0)), z))
+
+    return {f"draw {k}": _within(parameters, names, draw) for k in range(1, count + 1)}
+
+
+def _axes(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
+    """Each axis's parameters at its low and at its high end."""
+    require(len(spreads) > 0, "no spread: give at least one parameter and how far it spreads")
+    out: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
+    taken: dict[str, str] = {}
+    for key, spread in spreads.items():
+        patterns = (key,) if isinstance(key, str) else key
+        axis = " + ".join(patterns)
+        names = parameters.matching(*patterns)
+        for name in names:
+            require(name not in taken, f"{name} is on two axes, {taken.get(name)!r} and {axis!r}; leave it on one")
+            taken[name] = axis
+        ends = [_ends(parameters, name, spread) for name in names]
+        out[axis] = (
+            {n: e[0] for n, e in zip(names, ends, strict=True)},
+            {n: e[1] for n, e in zip(names, ends, strict=True)},
+        )
+    return out
+
+
+def _ends(parameters: ParameterSet, name: str, spread: Spread) -> tuple[float, float]:
+    p = parameters[name]
+    if isinstance(spread, tuple):
+        low, high = spread
+    else:
+        require(spread > 0, f"{name}: a spread is a positive fraction, got {spread:g}; 0.3 is +-30 %")
+        low, high = sorted((p.value * (1 - spread), p.value * (1 + spread)))
+    require(low < high, f"{name}: the spread from {low:g} to {high:g} {p.unit} is empty")
+    inside = p.lower <= low and high <= p.upper
+    require(inside, f"{name}: {low:g} to {high:g} {p.unit} leaves its bounds, {p.lower:g} to {p.upper:g} {p.unit}")
+    return low, high
+
+
+def _joined(parts: Iterator[dict[str, float]]) -> dict[str, float]:
+    return {name: value for part in parts for name, value in part.items()}
+
+
+def _square_root(matrix: Array) -> Array:
+    """A factor F with F F' the matrix, which rounding may have left a little short of positive."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _within(parameters: ParameterSet, names: list[str], draw: Callable[[], Array]) -> dict[str, float]:
+    for _ in range(MOST_DRAWS):
+        values = dict(zip(names, draw().tolist(), strict=True))
+        if all(parameters[n].lower <= v <= parameters[n].upper for n, v in values.items()):
+            return values
+    told = f"of {MOST_DRAWS} draws none lies within the bounds of {', '.join(names)}; widen them, or give corners"
+    raise InputError(told)
