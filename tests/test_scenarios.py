@@ -23,7 +23,8 @@ RIG = ParameterSet(
 
 
 def test_corners_are_every_combination_and_an_axis_moves_as_one() -> None:
-    cases = corners(RIG, {"load.mass": 0.3, ("friction.coulomb", "friction.static"): 0.5})
+    spreads: dict[str | tuple[str, ...], float] = {"load.mass": 0.3, ("friction.coulomb", "friction.static"): 0.5}
+    cases = corners(RIG, spreads)
     assert len(cases) == 4
     assert list(cases) == [f"load.mass {a}, friction.coulomb + friction.static {b}" for a in LOW_HIGH for b in LOW_HIGH]
     for case in cases.values():
