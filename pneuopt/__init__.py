@@ -6,7 +6,9 @@ The concept map, in the order in which data flow:
     read_drive(path)                  -> a drive and its ParameterSet; or build one: ForceDrive(Stribeck())
     identify(system, logs, freed)     -> IdentificationResult: estimates with confidence intervals
     select_model(systems, logs, ...)  -> which of several models the logs support, and why
-    validate(system, logs, fitted)    -> how well a held-out log is predicted
+    identifiability(system, logs, freed) -> Verdict: what the logs can tell, in words, before a fit
+    profile, derived(result, ...)     -> an interval where a linear one lies; one of a figure made of estimates
+    validate(system, logs, fitted)    -> how well a held-out log is predicted, and what is left in the residuals
     ClosedLoop(system, PID, Dither)   -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
     evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser
@@ -47,6 +49,7 @@ _HOME = {
     "pneuopt.control.pid": ("PID",),
     "pneuopt.control.dither": ("Dither",),
     "pneuopt.control.reference": ("Step",),
+    "pneuopt.control.sensor": ("SensorLag",),
     "pneuopt.control.loop": ("ClosedLoop",),
     "pneuopt.control.averaging": ("averaged", "mean_start", "ripple"),
     "pneuopt.control.margins": ("margins",),
@@ -58,22 +61,30 @@ _HOME = {
     "pneuopt.instruments": ("Actuator", "Encoder", "Sensor"),
     "pneuopt.rig": ("Rig", "record"),
     "pneuopt.identify": ("IdentificationResult", "identify", "predict", "validate"),
+    "pneuopt.identifiability": ("Verdict", "identifiability"),
+    "pneuopt.profiles": ("Profile", "profile"),
+    "pneuopt.derived": ("Derived", "derived"),
     "pneuopt.requirements": ("MaxSensitivity", "Overshoot", "PeakControl", "SettlingTime", "SteadyStateError"),
     "pneuopt.tuning.screening": ("Screening",),
     "pneuopt.tuning.two_phase": ("TwoPhase",),
     "pneuopt.certify": ("evaluate", "respond"),
     "pneuopt.tune": ("TuningResult", "tune"),
     "pneuopt.scenarios": ("corners", "draws", "samples"),
+    "pneuopt.comparison": ("LogComparison", "compare_logs"),
+    "pneuopt.reweighting": ("Huber", "SoftL1"),
+    "pneuopt.models.sensing": ("coarse_delay", "with_sensors"),
     "pneuopt.selection": ("ModelSelection", "select_model"),
     "pneuopt.study": ("grid", "sweep"),
     "pneuopt.files": ("read_drive", "write_fit"),
     "pneuopt.tuningfile": ("read_tuning", "write_tuned"),
     "pneuopt.plotting": (
         "plot_bode",
+        "plot_correlation",
         "plot_fit",
         "plot_friction",
         "plot_map",
         "plot_prediction",
+        "plot_residuals",
         "plot_steps",
         "save_figure",
     ),

@@ -1,6 +1,7 @@
 """Types of the names that `__init__.py` loads lazily."""
 
 from pneuopt.certify import evaluate, respond
+from pneuopt.comparison import LogComparison, compare_logs
 from pneuopt.control.averaging import averaged, mean_start, ripple
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
@@ -8,9 +9,12 @@ from pneuopt.control.margins import margins
 from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.control.sensor import SensorLag
+from pneuopt.derived import Derived, derived
 from pneuopt.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from pneuopt.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.files import read_drive, write_fit
+from pneuopt.identifiability import Verdict, identifiability
 from pneuopt.identify import IdentificationResult, identify, predict, validate
 from pneuopt.instruments import Actuator, Encoder, Sensor
 from pneuopt.models.chamber import Polytropic, Thermal
@@ -30,12 +34,25 @@ from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.sensing import coarse_delay, with_sensors
 from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.full_space import FullSpace
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.plotting import plot_bode, plot_fit, plot_friction, plot_map, plot_prediction, plot_steps, save_figure
+from pneuopt.plotting import (
+    plot_bode,
+    plot_correlation,
+    plot_fit,
+    plot_friction,
+    plot_map,
+    plot_prediction,
+    plot_residuals,
+    plot_steps,
+    save_figure,
+)
+from pneuopt.profiles import Profile, profile
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.reweighting import Huber, SoftL1
 from pneuopt.rig import Rig, record
 from pneuopt.scenarios import corners, draws, samples
 from pneuopt.selection import ModelSelection, select_model
@@ -57,6 +74,7 @@ __all__ = [
     "ConvergenceError",
     "Coulomb",
     "Cylinder",
+    "Derived",
     "DiscreteSystem",
     "Dither",
     "Encoder",
@@ -64,6 +82,7 @@ __all__ = [
     "FirstOrder",
     "ForceDrive",
     "FullSpace",
+    "Huber",
     "IdentificationResult",
     "InputError",
     "Integrator",
@@ -72,6 +91,7 @@ __all__ = [
     "Karnopp",
     "LeastSquares",
     "Load",
+    "LogComparison",
     "LuGre",
     "MaxSensitivity",
     "ModelSelection",
@@ -85,13 +105,16 @@ __all__ = [
     "PneuoptError",
     "Polytropic",
     "PressureDependent",
+    "Profile",
     "ProportionalValve",
     "Quantity",
     "Rig",
     "Screening",
     "SecondOrder",
     "Sensor",
+    "SensorLag",
     "SettlingTime",
+    "SoftL1",
     "Spool",
     "SteadyStateError",
     "Step",
@@ -101,27 +124,35 @@ __all__ = [
     "Trajectory",
     "TuningResult",
     "TwoPhase",
+    "Verdict",
     "Viscous",
     "averaged",
+    "coarse_delay",
+    "compare_logs",
     "contacts",
     "corners",
     "define",
+    "derived",
     "differentiate",
     "discretise",
     "draws",
     "evaluate",
     "friction_ladder",
     "grid",
+    "identifiability",
     "identify",
     "margins",
     "mean_start",
     "plot_bode",
+    "plot_correlation",
     "plot_fit",
     "plot_friction",
     "plot_map",
     "plot_prediction",
+    "plot_residuals",
     "plot_steps",
     "predict",
+    "profile",
     "read_drive",
     "read_log",
     "read_tuning",
@@ -139,6 +170,7 @@ __all__ = [
     "sweep",
     "tune",
     "validate",
+    "with_sensors",
     "write_fit",
     "write_tuned",
 ]

@@ -29,9 +29,9 @@ def evaluate(
     Parameters
     ----------
     loop : ClosedLoop or Rig
-        A rig's loop runs behind the rig's actuator and sensors (`record`, seed 0); what is measured is the plant's
-        true signal at the controller's samples, not what the controller saw, and PeakControl is what gets through the
-        actuator. Margins are those of a smooth loop: a rig has none.
+        What is measured is the plant's true signal, not what a sensor shows the controller of it. A rig's loop runs
+        behind the rig's actuator and sensors (`record`, seed 0), and is measured at the controller's samples;
+        PeakControl is then what gets through the actuator. Margins are those of a smooth loop: a rig has none.
     references : Step or sequence of Step
         Each from rest, or from steady motion.
     parameters : ParameterSet

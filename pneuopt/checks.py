@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.errors import InputError, LogError, ModelError, check_known, require
 from pneuopt.experiments import Experiment
 from pneuopt.logdoctor import Finding, examine
@@ -14,10 +15,11 @@ from pneuopt.statistics import noise_level
 from pneuopt.system import DIRECTION, System, names
 
 REFERENCES = ("speed_reference", "position_reference")  # a loop's set-points may stay in a log; no plant reads them
+Model = System | LoggedLoop
 LONGEST_PAUSE = 50  # usual steps without a sample; the inputs in between are unknown
 
 
-def check_logs(system: System, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
+def check_logs(system: Model, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
     """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
     require(len(experiments) > 0, "no experiments: give at least one log", LogError)
     check_known("parameter", parameters, system.parameters)
@@ -29,6 +31,8 @@ def check_logs(system: System, experiments: Sequence[Experiment], parameters: Pa
         name = experiment.name or f"log {number}"
         name = name if name not in taken else f"{name} ({number})"
         taken.add(name)
+        if isinstance(system, LoggedLoop):
+            system.check_log(experiment.trajectory, name)
         _check_channels(system, experiment, name, known)
         _check_conditions(system, experiment, parameters, name)
         out.append(replace(experiment, name=name))
@@ -57,7 +61,7 @@ def check_content(experiments: Sequence[Experiment]) -> None:
         require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}", LogError)
 
 
-def check_smooth(system: System) -> None:
+def check_smooth(system: Model) -> None:
     """Refuse Karnopp's friction where derivatives are taken: without its events a search sees no dry friction."""
     message = (
         "the plant has Karnopp's friction (friction.direction), which only a simulation switches; search on the smooth "
@@ -66,7 +70,7 @@ def check_smooth(system: System) -> None:
     require(DIRECTION not in system.parameters, message, ModelError)
 
 
-def _check_conditions(system: System, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
+def _check_conditions(system: Model, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
     """The hardware as it is in this log."""
     check_known("parameter", experiment.conditions, system.parameters, f"{name}: condition")
     try:
@@ -75,7 +79,7 @@ def _check_conditions(system: System, experiment: Experiment, parameters: Parame
         raise InputError(f"{name}: condition {error}") from None
 
 
-def _check_channels(system: System, experiment: Experiment, name: str, known: set[str]) -> None:
+def _check_channels(system: Model, experiment: Experiment, name: str, known: set[str]) -> None:
     trajectory = experiment.trajectory
     require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
     steps = np.diff(trajectory.t)
@@ -103,7 +107,7 @@ def _check_channels(system: System, experiment: Experiment, name: str, known: se
         require(bool(np.isfinite(trajectory[channel]).any()), empty, LogError)
 
 
-def _with_noise(system: System, experiments: Sequence[Experiment]) -> list[Experiment]:
+def _with_noise(system: Model, experiments: Sequence[Experiment]) -> list[Experiment]:
     """Where a log declares no noise: the median over all logs of what the channel shows, for sensors are shared."""
     found: dict[str, dict[str, float]] = {}
     for experiment in experiments:
@@ -125,7 +129,7 @@ def _with_noise(system: System, experiments: Sequence[Experiment]) -> list[Exper
     ]
 
 
-def measured_outputs(system: System, experiment: Experiment) -> tuple[str, ...]:
+def measured_outputs(system: Model, experiment: Experiment) -> tuple[str, ...]:
     """The system's outputs that a log holds, unless they are its inputs, too."""
     inputs = names(system.inputs)
     return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)

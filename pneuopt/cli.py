@@ -65,13 +65,18 @@ def identify(
     window: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
     ] = None,
+    select: Annotated[
+        bool, typer.Option("--select", help="Compare friction models instead, and recommend one.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Fit parameters to logs, with confidence intervals."""
+    """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
     with _guarded():
-        from pneuopt.commands import Outputs, run_identify
+        from pneuopt.commands.identifying import run_identify, run_select
+        from pneuopt.commands.shared import Outputs
 
-        raise typer.Exit(run_identify(drive, _expanded(logs), Outputs(output, json, plot), window, quiet))
+        run = run_select if select else run_identify
+        raise typer.Exit(run(drive, _expanded(logs), Outputs(output, json, plot), window, quiet))
 
 
 @app.command()
@@ -89,7 +94,8 @@ def tune(
 ) -> None:
     """Tune PID and dither together, and certify them."""
     with _guarded():
-        from pneuopt.commands import Outputs, run_tune
+        from pneuopt.commands.looping import run_tune
+        from pneuopt.commands.shared import Outputs
 
         raise typer.Exit(run_tune(fit, tuning, Outputs(output, json, plot), quiet))
 
@@ -108,7 +114,9 @@ def simulate(
     """Simulate a closed loop, or predict a log."""
     with _guarded():
         require((tuning is None) != (log is None), "give either a tuning file or --log, to say what to simulate")
-        from pneuopt.commands import Outputs, run_predict, run_simulate
+        from pneuopt.commands.identifying import run_predict
+        from pneuopt.commands.looping import run_simulate
+        from pneuopt.commands.shared import Outputs
 
         outputs = Outputs(output, json, plot)
         if tuning is not None:
@@ -129,7 +137,8 @@ def study(
 ) -> None:
     """Certify a loop over loads, pressures, or any parameter; status 1 if a case fails or never settles."""
     with _guarded():
-        from pneuopt.commands import Outputs, run_study
+        from pneuopt.commands.shared import Outputs
+        from pneuopt.commands.studying import run_study
 
         raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet))
 

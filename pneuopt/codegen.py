@@ -10,24 +10,19 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.compiler import build, say_once
-from pneuopt.emission import Kernel, emit
+from pneuopt.compiler import build
 from pneuopt.errors import ModelError, require
-from pneuopt.runge_kutta import rk4
+from pneuopt.kernels import prepare
 
 Array = NDArray[np.float64]
-HERE = Path(__file__).parent
-SAMPLED = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often the inputs of a piece change: see `emission.RATES`
-RESULTS = {"step": ("x_next", "S_next"), "output": ("y", "dy"), "update": ("x_next", "S_next")}
-STEPPED = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
+BATCH = 1000  # segments that the CasADi VM sums up at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +67,28 @@ class Run:
     dx_end: Array | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Gram:
+    """The residuals of m segments as `Rollout.gram` sums them up; s sensitivity columns, as for `Run`.
+
+    Attributes
+    ----------
+    grams : ndarray, shape (m, s + 1, s + 1)
+        Sum over samples and outputs of e e', with e = [dy | y - measured], weighted.
+    squares : ndarray, shape (m, n_outputs)
+        Sum over samples of each output's squared residuals, weighted.
+    y : ndarray, shape (m, n, n_outputs)
+    x_end : ndarray, shape (m, n_states)
+    dx_end : ndarray, shape (m, n_states, s)
+    """
+
+    grams: Array
+    squares: Array
+    y: Array
+    x_end: Array
+    dx_end: Array
+
+
 class Rollout:
     """Run a sampled system over many segments at once.
 
@@ -102,13 +119,13 @@ class Rollout:
         threads: int | None = None,
         lanes: int | None = None,
     ) -> None:
-        self._functions, source = _prepared(*map(_content, (pieces.step, pieces.update, pieces.ode)), tuple(wrt), start)
+        self._functions, source = prepare(pieces.step, pieces.update, pieces.ode, wrt, start)
         step = self._functions["step"]
         self.n_states, self.n_inputs, self.n_parameters = (step.size1_in(i) for i in (2, 3, 4))
         self.n_outputs = self._functions["output"].size1_out(0)
         self.n_columns = len(tuple(wrt)) + (self.n_states if start else 0)
         self._starts = self.n_states if start else 0
-        self._threads = threads or os.cpu_count() or 1
+        self._threads = threads or _processors()
         choices = ("SIMD", "LANES=1") if lanes is None else (f"LANES={lanes}",)
         self._library = build(source, *choices) if source and lanes != 0 else None
         self.lanes = 0 if self._library is None else ctypes.c_int.in_dll(self._library, "rollout_lanes").value
@@ -148,6 +165,45 @@ class Rollout:
         -------
         Run
         """
+        return self._run(*self._checked(x0, u, p, t, h, substeps), substeps, states)
+
+    def gram(
+        self,
+        x0: ArrayLike,
+        u: ArrayLike,
+        p: ArrayLike,
+        t: ArrayLike,
+        h: ArrayLike,
+        measured: ArrayLike,
+        weight: ArrayLike,
+        *,
+        substeps: int = 1,
+    ) -> Gram:
+        """Integrate as `run` does, and sum up the residuals' normal equations without storing their derivatives.
+
+        Parameters
+        ----------
+        x0, u, p, t, h, substeps
+            As for `run`.
+        measured : array_like, shape (m, n, n_outputs)
+            NaN: no residual.
+        weight : array_like, shape (m, n, n_outputs)
+            One over the standard deviation of the noise.
+
+        Returns
+        -------
+        Gram
+        """
+        given = self._checked(x0, u, p, t, h, substeps)
+        y, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (measured, weight))
+        shape = (*given[3].shape, self.n_outputs)
+        for name, array in (("measured", y), ("weight", w)):
+            require(array.shape == shape, f"{name}: {array.shape}, expected {shape}", ModelError)
+        return (self._gram_compiled if self._library is not None else self._gram_vm)(given, y, w, substeps)
+
+    def _checked(
+        self, x0: ArrayLike, u: ArrayLike, p: ArrayLike, t: ArrayLike, h: ArrayLike, substeps: int
+    ) -> tuple[Array, Array, Array, Array, Array]:
         t, h, x0, u, p = (np.ascontiguousarray(a, dtype=np.float64) for a in (t, h, x0, u, p))
         wrong = f"t and h must have shape (m, n), got {t.shape}, {h.shape}"
         require(t.ndim == 2 and h.shape == t.shape, wrong, ModelError)
@@ -157,29 +213,60 @@ class Rollout:
             require(array.shape == expected[name], f"{name}: {array.shape}, expected {expected[name]}", ModelError)
         require(p.shape in ((self.n_parameters,), (m, self.n_parameters)), f"p has shape {p.shape}", ModelError)
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}", ModelError)
-        run = self._run_compiled if self._library is not None else self._run_vm
-        return run(x0, u, p, t, h, substeps, states)
+        return x0, u, p, t, h
 
-    def _run_compiled(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
+    def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
+        if self._library is None:
+            return self._run_vm(x0, u, p, t, h, substeps, states)
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         x = np.empty((m, n, nx)) if states else None
-        stride = p.shape[1] if p.ndim == 2 else 0
-        pointers = [a.ctypes.data if a is not None else None for a in (x0, u, p, t, h, y, dy, x, x_end, dx_end)]
+        self._call((x0, u, p, t, h), substeps, (None, None, y, dy, x, x_end, dx_end, None, None))
+        return Run(y, x_end, x, _swapped(dy), _swapped(dx_end))
+
+    def _gram_compiled(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
+        m, nx, ns = len(given[0]), self.n_states, self.n_columns
+        grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
+        y, x_end, dx_end = np.empty(measured.shape), np.empty((m, nx)), np.empty((m, ns, nx))
+        self._call(given, substeps, (measured, weight, y, None, None, x_end, dx_end, grams, squares))
+        return Gram(grams, squares, y, x_end, np.swapaxes(dx_end, 1, 2))
+
+    def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
+        parts = []
+        for i in range(0, len(measured), BATCH):
+            x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + BATCH] for a in (*given, measured, weight))
+            run = self._run_vm(x0, u, p, t, h, substeps, states=False)
+            dy = np.empty((*y.shape, 0)) if run.dy is None else run.dy
+            dx_end = np.empty((*run.x_end.shape, 0)) if run.dx_end is None else run.dx_end
+            e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
+            e = np.where(np.isfinite(y)[..., None], e, 0.0)
+            flat = e.reshape(len(y), -1, e.shape[-1])
+            parts.append((np.swapaxes(flat, 1, 2) @ flat, np.sum(e[..., -1] ** 2, axis=1), run.y, run.x_end, dx_end))
+        return Gram(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    def _call(self, given: tuple[Array, ...], substeps: int, others: tuple[Array | None, ...]) -> None:
+        """Run the machine code, the segments shared out to the threads."""
         assert self._library is not None
+        p, (m, n) = given[2], given[3].shape
         function = self._library.rollout
-        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int, ctypes.c_longlong] + [ctypes.c_void_p] * 10
+        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int, ctypes.c_longlong] + [ctypes.c_void_p] * 14
         function.restype = None
+        pointers = [a.ctypes.data if a is not None else None for a in (*given, *others)]
         blocks = -(-m // self.lanes)
         parts = max(1, min(self._threads, blocks))
         edges = [min(m, blocks * i // parts * self.lanes) for i in range(parts + 1)]
+        stride = p.shape[1] if p.ndim == 2 else 0
         calls = [(a, b, n, substeps, stride, *pointers) for a, b in itertools.pairwise(edges)]
         if len(calls) == 1:
             function(*calls[0])
         else:
-            list(_pool(self._threads).map(lambda call: function(*call), calls))
-        return Run(y, x_end, x, _swapped(dy), _swapped(dx_end))
+            running = [_pool(self._threads).submit(function, *call) for call in calls]
+            try:
+                for each in running:
+                    each.result()
+            finally:
+                wait(running)  # Ctrl-C must not free the arrays under the threads
 
     def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
@@ -255,84 +342,21 @@ def _casadi_source(function: ca.Function) -> str:
     return str(generator.dump())
 
 
+def _processors() -> int:
+    """Those that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)  # Linux only
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="pneuopt")
-
-
-def _content(function: ca.Function | None) -> str | None:
-    return None if function is None else str(function.serialize())
-
-
-@functools.lru_cache(maxsize=64)
-def _prepared(
-    step: str, update: str | None, ode: str | None, wrt: tuple[int, ...], start: bool
-) -> tuple[dict[str, ca.Function], str]:
-    """The pieces with sensitivities, and their C; by content, for the same system is run again and again."""
-    others = [None if text is None else ca.Function.deserialize(text) for text in (update, ode)]
-    functions = _with_sensitivities(Pieces(ca.Function.deserialize(step), *others), wrt, start)
-    try:
-        return functions, _source(functions, len(wrt), start)
-    except NotImplementedError as missing:
-        say_once(f"no C for {missing}: this model runs in the CasADi VM, about ten times slower")
-        return functions, ""
-
-
-def _with_sensitivities(pieces: Pieces, wrt: tuple[int, ...], start: bool) -> dict[str, ca.Function]:
-    """Each piece with S = dx/d(columns) carried along: (..., x, u, p, S) -> (value, its sensitivity)."""
-    t, h, x, u, p = (ca.SX.sym(k, pieces.step.size1_in(i)) for i, k in enumerate(("t", "h", "x", "u", "p")))
-    S = ca.SX.sym("S", x.numel(), len(wrt) + (x.numel() if start else 0))
-
-    def moved(value: ca.SX) -> ca.SX:
-        """The value's sensitivity: its Jacobian first, which is cheaper than each column through every operation."""
-        fixed = ca.SX(value.numel(), S.size2() - len(wrt))
-        return ca.mtimes(ca.jacobian(value, x), S) + ca.horzcat(fixed, ca.jacobian(value, p)[:, list(wrt)])
-
-    def carried(name: str, arguments: list[ca.SX], value: ca.SX, sensitivity: ca.SX) -> ca.Function:
-        # a bare "step" would be bound to the C library's own
-        outputs = [ca.densify(value), ca.densify(sensitivity)]
-        return ca.Function(f"system_{name}", [*arguments, x, u, p, S], outputs, {"cse": True})
-
-    x_next, y = pieces.step(t, h, x, u, p)
-    S_next = moved(x_next)
-    if pieces.ode is not None:
-        rate = ca.Function(
-            "rate", [t, x, u, p, S], [ca.horzcat(*(f(pieces.ode(t, x, u, p)[0]) for f in (ca.densify, moved)))]
-        )
-        both = rk4(lambda at, z: rate(at, z[:, 0], u, p, z[:, 1:]), t, h, ca.horzcat(x, S))
-        x_next, S_next = both[:, 0], both[:, 1:]
-    functions = {"step": carried("step", [t, h], x_next, S_next), "output": carried("output", [t], y, moved(y))}
-    if pieces.update is not None:
-        after = pieces.update(t, x, u, p)
-        functions["update"] = carried("update", [t], after, moved(after))
-    return functions
 
 
 def _dense(function: ca.Function, name: str) -> ca.Function:
     inputs = [ca.SX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
     outputs = function.call(inputs)
     return ca.Function(name, inputs, [ca.densify(o) for o in outputs], {"cse": True})
-
-
-def _source(functions: dict[str, ca.Function], chosen: int, start: bool) -> str:
-    """The run in C: sizes, lanes, and the driver around the pieces."""
-    nx, nu, np_ = (functions["step"].size1_in(i) for i in (2, 3, 4))
-    starts = nx if start else 0
-    sizes = {"NX": nx, "NU": nu, "NP": np_, "NY": functions["output"].size1_out(0)}
-    sizes |= {"STARTS": starts, "NS": starts + chosen, "HAS_UPDATE": int("update" in functions)}
-    pieces = []
-    for name, results in RESULTS.items():
-        text, kept = "", 0
-        if name in functions:
-            arguments = ("t", "h", "x", "u", "p", "S") if name == "step" else ("t", "x", "u", "p", "S")
-            rates = STEPPED if name == "step" else SAMPLED
-            text, kept = emit(Kernel(name, functions[name], arguments, results), rates)
-        pieces.append(text)
-        sizes |= {f"{name.upper()}_KEPT": kept}
-    defines = (f"#define {k} {v}" for k, v in sizes.items())
-    lanes, driver = ((HERE / name).read_text(encoding="utf-8") for name in ("lanes.h", "rollout.c"))
-    before, after = driver.split("#include PIECES", 1)
-    return "\n".join([*defines, lanes, before, *pieces, after])
 
 
 def _unstacked(block: ca.DM, rows: int, m: int, columns: int) -> Array:

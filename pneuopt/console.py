@@ -15,10 +15,13 @@ from rich.text import Text
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import ParallelForm, to_standard
+from pneuopt.identifiability import Verdict
 from pneuopt.nlp.least_squares import Progress as Tell
 from pneuopt.nlp.status import Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.requirements import PERCENT, Requirement, name
+from pneuopt.scrutiny import NOT_TOLD
+from pneuopt.selection import ModelSelection
 from pneuopt.study import INTERRUPTED
 from pneuopt.units import write_value
 
@@ -43,6 +46,7 @@ def progress(label: str, *, quiet: bool) -> Iterator[Tell]:
     Parameters
     ----------
     label : str
+        Shown until there is news.
     quiet : bool
 
     Yields
@@ -53,10 +57,11 @@ def progress(label: str, *, quiet: bool) -> Iterator[Tell]:
     console = screen(error=True)
     silent = quiet or not console.is_terminal
     clock = TimeElapsedColumn(table_column=Column(min_width=7))
-    columns = SpinnerColumn(), clock, TextColumn("{task.description}", markup=False)
+    news = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
+    columns = SpinnerColumn(), clock, news
     with Progress(*columns, console=console, transient=True, disable=silent) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda text: bar.update(task, description=f"{label}: {text}")
+        yield lambda text: bar.update(task, description=text)
 
 
 def show_status(console: Console, status: Status) -> None:
@@ -76,7 +81,24 @@ def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
     table = _table("parameter", "value", "95 % confidence interval", "unit", "")
     for parameter, row in estimates.iterrows():
         value, interval = _interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
-        table.add_row(str(parameter), value, interval, str(row["unit"]), "at its bound" if row["at_bound"] else "")
+        value = "-" if row["note"] == NOT_TOLD else value
+        table.add_row(str(parameter), value, interval, str(row["unit"]), str(row["note"]))
+    console.print(table)
+
+
+def show_verdict(console: Console, verdict: Verdict | None) -> None:
+    """What the logs do not tell, why, and what run would; nothing if nothing is amiss."""
+    for sentence in verdict.sentences if verdict else ():
+        console.print(sentence, soft_wrap=True)
+
+
+def show_selection(console: Console, chosen: ModelSelection) -> None:
+    """The recommendation and its reason, then a row a candidate."""
+    console.print(Text(chosen.reason, style="bold green"), soft_wrap=True)
+    table = _table("model", "free", "BIC above best", "contains", "p of chance", "")
+    for row in chosen.table.reset_index(names="model").to_dict(orient="records"):
+        figures = [str(row["free"]), _figure(row["bic_above"], 4), str(row["contains"]), _figure(row["p_value"], 2)]
+        table.add_row(str(row["model"]), *figures, "" if row["converged"] else "not converged")
     console.print(table)
 
 
@@ -111,8 +133,8 @@ def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> N
     console.print(_standard_form(after), soft_wrap=True)
 
 
-def show_rejected(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet) -> None:
-    """What stands when a tuning failed, and what it had to reject.
+def show_rejected(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet, word: str) -> None:
+    """What stands when a tuning failed or was cut short, and what it had found.
 
     Parameters
     ----------
@@ -122,10 +144,12 @@ def show_rejected(console: Console, tuning: Path, stats: Mapping[str, float], gi
     stats : mapping of str to float
         Of a `TuningResult`, "rejected.pid.Kp" and so on among them.
     given : ParameterSet
+    word : str
+        What it is, "rejected" or "best so far".
     """
     found = {n.removeprefix("rejected."): v for n, v in stats.items() if n.startswith("rejected.")}
     tried = ", ".join(f"{n} {write_value(v, given[n].unit)}" for n, v in found.items() if not math.isnan(v))
-    console.print(f"the gains of {tuning} stand; rejected: {tried or 'none was found'}", soft_wrap=True)
+    console.print(f"the gains of {tuning} stand; {word}: {tried or 'none was found'}", soft_wrap=True)
 
 
 def show_metrics(
@@ -256,7 +280,19 @@ def _standard_form(parameters: ParameterSet) -> str:
 def _table(*columns: str) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False, header_style="bold")
     for column in columns:
-        text = column in ("parameter", "log", "channel", "certified", "rejected", "unit", "in log", "")
+        text = column in (
+            "parameter",
+            "model",
+            "contains",
+            "log",
+            "channel",
+            "certified",
+            "rejected",
+            "best so far",
+            "unit",
+            "in log",
+            "",
+        )
         table.add_column(column, justify="left" if text else "right", overflow="fold")
     return table
 
@@ -270,6 +306,10 @@ def _figure(value: float, digits: int) -> str:
 
 
 def _interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
+    if math.isfinite(low) and math.isinf(high):
+        return _figure(value, 4), f"above {_figure(low, 4)}"
+    if math.isinf(low) and math.isfinite(high):
+        return _figure(value, 4), f"below {_figure(high, 4)}"
     if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
         return _figure(value, 4), "not determined"
     return _to_spread(value, spread), f"{_to_spread(low, spread)} to {_to_spread(high, spread)}"

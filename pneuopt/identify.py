@@ -12,22 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.checks import check_content, check_free, check_logs, check_smooth, measured_outputs
+from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import ConvergenceError
 from pneuopt.experiments import Experiment
+from pneuopt.identifiability import Verdict
 from pneuopt.nlp.least_squares import NOISE_LEVEL, Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
-from pneuopt.posing import Problem, conditioned
+from pneuopt.posing import Model, Problem, as_logged, conditioned, free_run
 from pneuopt.provenance import provenance
-from pneuopt.simulate import simulate
-from pneuopt.statistics import agreement, confidence_interval, correlation_time
-from pneuopt.system import System
+from pneuopt.reweighting import Loss, Refit, fitted
+from pneuopt.scrutiny import scrutinised
+from pneuopt.starting import attempts
+from pneuopt.statistics import agreement, confidence_interval, correlation_time, cross_correlation, ljung_box
+from pneuopt.system import System, names
 from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
+AT_NOISE = 1.05  # squared residuals a sample, in noise variances, up to which no other start is tried (NUMERICS 3.6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +45,10 @@ class IdentificationResult:
         The system's, with the given values and the estimates; a `per_log` parameter keeps its given value here.
     estimates : DataFrame
         A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
-        at_bound, unit, source. No interval at a bound or where the data do not determine the parameter.
+        at_bound, unit, source, note. No interval at a bound, where the data do not determine the parameter, or without
+        convergence. Where a linear interval would lie it is the profile likelihood's, infinite at an open end.
     covariance : DataFrame
-        Of the estimates, scaled by the residuals' own level and correlation.
+        Of the estimates, scaled by the residuals' own level and correlation; NaN for what has no interval.
     fit : DataFrame
         A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit.
     trajectories : mapping of str to Trajectory
@@ -50,6 +56,8 @@ class IdentificationResult:
     status : Status
     stats : mapping of str to float
     provenance : mapping of str to str
+    verdict : Verdict
+        What the logs do not tell, why, and what run would: ``print(result.verdict)``.
     """
 
     parameters: ParameterSet
@@ -60,26 +68,35 @@ class IdentificationResult:
     status: Status
     stats: Mapping[str, float]
     provenance: Mapping[str, str]
+    verdict: Verdict | None = None
 
 
 def identify(
-    system: System,
+    system: System | ClosedLoop,
     experiments: Sequence[Experiment],
     parameters: ParameterSet,
     *,
     method: LeastSquares | None = None,
+    loss: Loss | None = None,
+    estimate_noise: bool = False,
     throw: bool = True,
 ) -> IdentificationResult:
     """Fit the free parameters and every log's start state to the logs; no guess is needed from the user.
 
     Parameters
     ----------
-    system : System
+    system : System or ClosedLoop
+        A loop with its sampled PID, where the logs hold the reference ("speed_reference") but not the command. Where
+        they hold the command, identify the plant alone: the controller then says nothing more.
     experiments : sequence of Experiment
         Each with all inputs and at least one output of the system. Missing outputs and samples do not count.
     parameters : ParameterSet
         The free ones are estimated; the others are known, unless a log's conditions override them.
     method : LeastSquares, optional
+    loss : Loss, optional
+        For logs with outliers: `Huber()` or `SoftL1()`; by default every residual counts with its square.
+    estimate_noise : bool
+        Take each channel's noise from its residuals, whatever the logs say of it.
     throw : bool
         Raise if the fit did not converge; otherwise the result says so in its status.
 
@@ -94,25 +111,29 @@ def identify(
     ConvergenceError
         If no candidate start converged; the error's `solution` is the result, marked.
     """
-    method = method or LeastSquares()
-    check_smooth(system)
-    experiments = check_logs(system, experiments, parameters)
+    method, model = method or LeastSquares(), as_logged(system)
+    check_smooth(model)
+    if estimate_noise:
+        experiments = [replace(e, noise={}) for e in experiments]
+    experiments = check_logs(model, experiments, parameters)
     check_free(experiments, parameters)
     check_content(experiments)
-    problem = Problem(system, tuple(experiments), system.parameters | parameters, method)
-    fit, label = _best(problem, method)
-    result = _result(problem, fit, label)
+    problem = Problem(model, tuple(experiments), model.parameters | parameters, method)
+    found, label = _best(problem, loss, estimate_noise=estimate_noise)
+    result = scrutinised(found.problem, _result(found, label, loss))
     if throw and not result.status.converged:
         raise ConvergenceError(f"identification {result.status}", result)
     return result
 
 
-def validate(system: System, experiments: Sequence[Experiment], parameters: ParameterSet) -> "pd.DataFrame":
+def validate(
+    system: System | ClosedLoop, experiments: Sequence[Experiment], parameters: ParameterSet
+) -> "pd.DataFrame":
     """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
 
     Parameters
     ----------
-    system : System
+    system : System or ClosedLoop
     experiments : sequence of Experiment
         Best such as no fit has seen.
     parameters : ParameterSet
@@ -120,23 +141,29 @@ def validate(system: System, experiments: Sequence[Experiment], parameters: Para
     Returns
     -------
     DataFrame
-        A row a log and channel: rmse, nrmse, fit_percent, samples, unit.
+        A row a log and channel: rmse, nrmse, fit_percent, samples, unit; whiteness_p, the probability of residuals so
+        little white by chance (`ljung_box`); of each input how much is left in them (`cross_correlation`, about 3 is
+        what chance reaches) and at which lag in samples: "correlation[force]", "lag[force]".
     """
     import pandas as pd
 
-    fixed = system.parameters | parameters.fixed(*parameters.free_names)
+    model = as_logged(system)
+    fixed = model.parameters | parameters.fixed(*parameters.free_names)
     rows = []
-    for experiment in check_logs(system, experiments, fixed):
-        rows += _agreements(system, experiment, _predicted(system, experiment, fixed))
+    for experiment in check_logs(model, experiments, fixed):
+        run = _predicted(model, experiment, fixed)
+        rows += [
+            row | _leftover(model, experiment, run, str(row["channel"])) for row in _agreements(model, experiment, run)
+        ]
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
 
-def predict(system: System, experiment: Experiment, parameters: ParameterSet) -> Trajectory:
+def predict(system: System | ClosedLoop, experiment: Experiment, parameters: ParameterSet) -> Trajectory:
     """The free run that `validate` compares with a log.
 
     Parameters
     ----------
-    system : System
+    system : System or ClosedLoop
     experiment : Experiment
     parameters : ParameterSet
 
@@ -145,25 +172,26 @@ def predict(system: System, experiment: Experiment, parameters: ParameterSet) ->
     Trajectory
         States and outputs on the log's grid.
     """
-    fixed = system.parameters | parameters.fixed(*parameters.free_names)
-    return _predicted(system, check_logs(system, [experiment], fixed)[0], fixed)
+    model = as_logged(system)
+    fixed = model.parameters | parameters.fixed(*parameters.free_names)
+    return _predicted(model, check_logs(model, [experiment], fixed)[0], fixed)
 
 
-def _predicted(system: System, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
+def _predicted(system: Model, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
     inputs, known = experiment.trajectory, conditioned(fixed, experiment)
     if not system.states:
-        return simulate(system, inputs, known)
+        return free_run(system, inputs, known, {})
     whole = LeastSquares(segment_time=math.inf)
     problem = Problem(system, (experiment,), fixed, whole)
     start = problem.candidates()[0]
     initial = solve_least_squares(problem.transcription(start), whole).solution.trajectories[0]
     state = {s.name: float(initial[s.name][0]) for s in system.states}
-    return simulate(system, inputs, known, initial=state)
+    return free_run(system, inputs, known, state)
 
 
-def _result(problem: Problem, fit: Fit, label: str) -> IdentificationResult:
+def _result(found: Refit, label: str, loss: Loss | None) -> IdentificationResult:
     """Read the solver's answer back into parameters and tables."""
-    solution = fit.solution
+    problem, fit, solution = found.problem, found.fit, found.fit.solution
     free = solution.parameters.free_names
     shared = [n for n in free if n in problem.parameters]
     values = {n: solution.parameters.value(n) for n in shared}
@@ -172,7 +200,7 @@ def _result(problem: Problem, fit: Fit, label: str) -> IdentificationResult:
     squares = fit.chi_square if fit.jumps is None else 2 * solution.stats["cost"]
     variance = squares / max(1, fit.count - len(free) - starts)
     correlated = max(_correlated(problem.system, problem.experiments, runs), _correlated_jumps(fit.jumps))
-    covariance = None if fit.covariance is None else fit.covariance * variance * correlated
+    covariance = None if fit.covariance is None else fit.covariance * variance * correlated * found.spread
     return IdentificationResult(
         problem.parameters.with_values(values),
         _estimates(solution.parameters.select(free), covariance, fit.at_bound, solution.status),
@@ -181,31 +209,55 @@ def _result(problem: Problem, fit: Fit, label: str) -> IdentificationResult:
         runs,
         solution.status,
         {**solution.stats, "chi_square_ratio": variance, "correlation_time": correlated},
-        {**provenance(problem.method), "start": label, **{f"sha256[{e.name}]": e.sha256 for e in problem.experiments}},
+        {
+            **provenance(problem.method, *([loss] if loss else [])),
+            "start": label,
+            **{f"sha256[{e.name}]": e.sha256 for e in problem.experiments},
+        },
     )
 
 
-def _best(problem: Problem, method: LeastSquares) -> tuple[Fit, str]:
+def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple[Refit, str]:
     """The first candidate that converges at the noise's level; else the least cost, once two have found it, or of all.
 
     A wrong basin can converge, too; its residuals then exceed the noise.
     """
-    fits: list[tuple[Fit, str]] = []
-    for candidate in problem.candidates():
-        fit = solve_least_squares(problem.transcription(candidate), method)
-        if fit.solution.status.code is Code.INTERRUPTED or (
-            fit.solution.status.converged and fit.chi_square <= NOISE_LEVEL * fit.count
-        ):
-            return fit, candidate.label
-        fits.append((fit, candidate.label))
-        fits.sort(key=lambda found: _cost(found[0]))
-        if len(fits) > 1 and _are_alike(fits[0][0], fits[1][0]):
-            break
-    fit, label = fits[0]
-    status = fit.solution.status
-    if not status.converged and len(fits) > 1:
+    fits: list[tuple[Refit, str]] = []
+    interrupted = False
+    try:
+        for candidate in attempts(problem):
+            found = fitted(problem, candidate, loss, estimate_noise=estimate_noise)
+            fit = found.fit
+            if fit.solution.status.code is Code.INTERRUPTED or _is_at_noise(fit):
+                return found, candidate.label
+            fits.append((found, candidate.label))
+            fits.sort(key=lambda each: _rank(each[0].fit))
+            if len(fits) > 1 and _are_alike(fits[0][0].fit, fits[1][0].fit):
+                break
+    except KeyboardInterrupt:
+        interrupted = True
+    found, label = fits[0]
+    status = found.fit.solution.status
+    if interrupted:
+        status = Status(Code.INTERRUPTED, f"the best of {len(fits)} starts so far; run again for an answer")
+    elif not status.converged and len(fits) > 1:
         status = Status(status.code, f"none of {len(fits)} starts will do; in the best, {status.message}")
-    return replace(fit, solution=replace(fit.solution, status=status)), label
+    if len(problem.experiments) > 1:
+        status = Status(status.code, f"{status.message}; compare_logs tells whether the logs are of one drive")
+    solution = replace(found.fit.solution, status=status)
+    return replace(found, fit=replace(found.fit, solution=solution)), label
+
+
+def _is_at_noise(fit: Fit) -> bool:
+    """Whether nothing better is to be found; a wrong basin of soft bristles has left 1.1 noise variances a sample."""
+    return fit.solution.status.converged and fit.jumps is None and fit.chi_square <= AT_NOISE * fit.count
+
+
+def _rank(fit: Fit) -> tuple[int, float]:
+    """The order of fits: by cost, but noise of the states explains too much to be compared with a fit without."""
+    if fit.jumps is not None:
+        return 1, _cost(fit)
+    return 0 if 2 * _cost(fit) <= NOISE_LEVEL * fit.count else 2, _cost(fit)
 
 
 def _cost(fit: Fit) -> float:
@@ -215,17 +267,17 @@ def _cost(fit: Fit) -> float:
 def _are_alike(best: Fit, second: Fit) -> bool:
     """Whether both converged, at the same cost."""
     converged = best.solution.status.converged and second.solution.status.converged
-    return converged and _cost(second) <= 1.001 * _cost(best)
+    return converged and _rank(best)[0] == _rank(second)[0] and _cost(second) <= 1.001 * _cost(best)
 
 
-def _fit_table(system: System, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
+def _fit_table(system: Model, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
     import pandas as pd
 
     rows = [row for e in experiments for row in _agreements(system, e, runs[e.name])]
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
 
-def _agreements(system: System, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
+def _agreements(system: Model, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
     units = {q.name: q.unit for q in system.outputs}
     rows: list[dict[str, object]] = []
     for channel in measured_outputs(system, experiment):
@@ -235,7 +287,18 @@ def _agreements(system: System, experiment: Experiment, run: Trajectory) -> list
     return rows
 
 
-def _correlated(system: System, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> float:
+def _leftover(system: Model, experiment: Experiment, run: Trajectory, channel: str) -> dict[str, object]:
+    """What of the inputs, and of its own past, is left in a channel's residuals."""
+    log = experiment.trajectory
+    residuals = log[channel] - run[channel]
+    found: dict[str, object] = {"whiteness_p": ljung_box(residuals)[1]}
+    for name in (n for n in names(system.inputs) if n in log):
+        size, lag = cross_correlation(residuals, log[name])
+        found |= {f"correlation[{name}]": size, f"lag[{name}]": lag}
+    return found
+
+
+def _correlated(system: Model, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> float:
     """By how much correlated residuals (model error, not noise) widen a variance: the mean over logs and channels."""
     times = [
         correlation_time(e.trajectory[channel] - runs[e.name][channel])

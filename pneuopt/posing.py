@@ -1,32 +1,47 @@
 """An identification posed as multiple shooting: logs, conditions and own parameters become a `Transcription`."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.checks import measured_outputs
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.errors import InputError
 from pneuopt.experiments import Experiment
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.system import Log, Start, System, discretise, names
+from pneuopt.simulate import simulate
+from pneuopt.system import DiscreteSystem, Log, Start, System, discretise, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
+Model = System | LoggedLoop
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is to be identified, and its translation to a transcription and back."""
+    """What is to be identified, and its translation to a transcription and back.
 
-    system: System
+    Parameters
+    ----------
+    system : System or LoggedLoop
+    experiments : tuple of Experiment
+    parameters : ParameterSet
+    method : LeastSquares
+    weights : mapping of str to ndarray, each of shape (n, n_measured_outputs)
+        By log: of each sample's squared residual; absent ones are 1.
+    """
+
+    system: Model
     experiments: tuple[Experiment, ...]
     parameters: ParameterSet
     method: LeastSquares
+    weights: Mapping[str, Array] = field(default_factory=dict)
 
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
@@ -52,14 +67,20 @@ class Problem:
         phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
         residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
         parameters = self.unknowns().with_values(candidate.parameters)
-        return Transcription(discretise(self.system), parameters, phases, residuals)
+        return Transcription(self._sampled(), parameters, phases, residuals)
+
+    def _sampled(self) -> DiscreteSystem:
+        return self.system.discrete() if isinstance(self.system, LoggedLoop) else discretise(self.system)
 
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
-        inputs = experiment.trajectory.matrix(names(self.system.inputs))
-        nodes = every(len(t), self._segment(h))
-        return Phase(experiment.name, t, h, inputs, nodes, guess=states.matrix(names(self.system.states)))
+        nodes, guess = every(len(t), self._segment(h)), states.matrix(names(self.system.states))
+        if isinstance(self.system, LoggedLoop):
+            driven = self.system.driven(experiment.trajectory, experiment.name)
+            start = self.system.known_start(experiment.trajectory, states, self.parameters)
+            return Phase(experiment.name, t, h, driven, nodes, start, guess=guess)
+        return Phase(experiment.name, t, h, experiment.trajectory.matrix(names(self.system.inputs)), nodes, guess=guess)
 
     def _segment(self, h: Array) -> int:
         """Samples between two nodes; a static map has no gaps, so its cut is only for batching."""
@@ -71,7 +92,21 @@ class Problem:
     def _residuals(self, index: int, experiment: Experiment) -> Residuals:
         outputs = measured_outputs(self.system, experiment)
         noise = np.array([experiment.noise[o] for o in outputs])
+        if experiment.name in self.weights:
+            noise = noise[:, None] / np.sqrt(self.weights[experiment.name].T)
         return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
+
+
+def as_logged(model: System | ClosedLoop) -> Model:
+    """The model as an identification reads it from a log."""
+    return LoggedLoop(model) if isinstance(model, ClosedLoop) else model
+
+
+def free_run(model: Model, inputs: Trajectory, parameters: ParameterSet, initial: Mapping[str, float]) -> Trajectory:
+    """Simulate the model along a log from a known state."""
+    if isinstance(model, LoggedLoop):
+        return simulate(model.loop, model.reference_column(inputs), parameters, initial=initial)
+    return simulate(model, inputs, parameters, initial=initial)
 
 
 def conditioned(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:

@@ -1,5 +1,6 @@
 """Where a result comes from: versions and options, as text that goes with it."""
 
+import functools
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
@@ -26,6 +27,7 @@ def provenance(*options: object) -> dict[str, str]:
     }
 
 
+@functools.cache
 def _version(package: str) -> str:
     try:
         return version(package)

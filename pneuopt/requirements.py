@@ -6,9 +6,14 @@ Values are fractions of the step's size, seconds, or the command's unit: `Oversh
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pneuopt.errors import require
 
+Value = TypeVar("Value", float, NDArray[np.float64])
 PERCENT = ("Overshoot", "SteadyStateError")
 
 
@@ -200,8 +205,8 @@ def name(requirement: Requirement) -> str:
     return type(requirement).__name__
 
 
-def read(metrics: Mapping[str, float]) -> dict[str, float]:
-    """The requirements' values from metrics: fractions where those are in percent."""
+def read(metrics: Mapping[str, Value]) -> dict[str, Value]:
+    """The requirements' values from metrics, numbers or arrays: fractions where those are in percent."""
     kinds = [k.__name__ for k in Requirement.__args__]
     return {k: metrics[k] / (100 if k in PERCENT else 1) for k in kinds if k in metrics}
 

@@ -7,7 +7,7 @@ finite resolution, and a controller that sees only those sensors, and differenti
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -22,7 +22,7 @@ from pneuopt.integration import Run
 from pneuopt.parameters import ParameterSet, Quantity
 from pneuopt.simulate import contacts, first_state, held_inputs, new_run, warn_of
 from pneuopt.stick_slip import Event, StickSlip
-from pneuopt.system import Rest, RestFinder, Symbols, System, define, names, stacked, vector
+from pneuopt.system import Symbols, System, define, names, stacked, vector
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -35,7 +35,8 @@ class Rig:
     Parameters
     ----------
     model : System or ClosedLoop
-        With Karnopp's friction (`ForceDrive(Karnopp(Stribeck()))`) it sticks and slips. A loop is sampled.
+        With Karnopp's friction (`ForceDrive(Karnopp(Stribeck()))`) it sticks and slips. A loop is sampled; the rig's
+        sensors stand in for the loop's own.
     sensors : mapping of str to Sensor
         By the plant's output: what is measured, and logged.
     actuator : Actuator
@@ -97,10 +98,7 @@ class Rig:
 
     @cached_property
     def sensed(self) -> System:
-        """The plant with an output "sensor.*" a sensor, and a state of that name where it lags.
-
-        A loop on it, ``ClosedLoop(rig.sensed, ..., measured="sensor.speed")``, can be tuned for what it will see.
-        """
+        """The plant with an output "sensor.*" a sensor, and a state of that name where it lags."""
         plant = self.plant
         shown = {f"sensor.{q.name}": q for q in plant.outputs if q.name in self.channels}
         lags = {n: self.sensors[q.name].lag for n, q in shown.items()}
@@ -116,9 +114,7 @@ class Rig:
         sensors = {n: replace(q, name=n) for n, q in shown.items()}
         lagging = (q for n, q in sensors.items() if lags[n] > 0)
         states, outputs = (*plant.states, *lagging), (*plant.outputs, *sensors.values())
-        system = define(states, plant.inputs, outputs, plant.parameters, rhs)
-        finder = partial(_rest, plant, plant.rest_finder) if plant.rest_finder else None
-        return replace(system, rest_finder=finder, checker=plant.checker, guards=plant.guards)
+        return define(states, plant.inputs, outputs, plant.parameters, rhs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +234,9 @@ class _Controller:
         loop.check(parameters)
         seen = loop.feedback
         echo = define([seen], [loop.command], [seen], loop.plant.parameters, lambda _t, y, _u, _p: (_at_rest(y), y))
-        echoing = replace(loop, plant=echo)
+        echoing = replace(loop, plant=echo, sensor=None)
         self._update, self._p = compiled(echoing.update), echoing.numbers(parameters)
-        plant, own = np.split(x, [len(rig.plant.states)])
+        plant, own = x[: len(rig.plant.states)], x[1 - len(echoing.states) :]
         self._rig, self._loop, self._fed, self._x = rig, loop, fed, own
         self._command = names(echoing.states).index("pid.command")
         self.before = float(own[self._command - 1])
@@ -313,17 +309,6 @@ def _settled(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
 def _outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
     """The plant's, by name."""
     return dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel().tolist(), strict=True))
-
-
-def _rest(plant: System, finder: RestFinder, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
-    """The plant's rest, or steady motion, and every sensor's at the truth."""
-    wanted = {n.removeprefix("sensor."): value for n, value in outputs.items()}
-    rest = finder(parameters, wanted)
-    x = [rest.states.get(n, 0.0) for n in names(plant.states)]
-    u = [rest.inputs.get(n, 0.0) for n in names(plant.inputs)]
-    y = np.array(plant.ode(0, x, u, vector(plant.parameters, parameters))[1]).ravel().tolist()
-    shown = {f"sensor.{n}": value for n, value in zip(names(plant.outputs), y, strict=True)}
-    return Rest({**rest.states, **shown}, rest.inputs)
 
 
 def _at_samples(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:

@@ -2,7 +2,8 @@
 
    NX, NU, NP, NY and NS are the sizes of the state, input, parameter and output vectors and the number of sensitivity
    columns S = dx/d(start, parameters). All arrays are C-contiguous with the segment first; a null pointer leaves that
-   result out. */
+   result out. With measured outputs (NaN: none) and their weights, the Gram matrix of [dy | y - measured], weighted, is
+   summed over a segment's samples, and dy itself is never stored. */
 
 #ifdef _WIN32
 #define EXPORT __declspec(dllexport)
@@ -10,10 +11,12 @@
 #define EXPORT
 #endif
 #define LENGTH(n) ((n) > 0 ? (n) : 1)
+#define WIDTH (NS + 1)
 
 typedef struct {
   Lanes t[1], h[1], x[LENGTH(NX)], u[LENGTH(NU)], p[LENGTH(NP)], S[LENGTH(NX * NS)];
   Lanes x_next[LENGTH(NX)], S_next[LENGTH(NX * NS)], y[LENGTH(NY)], dy[LENGTH(NY * NS)];
+  Lanes measured[LENGTH(NY)], weight[LENGTH(NY)], gram[WIDTH * WIDTH], squares[LENGTH(NY)];
   Lanes step_kept[LENGTH(STEP_KEPT)], output_kept[LENGTH(OUTPUT_KEPT)], update_kept[LENGTH(UPDATE_KEPT)];
 } Segment;
 
@@ -40,7 +43,7 @@ static void advance(Segment *s) {
 }
 
 static void start(Segment *s) {
-  memset(s->S, 0, sizeof(s->S));
+  memset(s->S, 0, sizeof(s->S)), memset(s->gram, 0, sizeof(s->gram)), memset(s->squares, 0, sizeof(s->squares));
   for (int c = 0; c < STARTS; c++) s->S[c * NX + c] = ALL(1.0);
 #if HAS_UPDATE
   update_segment(s);
@@ -53,6 +56,23 @@ static void read_sample(Segment *s) {
   update_sample(s), update_call(s), advance(s);
 #endif
   output_sample(s), output_call(s);
+}
+
+static void add_residuals(Segment *s) {
+  Lanes e[WIDTH];
+  for (int i = 0; i < NY; i++) {
+    const Lanes known = v_eq(s->measured[i], s->measured[i]), weight = s->weight[i];
+    for (int a = 0; a < NS; a++) e[a] = v_if_else_zero(known, s->dy[a * NY + i] * weight);
+    e[NS] = v_if_else_zero(known, (s->y[i] - s->measured[i]) * weight);
+    s->squares[i] += e[NS] * e[NS];
+    for (int a = 0; a < WIDTH; a++)
+      for (int b = 0; b <= a; b++) s->gram[a * WIDTH + b] += e[a] * e[b];
+  }
+}
+
+static void mirror(Segment *s) {
+  for (int a = 0; a < WIDTH; a++)
+    for (int b = 0; b < a; b++) s->gram[b * WIDTH + a] = s->gram[a * WIDTH + b];
 }
 
 static void step_through(Segment *s, int substeps) {
@@ -68,7 +88,8 @@ static void step_through(Segment *s, int substeps) {
 
 EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stride,
                                   const double *x0, const double *u, const double *p, const double *t, const double *h,
-                                  double *y, double *dy, double *x, double *x_end, double *dx_end) {
+                                  const double *measured, const double *weight, double *y, double *dy, double *x,
+                                  double *x_end, double *dx_end, double *gram, double *squares) {
   Segment s;
   for (Count i = first; i < last; i += LANES) {
     const int lanes = last - i < LANES ? (int)(last - i) : LANES;
@@ -85,8 +106,14 @@ EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stri
       scatter(s.x, x, sample, NX, lanes);
       read_sample(&s);
       scatter(s.y, y, sample, NY, lanes), scatter(s.dy, dy, sample, NY * NS, lanes);
+      if (gram) {
+        gather(s.measured, measured, sample, NY), gather(s.weight, weight, sample, NY);
+        add_residuals(&s);
+      }
       step_through(&s, substeps);
     }
+    mirror(&s);
+    scatter(s.gram, gram, row, WIDTH * WIDTH, lanes), scatter(s.squares, squares, row, NY, lanes);
     scatter(s.x, x_end, row, NX, lanes), scatter(s.S, dx_end, row, NX * NS, lanes);
   }
 }

@@ -41,11 +41,14 @@ class Start:
     parameters : mapping of str to float
         By name; a `per_log` one as "name[log]".
     label : str
+    tried : tuple of str
+        Those of the parameters that the log does not tell, and the candidates try: one value each.
     """
 
     states: Mapping[str, Trajectory]
     parameters: Mapping[str, float]
     label: str = ""
+    tried: tuple[str, ...] = ()
 
 
 class StartFinder(Protocol):

@@ -6,7 +6,7 @@ A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or s
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -21,9 +21,10 @@ from pneuopt.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.provenance import provenance
-from pneuopt.requirements import MaxSensitivity, PeakControl, Requirement, Specification, name, read, specify
-from pneuopt.tuning.candidates import Simulator, Space, Tell, span, worst
-from pneuopt.tuning.screening import Screening, screen
+from pneuopt.requirements import PeakControl, Requirement, Specification, name, read, specify
+from pneuopt.tuning.candidates import Space, Tell, span
+from pneuopt.tuning.screening import Screening, merit, screen
+from pneuopt.tuning.simulator import Simulator, each, worst
 from pneuopt.tuning.two_phase import TwoPhase, is_linear, solve_two_phase
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Method = TwoPhase | Screening
 ATTEMPTS = 3  # margins tried, each twice the one before
-CHECKED = 20  # printed gains whose sensitivity is computed at once
 TRIED = 5  # printed gains certified at each margin, at most
+ROUNDS = 3  # of looking around for printed gains that lose next to nothing
 GRAZING = 0.01  # relative excess of the certified over the claimed settling time
 PEAKS_EXACT, PEAKS_SCREENED = 1 / 300, 1 / 5  # of the margin, for peak control and sensitivity
 UNFELT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # by a linear loop's average
@@ -58,7 +59,7 @@ class TuningResult:
     stats : mapping of str to float
         "seconds", "deviation.SettlingTime" and so on (the largest |claimed - certified|), and the search's own:
         "margin", "starts", "starts_converged", "starts_agreeing", "optimum" (before rounding), "simulations"; where
-        nothing is certified "rejected.pid.Kp" and so on, and "contacts" where a response ran into an end stop.
+        the given gains stand "rejected.pid.Kp" and so on, and "contacts" where a response ran into an end stop.
     provenance : mapping of str to str
     """
 
@@ -91,6 +92,7 @@ def tune(
     Parameters
     ----------
     loop : ClosedLoop
+        The requirements are read on its true measured signal; the controller acts on what the loop's sensor shows.
     references : Step or sequence of Step
         Each from rest, or from steady motion, and with a label of its own; the worst counts.
     parameters : ParameterSet
@@ -114,8 +116,9 @@ def tune(
     InputError
         If parameters, bounds and requirements do not fit together; the message names the one.
     ConvergenceError
-        If the limits cannot be kept, or the independent simulation does not confirm them; the error's `solution` is
-        the result, with the given gains unchanged.
+        If the limits cannot be kept, the independent simulation does not confirm them, or Ctrl-C cuts the screening
+        short; the error's `solution` is the result, with the given gains unchanged: `claimed` and `certified` are
+        those of the best point found, which is in its `stats`.
 
     Examples
     --------
@@ -167,12 +170,13 @@ def _clip(loop: ClosedLoop, parameters: ParameterSet) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What a search hands over: a point before rounding, the objective there, what is active, figures."""
+    """What a search hands over: a point before rounding, what is active there, figures; whether it came to its end."""
 
     point: Array
     status: Status
     active: tuple[str, ...]
     stats: Mapping[str, float]
+    is_complete: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,15 +198,27 @@ class _Search:
             found = self._search(simulator, attempt, margin, start)
             counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
             found = replace(found, stats={**found.stats, **counts, "margin": margin})
+            if not found.is_complete:
+                return self._cut_short(simulator, found)
             if not found.status.converged:
                 return result or self._result(simulator, found, found.point)
-            for point in self._printed(simulator, found.point, margin):
+            for point in self._printed(simulator, found, margin):
                 result = self._result(simulator, found, point)
                 if result.status.converged or "contacts" in result.stats:
                     return result
             start = found.point
         assert result is not None
         return result
+
+    def _cut_short(self, simulator: Simulator, found: _Found) -> TuningResult:
+        """The best so far, as printed, with its certificate; not handed out, for nobody has chosen it."""
+        digits = self.method.digits
+        best = self._result(simulator, found, self.space.printed(found.point, digits) if digits else found.point)
+        verdict = f"{'holds' if best.status.converged else 'does not hold'}: {best.status.message}"
+        count = f"{found.stats['simulations']:.0f} simulations"
+        status = Status(Code.INTERRUPTED, f"the best of {count} so far {verdict}; run again for an answer")
+        values = {f"rejected.{n}": best.parameters.value(n) for n in self.space.names if best.status.converged}
+        return replace(best, parameters=self.space.parameters, status=status, stats={**values, **best.stats})
 
     def _search(self, simulator: Simulator, attempt: int, margin: float, start: Array) -> _Found:
         if isinstance(self.method, TwoPhase):
@@ -234,28 +250,34 @@ class _Search:
     def _screen(self, simulator: Simulator, margin: float, start: Array) -> _Found:
         assert isinstance(self.method, Screening)
         spec = self._tightened(margin)
-        point, count = screen(simulator, self.references, self.space, spec, self.method, start, self.tell)
-        values = simulator.values(point[None], spec)[0]
-        stats = {"simulations": float(count), "optimum": spec.objective(values)}
-        return _Found(point, _screened(self.spec, values), _active(self.space, spec, point, values), stats)
+        found = screen(simulator, self.references, self.space, spec, self.method, start, self.tell)
+        values = each(simulator.values(found.point[None], spec))[0]
+        stats = {"simulations": float(found.count), "optimum": spec.objective(values)}
+        status, active = _screened(self.spec, values), _active(self.space, spec, found.point, values)
+        return _Found(found.point, status, active, stats, found.is_complete)
 
-    def _printed(self, simulator: Simulator, point: Array, margin: float) -> list[Array]:
-        """Near the point, of the gains as printed, those that keep the limits, the best first."""
-        if self.method.digits is None:
-            return [point]
-        spec = self._tightened(margin / 2)
-        points, kept = self.space.printed(point, self.method.digits, 1), list[Array]()
-        quick = spec if spec.weight(MaxSensitivity) else spec.without(MaxSensitivity)  # the dear one: of the best only
-        found = simulator.values(points, quick)
-        good = sorted((quick.objective(v), k) for k, v in enumerate(found) if not quick.violated(v))
-        ranked = points[[k for merit, k in good if np.isfinite(merit)]]
-        for first in range(0, len(ranked), CHECKED):
-            batch = ranked[first : first + CHECKED]
-            found = simulator.values(batch, spec)
-            kept += [near for near, v in zip(batch, found, strict=True) if not spec.violated(v)]
-            if len(kept) >= TRIED:
+    def _printed(self, simulator: Simulator, found: _Found, margin: float) -> Iterator[Array]:
+        """The gains as printed; where those break a limit or lose too much, what a last place more or less mends."""
+        digits, spec, tried = self.method.digits, self._tightened(margin / 2), list[list[float]]()
+        if digits is None:
+            yield found.point
+            return
+        scale = min(r.horizon - r.at for r in self.references)
+        nearest = self.space.printed(found.point, digits)
+        points, most = nearest[None], found.stats["optimum"] * (1 + GRAZING)
+        for _ in range(ROUNDS):
+            values = simulator.values(points, spec)
+            order, rows = np.argsort(merit(values, spec, scale)), each(values)
+            for k in order.tolist():
+                good = not spec.violated(rows[k]) and spec.objective(rows[k]) <= most
+                if good and len(tried) < TRIED and points[k].tolist() not in tried:
+                    tried.append(points[k].tolist())
+                    yield points[k]
+            points = self.space.neighbours(points[order[0]], digits)
+            if not len(points):
                 break
-        return kept[:TRIED] or [self.space.printed(point, self.method.digits)[0]]
+        if not tried:
+            yield nearest
 
     def _result(self, simulator: Simulator, found: _Found, point: Array) -> TuningResult:
         import pandas as pd

@@ -11,6 +11,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, StandardForm, to_parallel
 from pneuopt.control.reference import Step
+from pneuopt.control.sensor import SensorLag
 from pneuopt.errors import InputError, check_known, require
 from pneuopt.nlp.status import Status
 from pneuopt.output import plain, write_text
@@ -37,7 +38,7 @@ T = TypeVar("T")
 RESULTS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
-_SECTIONS = ("loop", "pid", "dither", "reference", "minimise", "limits")
+_SECTIONS = ("loop", "sensor", "pid", "dither", "reference", "minimise", "limits")
 _STRUCTURE: Mapping[str, tuple[str, ...]] = {
     "loop": ("measured", "actuated"),
     "pid": ("form", "sample_time", "limits"),
@@ -65,7 +66,7 @@ class Tuning:
     loop : ClosedLoop
     references : tuple of Step
     parameters : ParameterSet
-        "pid.*" and "dither.*", the free ones within finite bounds.
+        "pid.*", "dither.*" and "sensor.lag", the free ones within finite bounds.
     minimise : mapping of Requirement to float
         Weights; empty where the file only describes a loop.
     subject_to : tuple of Requirement
@@ -122,7 +123,7 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     """
     said = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in RESULTS}
     check_known("section", said, _SECTIONS, str(path))
-    for name in ("loop", "pid", "dither", "minimise", "limits"):
+    for name in ("loop", "sensor", "pid", "dither", "minimise", "limits"):
         require(isinstance(said.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
     require("pid" in said, f"{path}: no controller; add a section [pid]")
     loop = _loop(said, plant, path)
@@ -173,7 +174,15 @@ def _loop(said: Sections, plant: System, path: str | Path) -> ClosedLoop:
     sample_time = _value(pid, "sample_time", "s", f"{path}: [pid]") if "sample_time" in pid else None
     controller = _checked(lambda: PID(sample_time, limits="limits" in pid), f"{path}: [pid]")
     oscillation = _dither(dither, f"{path}: [dither]") if "dither" in said else None
-    return _checked(lambda: ClosedLoop(plant, controller, oscillation, **wiring), str(path))
+    sensor = _sensor(said["sensor"], f"{path}: [sensor]") if "sensor" in said else None
+    return _checked(lambda: ClosedLoop(plant, controller, oscillation, **wiring, sensor=sensor), str(path))
+
+
+def _sensor(said: Mapping[str, Any], where: str) -> SensorLag:
+    check_known("key", said, ("lag",), where)
+    require("lag" in said, f'{where} says no lag; write lag = "5 ms"')
+    lag = _value(said, "lag", "s", where)
+    return _checked(lambda: SensorLag(lag), where)
 
 
 def _dither(said: Mapping[str, Any], where: str) -> Dither:
@@ -185,7 +194,7 @@ def _dither(said: Mapping[str, Any], where: str) -> Dither:
 
 
 def _parameters(said: Sections, loop: ClosedLoop, path: str | Path) -> ParameterSet:
-    own = loop.parameters.select(n for n in loop.parameters if n.startswith(("pid.", "dither.")))
+    own = loop.parameters.select(n for n in loop.parameters if n.startswith(("pid.", "dither.", "sensor.")))
     form = said["pid"].get("form", "parallel")
     check_known("form", [str(form)], _GAINS, f"{path}: [pid]")
     read = _standard(said["pid"], own, path) if form == "standard" else _entries(said, "pid", own, path)

@@ -34,7 +34,7 @@ from pneuopt.models.friction import LuGre
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 from pneuopt.rig import Recording, Rig, record
 from pneuopt.stick_slip import EventKind
-from pneuopt.system import Rest, System
+from pneuopt.system import System
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,30 +108,17 @@ def tuned(ranges: Mapping[str, tuple[float, float]], start: Mapping[str, float])
     Under dither the loop ends at some instant of an oscillation, and a linearisation there says nothing.
     """
     drive, p = lagging(po.Stribeck())
-    loop = controlled(seen(drive.system(), FILTER + SAMPLE / 2), "seen", dither=bool(start))
-    own = loop.parameters.select(loop.parameters.matching("pid.*", *(["dither.*"] if start else [])))
+    loop = controlled(drive.system(), dither=bool(start))
+    own = loop.parameters.select(loop.parameters.matching("pid.*", "sensor.*", *(["dither.*"] if start else [])))
     given = (p | own).with_values({**HAND, **DAMPER, **start}).with_bounds(ranges).freed(*ranges)
     limits = [] if start else [po.MaxSensitivity(SENSITIVITY)]
     return po.tune(loop, STEPS, given, minimise=po.SettlingTime(BAND), subject_to=limits, method=SEARCH)
 
 
-def seen(plant: System, lag: float) -> System:
-    """The plant with an output "seen" more: its speed behind a lag [s], as an encoder's filter shows it."""
-    sensed = Rig(plant, {"speed": Sensor(lag=lag)}).sensed
-    own = {q.name: replace(q, name="seen") for q in (*sensed.states, *sensed.outputs) if q.name == "sensor.speed"}
-    finder = plant.rest_finder
-    assert finder is not None
-
-    def rest(parameters: po.ParameterSet, outputs: Mapping[str, float]) -> Rest:
-        return finder(parameters, {"speed" if n == "seen" else n: value for n, value in outputs.items()})
-
-    states, outputs = (tuple(own.get(q.name, q) for q in part) for part in (sensed.states, sensed.outputs))
-    return replace(sensed, states=states, outputs=outputs, rest_finder=rest)
-
-
-def controlled(plant: System, measured: str, *, dither: bool) -> po.ClosedLoop:
-    """The sampled loop about it."""
-    return po.ClosedLoop(plant, po.PID(sample_time=SAMPLE), po.Dither(FREQUENCY) if dither else None, measured=measured)
+def controlled(plant: System, *, dither: bool) -> po.ClosedLoop:
+    """The sampled loop about it, as the encoder's filter and differences let it see the speed."""
+    own = po.Dither(FREQUENCY) if dither else None
+    return po.ClosedLoop(plant, po.PID(sample_time=SAMPLE), own, sensor=po.SensorLag(FILTER + SAMPLE / 2))
 
 
 def knobs(found: po.TuningResult) -> dict[str, float]:
@@ -144,7 +131,7 @@ def knobs(found: po.TuningResult) -> dict[str, float]:
 def on_the_rig(values: Mapping[str, float], v: float, before: float | None = None) -> Recording:
     """From rest at mid stroke to a set speed, at once or by way of another."""
     drive, p = lagging(po.Karnopp(po.Stribeck()))
-    loop = controlled(drive.system(), "speed", dither="dither.amplitude" in values)
+    loop = controlled(drive.system(), dither="dither.amplitude" in values)
     rig = Rig(loop, {"position": Sensor(resolution=RESOLUTION)}, Actuator(hysteresis=0.04), Encoder(filter_time=FILTER))
     t = np.arange(round(SECONDS / SAMPLE) + 1) * SAMPLE
     reference = np.where(t < UNTIL, v if before is None else before, v)

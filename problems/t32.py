@@ -27,8 +27,9 @@ import pneuopt as po
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.requirements import Specification, specify
-from pneuopt.tuning.candidates import Simulator, Space, span
+from pneuopt.tuning.candidates import Space, span
 from pneuopt.tuning.screening import merit, screen
+from pneuopt.tuning.simulator import Responses, Simulator
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,17 +68,17 @@ class Counter:
     kept: list[tuple[Array, float, int, float, float]] = field(default_factory=list)
     begun: tuple[float, float] = field(default_factory=lambda: (time.perf_counter(), time.process_time()))
 
-    def values(self, points: Array, spec: Specification) -> list[dict[str, float]]:
-        """As `Simulator.values`; the merit that is kept is always that of the narrow band."""
+    def respond(self, points: Array, band: float) -> Responses:
+        """As `Simulator.respond`; the merit that is kept is always that of the narrow band."""
         if len(self.kept) < len(self.limits) and self.simulations + len(points) > self.limits[len(self.kept)]:
             self.keep()
-        found = self.simulator.values(points, spec)
+        found = self.simulator.respond(points, band)
         self.simulations += len(points)
-        if spec.band == self.spec.band:
-            merits = [merit(v, self.spec, STEP.horizon) for v in found]
+        if band == self.spec.band:
+            merits = merit(found.values, self.spec, STEP.horizon)
             k = int(np.argmin(merits))
             if merits[k] < self.best:
-                self.best, self.point = merits[k], points[k]
+                self.best, self.point = float(merits[k]), points[k]
             self.trace.append((self.simulations, self.best))
         return found
 
@@ -156,7 +157,7 @@ def evolve(counter: Counter, budget: int, seed: int, options: dict[str, Any]) ->
 
     def cost(unit: Array) -> Array:
         points = space.draw(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
-        return np.array([merit(v, counter.spec, STEP.horizon) for v in counter.values(points, counter.spec)])
+        return merit(counter.respond(points, counter.spec.band).values, counter.spec, STEP.horizon)
 
     members = options.get("popsize", 15) * len(space.names)
     settings: dict[str, Any] = {"bounds": [(0.0, 1.0)] * len(space.names), "vectorized": True, "updating": "deferred"}
@@ -166,7 +167,7 @@ def evolve(counter: Counter, budget: int, seed: int, options: dict[str, Any]) ->
 
 
 def certified(loop: po.ClosedLoop, space: Space, point: Array) -> tuple[float, float, float, float]:
-    parameters = space.filled(space.printed(point, DIGITS)[0])
+    parameters = space.filled(space.printed(point, DIGITS))
     found = po.evaluate(loop, STEP, parameters, band=SPEC.band)[STEP.label]
     response = po.respond(loop, STEP, parameters)
     raw = settled(response.t, response["speed"])

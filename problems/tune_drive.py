@@ -5,8 +5,12 @@
 The drive is a 32 mm cylinder of the catalogue (LuGre friction) under a speed PID sampled at 1 kHz. It is tuned for four
 steps at once: small and large, forwards and backwards, from rest and from motion; the controller sees the speed through
 the lag of an encoder (difference over a sample, 5 ms of filter). The rig has what the model leaves out: Karnopp
-friction of the same levels, 0.4 % of hysteresis in the valve, an encoder of 10 um. Its figures are those of the true
-speed.
+friction of the same levels, 0.4 % of hysteresis in the valve, an encoder of 10 um. All figures are those of the true
+speed. What the smooth model does not foretell is the overshoot of a piston that really sticks: on the rig the
+break-away to 0.1 m/s passes it by up to a fifth.
+
+saved_by_dither compares the settling times on the rig; for a step that never settles its horizon stands, so it is a
+lower bound.
 """
 
 import sys
@@ -26,11 +30,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SLOW, FRONT = {"position": 0.05}, {"position": 0.25}  # [m] of 0.3
+HORIZON = 0.6  # [s]
 STEPS = [
-    po.Step(0.10, horizon=0.6, start=SLOW),
-    po.Step(0.25, horizon=0.6, start=SLOW),
-    po.Step(-0.20, horizon=0.6, start=FRONT),
-    po.Step(0.15, initial=0.10, horizon=0.6, start=SLOW),
+    po.Step(0.10, horizon=HORIZON, start=SLOW),
+    po.Step(0.25, horizon=HORIZON, start=SLOW),
+    po.Step(-0.20, horizon=HORIZON, start=FRONT),
+    po.Step(0.15, initial=0.10, horizon=HORIZON, start=SLOW),
 ]
 HAND = {"pid.Kp": 1.0, "pid.Ki": 10.0, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
 RANGES = {
@@ -43,9 +48,9 @@ RANGES = {
 }
 # What `tune` finds on the same drive where the controller sees the true speed at once.
 BLIND = {"pid.Kp": 2.462, "pid.Ki": 86.18, "pid.Kd": 0.0561, "pid.Tf": 0.002714, "dither.offset": -0.08653}
-LIMITS = (po.Overshoot(0.05), po.MaxSensitivity(1.6))
-SMOOTH = {"settling_time": "<= 0.16", "overshoot": "<= 5", "max_sensitivity": "<= 1.6"}
-REAL = {"settling_time": "<= 0.3", "overshoot": "<= 15"}
+LIMITS = (po.Overshoot(0.02), po.MaxSensitivity(1.6))
+SMOOTH = {"settling_time": "<= 0.16", "overshoot": "<= 2", "max_sensitivity": "<= 1.6"}
+REAL = {"settling_time": "<= 0.2", "overshoot": "<= 20"}
 SAMPLE, HYSTERESIS, COUNT, FILTER = 1e-3, 0.04, 1e-5, 5e-3  # [s], [V] of 10 V, [m], [s]
 COLOURS = {"hand": GREY, "pid_only": ORANGE, "tuned": BLUE}
 VALVE: dict[str, Any] = {"pid_only": {"lw": 1.4, "zorder": 3}, "tuned": {"lw": 0.8, "alpha": 0.6}}
@@ -79,16 +84,15 @@ def loops() -> tuple[po.ClosedLoop, po.Rig, po.ParameterSet]:
     """The loop as it is tuned, the rig that it is tried on, the hand tuning with its ranges."""
     drive, hardware = s32()
     pid, dither = po.PID(sample_time=SAMPLE), po.Dither(frequency=100.0)
-    seen = po.Rig(drive.system(), {"speed": po.Sensor(lag=FILTER + SAMPLE / 2)}).sensed
-    loop = po.ClosedLoop(seen, pid, dither, measured="sensor.speed")
+    loop = po.ClosedLoop(drive.system(), pid, dither, sensor=po.SensorLag(FILTER + SAMPLE / 2))
     sticking = replace(drive, friction=po.Karnopp(po.Stribeck()))
     rig = po.Rig(
-        po.ClosedLoop(sticking.system(), pid, dither, measured="speed"),
+        po.ClosedLoop(sticking.system(), pid, dither),
         {"position": po.Sensor(resolution=COUNT)},
         po.Actuator(hysteresis=HYSTERESIS),
         po.Encoder(filter_time=FILTER),
     )
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
+    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*", "sensor.*"))
     return loop, rig, (hardware.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
 
 
@@ -99,7 +103,7 @@ def main(job: Job) -> "pd.DataFrame":
         claims += on_rig(name, job.real[name], REAL if name == "tuned" else {})
     claims += on_rig("blind", job.real["blind"], {})
     claims += [Claim(f"{name}.seconds", value, "s") for name, value in job.seconds.items()]
-    alone, both = (worst(job.real[n], "SettlingTime") for n in ("pid_only", "tuned"))
+    alone, both = (float(np.nan_to_num(worst(job.real[n], "SettlingTime"), nan=HORIZON)) for n in ("pid_only", "tuned"))
     return frame([*claims, Claim("rig.settling_time.saved_by_dither", 1 - both / alone, "1", None, ">= 0.25")])
 
 

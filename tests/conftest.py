@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from pneuopt import codegen, compiler
+from pneuopt import compiler, kernels
 
-CACHES = (compiler.build, compiler.say_once, compiler._compiler_version, compiler._temporary_folder, codegen._prepared)
+CACHES = (compiler.build, compiler.say_once, compiler._compiler_version, compiler._temporary_folder, kernels.prepared)
 
 
 def _forget() -> None:

@@ -1,16 +1,20 @@
 import json
+import math
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
-from pneuopt import commands
 from pneuopt.cli import app
+from pneuopt.commands import identifying, looping
+from pneuopt.console import screen, show_estimates
 from pneuopt.experiments import read_log
 from pneuopt.files import read_drive, read_status
 from pneuopt.models.drive import ForceDrive
@@ -20,6 +24,7 @@ from pneuopt.nlp.status import Code, Status
 from pneuopt.simulate import simulate
 from pneuopt.tomlfile import read_toml
 from pneuopt.trajectories import Trajectory
+from pneuopt.tune import TuningResult, tune
 from pneuopt.tuningfile import read_tuning
 
 TRUTH = {"load.mass": 6.0, "friction.coulomb": 25.0, "friction.viscous": 40.0, "friction.smoothing": 5e-3}
@@ -97,7 +102,45 @@ def test_identify_recovers_what_made_the_logs_and_says_so(folder: Path) -> None:
         assert row["name"] in result.stdout
     assert "# weighed" in Path("fit.toml").read_text(encoding="utf-8")
     assert Path("fit.png").stat().st_size > 10_000
-    assert Path("fit_friction.png").stat().st_size > 10_000
+    for name in ("friction", "residuals", "correlation"):
+        assert Path(f"fit_{name}.png").stat().st_size > 10_000
+    assert said["verdict"] == {"sentences": [], "untold": [], "table": said["verdict"]["table"]}
+
+
+def test_a_friction_model_is_chosen_and_explained(folder: Path) -> None:
+    result = run("identify drive.toml run_01.csv --select --json chosen.json")
+    assert result.exit_code == 0, result.stderr
+    said = json.loads(Path("chosen.json").read_text(encoding="utf-8"))
+    assert said["recommended"] == "coulomb"
+    assert result.stdout.startswith(said["reason"])
+    assert {row["name"] for row in said["candidates"]} >= {"viscous", "coulomb", "stribeck", "lugre"}
+    refused = run("identify drive.toml run_01.csv --select -o fit.toml")
+    assert refused.exit_code == 2
+    assert "--select writes neither -o nor --plot" in refused.stderr
+
+
+def test_what_a_log_does_not_tell_is_said_before_and_after(folder: Path) -> None:
+    """A drive that moves one way at one speed: no slope, no curve."""
+    t = np.arange(0, 1.0, 2e-3)
+    position = 50 * t + 0.02 * np.random.default_rng(0).standard_normal(len(t))
+    rows = [f"{a:.4f},30,{b:.5f}" for a, b in zip(t, position, strict=True)]
+    Path("steady.csv").write_text("\n".join(["time [s],force [N],position [mm]", *rows]) + "\n", encoding="utf-8")
+    result = run("identify drive.toml steady.csv --json fit.json")
+    assert "warning: before the fit: the logs do not tell" in result.stderr
+    assert "friction.viscous: nearly all speeds lie between" in result.stderr.replace("\n", " ")
+    said = json.loads(Path("fit.json").read_text(encoding="utf-8"))
+    assert said["verdict"]["sentences"]
+    assert "friction.viscous" in result.stdout
+
+
+def test_open_ends_and_what_is_not_told_are_no_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    ends = {"a.open": (2.0, math.nan, 1.5, math.inf, ""), "b.blind": (7.0, math.nan, -math.inf, math.inf, "not told")}
+    columns = ["value", "stderr", "ci_low", "ci_high", "note"]
+    table = pd.DataFrame.from_dict(ends, orient="index", columns=columns).assign(unit="N")
+    show_estimates(screen(), table)
+    first, second = capsys.readouterr().out.splitlines()[-3:-1]
+    assert first.split() == ["a.open", "2", "above", "1.5", "N"]
+    assert second.split() == ["b.blind", "-", "not", "determined", "N", "not", "told"]
 
 
 def test_many_windows_are_shown_in_short(folder: Path) -> None:
@@ -298,7 +341,7 @@ def test_an_interrupted_fit_is_written_and_marked(folder: Path, monkeypatch: pyt
 
         return LeastSquares(progress=stop)
 
-    monkeypatch.setattr(commands, "LeastSquares", interrupting)
+    monkeypatch.setattr(identifying, "LeastSquares", interrupting)
     result = run("identify drive.toml run_01.csv -o fit.toml")
     assert result.exit_code == 130
     assert result.stdout.startswith("NOT converged (interrupted): the best iterate so far")
@@ -313,7 +356,7 @@ def test_an_interruption_elsewhere_writes_nothing(folder: Path, monkeypatch: pyt
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "tune", interrupt)
+    monkeypatch.setattr(looping, "tune", interrupt)
     before = set(folder.iterdir())
     result = run("tune drive.toml tuning.toml -o tuned.toml")
     assert result.exit_code == 130
@@ -321,9 +364,29 @@ def test_an_interruption_elsewhere_writes_nothing(folder: Path, monkeypatch: pyt
     assert set(folder.iterdir()) == before
 
 
+def test_an_interrupted_tuning_shows_the_best_so_far_and_writes_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*args: Any, **options: Any) -> TuningResult:
+        def stop(line: str) -> None:
+            if "generation 3" in line:
+                raise KeyboardInterrupt
+
+        return tune(*args, **(options | {"progress": stop}))
+
+    monkeypatch.setattr(looping, "tune", stopped)
+    before = set(folder.iterdir())
+    result = run("tune drive.toml tuning.toml -o tuned.toml --json tuned.json")
+    assert result.exit_code == 130
+    assert result.stdout.startswith("NOT converged (interrupted): the best of 160 simulations so far ")
+    assert "the gains of tuning.toml stand; best so far: pid.Kp " in result.stdout
+    assert result.stdout.endswith("no file is written\n")
+    assert set(folder.iterdir()) == before
+
+
 def test_a_fit_that_fails_is_written_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = LeastSquares().stages[:1]
-    monkeypatch.setattr(commands, "LeastSquares", lambda **_: LeastSquares(stages=few, tolerance=1e-9))
+    monkeypatch.setattr(identifying, "LeastSquares", lambda **_: LeastSquares(stages=few, tolerance=1e-9))
     result = run("identify drive.toml run_01.csv -o fit.toml")
     assert result.exit_code == 1
     assert result.stdout.startswith("NOT converged")
@@ -357,8 +420,8 @@ def test_help_loads_nothing_heavy() -> None:
 def test_ctrl_c_ends_a_real_process_with_130(folder: Path) -> None:
     code = (
         "import os, signal\n"
-        "from pneuopt import commands\n"
-        "commands.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
+        "from pneuopt.commands import looping\n"
+        "looping.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
         "from pneuopt.cli import main\n"
         "main()\n"
     )

@@ -269,3 +269,33 @@ def test_results_are_the_callers_own() -> None:
 def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers() -> None:
     with pytest.raises(ModelError, match="argument 2 has 2 numbers, expected 3"):
         compiled(mixed())(1.0, np.ones((2, 3)), np.ones(2))
+
+
+@pytest.mark.parametrize("lanes", [pytest.param(None, marks=needs_compiler), 0])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_gram_is_that_of_the_run_s_residuals(name: str, lanes: int | None) -> None:
+    """Summed up on the way, it equals what the stored derivatives give; a missing sample counts nothing."""
+    case = Case(name)
+    rollout = Rollout(case.system.pieces, (0, 1), start=True, threads=2, lanes=lanes)
+    run = case.run(rollout)
+    rng = np.random.default_rng(5)
+    measured = run.y + rng.standard_normal(run.y.shape)
+    measured[0, 1] = measured[1, 4:] = np.nan
+    weight = 1 + rng.random(measured.shape)
+    found = rollout.gram(case.x0, case.u, case.p, case.t, case.h, measured, weight, substeps=case.system.substeps)
+    assert run.dy is not None
+    e = np.concatenate([run.dy, (run.y - measured)[..., None]], axis=-1) * weight[..., None]
+    e = np.where(np.isfinite(measured)[..., None], e, 0.0).reshape(len(e), -1, e.shape[-1])
+    assert_allclose(found.grams, np.swapaxes(e, 1, 2) @ e, rtol=1e-9, atol=1e-9 * np.abs(e).max() ** 2)
+    assert_allclose(found.squares.sum(axis=1), found.grams[:, -1, -1], rtol=1e-12)
+    assert_allclose(found.y, run.y, rtol=1e-12)
+    assert_allclose(found.x_end, run.x_end, rtol=1e-12)
+    assert run.dx_end is not None
+    assert_allclose(found.dx_end, run.dx_end, rtol=1e-12)
+
+
+def test_residuals_of_another_shape_are_refused() -> None:
+    case = Case("stribeck")
+    wrong = np.zeros((5, 6, 1))
+    with pytest.raises(ModelError, match=r"measured: \(5, 6, 1\), expected \(5, 6, 2\)"):
+        case.rollout((0,)).gram(case.x0, case.u, case.p, case.t, case.h, wrong, wrong)

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
-from pneuopt import commands
 from pneuopt.cli import app
+from pneuopt.commands import studying
 from pneuopt.study import sweep
 
 DRIVE = """
@@ -60,7 +60,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     with ThreadPoolExecutor(1) as executor:
-        monkeypatch.setattr(commands, "sweep", partial(sweep, executor=executor))
+        monkeypatch.setattr(studying, "sweep", partial(sweep, executor=executor))
         yield tmp_path
 
 
@@ -140,7 +140,7 @@ def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pyte
 
     with ThreadPoolExecutor(1) as executor:
         interrupted = partial(sweep, executor=executor)
-        monkeypatch.setattr(commands, "sweep", lambda *a, **k: interrupted(*a, **{**k, "progress": interrupt}))
+        monkeypatch.setattr(studying, "sweep", lambda *a, **k: interrupted(*a, **{**k, "progress": interrupt}))
         result = run(LINE)
     assert result.exit_code == 130
     assert result.stdout.startswith("4 cases, each the worst of 2 references: 3 interrupted")
@@ -150,7 +150,7 @@ def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pyte
 
 def test_processes_do_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run("study study.toml -o threads.csv")
-    monkeypatch.setattr(commands, "sweep", sweep)
+    monkeypatch.setattr(studying, "sweep", sweep)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     assert run("study study.toml -o processes.csv").exit_code == 0
     one, other = (pd.read_csv(f"{name}.csv").drop(columns="seconds [s]") for name in ("threads", "processes"))

@@ -280,14 +280,14 @@ def test_an_interruption_keeps_the_best_iterate() -> None:
 
     def progress(line: str) -> None:
         seen.append(line)
-        if len(seen) == 14:
+        if len(seen) == 7:
             raise KeyboardInterrupt
 
     free = ForceDrive(Coulomb()).parameters.freed(*FREE)
     method = LeastSquares(progress=progress)
     result = identify(ForceDrive(Coulomb()).system(), [pushed(Coulomb())], free, method=method, throw=False)
     assert result.status.code is Code.INTERRUPTED
-    assert len(seen) == 14
+    assert len(seen) == 7
     assert result.estimates["value"]["friction.coulomb"] == pytest.approx(30, rel=0.05)
     seen.clear()
     with pytest.raises(ConvergenceError, match="interrupted"):
@@ -345,6 +345,17 @@ def test_a_held_out_run_is_predicted() -> None:
     assert read(wrong, ("run 7", "position"), "rmse") > 100 * NOISE["position"]
     run = predict(ForceDrive(Stribeck()).system(), held_out, fit.parameters)
     assert len(run) == len(held_out.trajectory)
+
+
+def test_validation_says_what_is_left_in_the_residuals() -> None:
+    log, system = pushed(Coulomb(), "position", seed=3, seconds=0.5), ForceDrive(Coulomb()).system()
+    good = validate(system, [log], known(Coulomb())).iloc[0]
+    assert good["whiteness_p"] > 0.001
+    assert good["correlation[force]"] < 4
+    assert 0 <= good["lag[force]"] <= 20
+    heavier = validate(system, [log], known(Coulomb()).with_values({"load.mass": 3.3})).iloc[0]
+    assert heavier["whiteness_p"] < 1e-6
+    assert heavier["correlation[force]"] > 5
 
 
 def test_validation_reads_conditions_and_defaults() -> None:

@@ -1,6 +1,6 @@
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,10 +21,12 @@ from pneuopt.plotting import (
     Response,
     has_friction_map,
     plot_bode,
+    plot_correlation,
     plot_fit,
     plot_friction,
     plot_map,
     plot_prediction,
+    plot_residuals,
     plot_steps,
     save_figure,
 )
@@ -42,10 +44,21 @@ TRUTH = DRIVE.parameters.with_values(
 TRIPLE = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])
 
 
+def table(covariance: Mapping[str, float]) -> pd.DataFrame:
+    """Uncorrelated estimates of these variances."""
+    return pd.DataFrame(np.diag(list(covariance.values())), index=list(covariance), columns=list(covariance))
+
+
 @dataclass(frozen=True)
 class Fit:
     parameters: ParameterSet
     trajectories: Mapping[str, Trajectory]
+    covariance: pd.DataFrame = field(default_factory=lambda: table({}))
+
+    @property
+    def estimates(self) -> pd.DataFrame:
+        values = [self.parameters.value(str(n)) for n in self.covariance.index]
+        return pd.DataFrame({"value": values}, index=self.covariance.index, dtype=float)
 
 
 def fitted(seed: int = 0) -> tuple[Experiment, Trajectory]:
@@ -109,6 +122,55 @@ def test_the_friction_map_is_that_of_the_equations() -> None:
     assert np.median(error) < 0.7
     assert error.max() < 5.0
     assert texts(figure.axes[0]) == "speed [m/s]|friction force [N]|"
+
+
+def test_the_friction_maps_band_is_that_of_the_estimates() -> None:
+    experiment, run = fitted()
+    result = Fit(TRUTH, {"run_0": run}, table({"friction.coulomb": 4.0, "friction.viscous": 25.0}))
+    axes = plot_friction(DRIVE.system(), result, [experiment]).axes[0]
+    (band,) = axes.collections
+    speed, force = line(axes, "fitted")
+    edges = np.asarray(band.get_paths()[0].vertices, dtype=float)
+    for v in (speed[5], speed[-5]):
+        at = edges[np.isclose(edges[:, 0], v)][:, 1]
+        spread = np.sqrt(4.0 * np.tanh(v / TRUTH.value("friction.smoothing")) ** 2 + 25.0 * v**2)
+        assert at.max() - at.min() == pytest.approx(2 * 1.96 * spread, rel=1e-3)
+    assert np.isfinite(force).all()
+    blind = Fit(TRUTH, {"run_0": run}, table({"friction.coulomb": np.nan, "friction.viscous": 25.0}))
+    assert len(plot_friction(DRIVE.system(), blind, [experiment]).axes[0].collections) == 0
+
+
+def test_residuals_show_what_is_left_in_them() -> None:
+    experiment, run = fitted()
+    rng = np.random.default_rng(0)
+    white = 1e-5 * rng.standard_normal(len(run))
+    noisy = Experiment(run.with_columns({"force": experiment.trajectory["force"]}), {"position": 1e-5}, name="run")
+    good = Experiment(noisy.trajectory.with_columns({"position": run["position"] + white}), {"position": 1e-5})
+    pulled = run["position"] + white + 2e-7 * experiment.trajectory["force"]
+    bad = Experiment(noisy.trajectory.with_columns({"position": pulled}), {"position": 1e-5})
+    for log, expected in ((good.select(["force", "position"]), False), (bad.select(["force", "position"]), True)):
+        over_time, own, crossed, spread = plot_residuals([run], [log]).axes
+        assert texts(over_time) == "time [s]|position [mm]|residuals"
+        assert texts(own).startswith("lag [samples]||autocorrelation")
+        rho = np.asarray(line(crossed, "force")[1])
+        band = 1.96 / np.sqrt(len(run))
+        assert bool(np.abs(rho).max() > 2 * band) is expected
+        (told,) = own.texts
+        assert told.get_text().startswith("Ljung-Box p")
+        assert ("< 1e-4" in told.get_text()) is expected
+        assert spread.get_ylabel() == "residual / noise"
+    with pytest.raises(InputError, match="1 runs do not match 2 experiments"):
+        plot_residuals([run], [good, bad])
+
+
+def test_correlations_are_cells_and_never_a_rounded_one() -> None:
+    names = ["load.force", "friction.coulomb_asymmetry", "load.mass"]
+    covariance = pd.DataFrame([[1, 0.99998, 0], [0.99998, 1, 0], [0, 0, np.nan]], index=names, columns=names)
+    axes = plot_correlation(Fit(TRUTH, {}, covariance)).axes[0]
+    assert [q.get_text() for q in axes.get_xticklabels()] == names[:2]
+    assert sorted(q.get_text() for q in axes.texts) == ["0.9999", "0.9999", "1.00", "1.00"]
+    with pytest.raises(InputError, match="no estimate has a standard deviation"):
+        plot_correlation(Fit(TRUTH, {}, covariance * np.nan))
 
 
 def test_a_rig_shows_its_measured_force() -> None:

@@ -157,18 +157,6 @@ def test_what_is_logged_and_what_is_true() -> None:
     assert run.experiment.noise["position"] == pytest.approx(np.hypot(1e-6, 1e-5 / np.sqrt(12)))
 
 
-def test_a_loop_may_see_what_the_sensors_show() -> None:
-    """For tuning: the sensed plant knows its rest and its steady motion, every sensor at the truth."""
-    rig = Rig(PneumaticDrive().system(), {"speed": Sensor(lag=5e-3), "pressure_a": Sensor(lag=1e-3)})
-    loop = ClosedLoop(rig.sensed, PID(sample_time=1e-3), measured="sensor.speed")
-    x = loop.initial(loop.parameters, reference=0.2, start={"position": 0.05})
-    state = dict(zip([q.name for q in loop.states], x, strict=True))
-    assert state["sensor.speed"] == state["speed"] == 0.2
-    assert state["sensor.pressure_a"] == state["pressure_a"] > 3e5
-    assert state["position"] == 0.05
-    assert rig.sensed.guards == rig.plant.guards != ()
-
-
 def test_a_coarse_encoder_roughens_a_loop_that_is_smooth_on_paper() -> None:
     """The mismatch that a rig is for: at 50 mm/s, counts of 0.1 um leave 0.5 mm/s of ripple, of 0.1 mm 34 mm/s."""
     loop, p = drive_loop(Karnopp(Stribeck()), Kp=1500.0, Ki=3e4)

@@ -23,13 +23,13 @@ from pneuopt.requirements import (
     PeakControl,
     Requirement,
     SettlingTime,
-    Specification,
     SteadyStateError,
     specify,
 )
 from pneuopt.tune import TuningResult, tune
-from pneuopt.tuning.candidates import Simulator, span
+from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import Screening, _Judge, screen
+from pneuopt.tuning.simulator import Responses, Simulator
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
 
 STEP = Step(1.0)
@@ -279,20 +279,105 @@ def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
     space, references = span(loop, parameters), [Step(0.1, horizon=0.3)]
     spec = specify(SettlingTime(), [Overshoot(0.05), MaxSensitivity(1.3)])
     simulator, judged = Simulator(loop, references, space), list[int]()
+    robust = Responses.robust
 
-    class Counting:
-        def values(self, points: np.ndarray, asked: Specification) -> list[dict[str, float]]:
-            judged.append(len(points) * asked.concerns(MaxSensitivity))
-            return simulator.values(points, asked)
+    def counting(responses: Responses, rows: np.ndarray) -> dict[str, np.ndarray]:
+        judged.append(int(rows.sum()))
+        return robust(responses, rows)
 
     method = Screening(members=12, generations=3, refinements=0)
-    found, count = screen(Counting(), references, space, spec, method, space.start, lambda _: None)  # type: ignore[arg-type]
-    assert count == 12 * 4 * 4
-    assert sum(judged) < 0.7 * count
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Responses, "robust", counting)
+        found = screen(simulator, references, space, spec, method, space.start, lambda _: None)
+    assert found.is_complete
+    assert found.count == 12 * 4 * 4
+    assert sum(judged) < 0.7 * found.count
 
-    def plainly(judge: _Judge, unit: np.ndarray, rivals: np.ndarray) -> np.ndarray:
+    def plainly(judge: _Judge, unit: np.ndarray, _: np.ndarray) -> np.ndarray:
         return judge(unit)
 
     with pytest.MonkeyPatch.context() as patch:
+        race = _Judge.race
+        patch.setattr(_Judge, "__call__", lambda judge, unit: race(judge, unit, np.full(len(unit), np.inf)))
         patch.setattr(_Judge, "race", plainly)
-        assert np.array_equal(found, screen(simulator, references, space, spec, method, space.start, lambda _: None)[0])
+        plain = screen(simulator, references, space, spec, method, space.start, lambda _: None)
+    assert np.array_equal(found.point, plain.point)
+
+
+def test_references_run_together_or_alone_alike() -> None:
+    """Few candidates share the lanes across references, the shorter padded; it changes nothing."""
+    loop, parameters = friction_loop()
+    space, references = span(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, horizon=0.2)]
+    simulator, spec = Simulator(loop, references, space), specify(SettlingTime(), [MaxSensitivity(1.5)])
+    points = space.draw(np.random.default_rng(3).random((9, 4)))
+    many = simulator.values(points, spec)
+    for k, point in enumerate(points):
+        for name, value in simulator.values(point[None], spec).items():
+            assert value[0] == pytest.approx(many[name][k], rel=1e-9, nan_ok=True), name
+    assert many["SettlingTime"].shape == (9,)
+
+
+def test_the_search_reads_what_the_certificate_reads() -> None:
+    loop, parameters = friction_loop()
+    space, steps = span(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, at=0.05, horizon=0.3)]
+    points = space.draw(np.random.default_rng(4).random((4, 4)))
+    found = Simulator(loop, steps, space).respond(points, 0.02)
+    for k, point in enumerate(points):
+        proof = evaluate(loop, steps, space.filled(point))
+        for step, measured in zip(steps, found.references, strict=True):
+            for name in ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl"):
+                ours, theirs = measured.metrics[name][k], proof[step.label][name]
+                assert ours == pytest.approx(theirs, rel=2e-2, abs=2e-3, nan_ok=True), (name, step)
+
+
+def test_printed_gains_come_first_and_neighbours_differ_in_one_last_place() -> None:
+    loop, parameters = friction_loop()
+    space = span(loop, parameters)
+    printed = space.printed(np.array([123.456, 9999.96, 0.0, -12.3456]), 4)
+    assert printed.tolist() == [123.5, 10000.0, 0.0, -12.35]
+    near = space.neighbours(np.array([123.5, 10000.0, 0.0, -12.35]), 4)
+    assert near.tolist() == [
+        [123.4, 10000.0, 0.0, -12.35],
+        [123.6, 10000.0, 0.0, -12.35],
+        [123.5, 9990.0, 0.0, -12.35],
+        [123.5, 10000.0, 0.0, -12.36],
+        [123.5, 10000.0, 0.0, -12.34],
+    ]
+
+
+def interrupted(after: int) -> TuningResult:
+    loop, parameters = friction_loop()
+    seen = list[str]()
+
+    def stop(line: str) -> None:
+        seen.append(line)
+        if len(seen) == after:
+            raise KeyboardInterrupt
+
+    return tune(
+        loop,
+        Step(0.1, horizon=0.5),
+        parameters,
+        minimise=SettlingTime(),
+        subject_to=[Overshoot(0.05)],
+        method=Screening(members=20, generations=4, refinements=60),
+        throw=False,
+        progress=stop,
+    )
+
+
+def test_ctrl_c_keeps_the_given_gains_and_shows_the_best_so_far_certified() -> None:
+    _, given = friction_loop()
+    result = interrupted(after=15)
+    assert result.status.code is Code.INTERRUPTED
+    assert result.status.message.startswith("the best of 380 simulations so far holds: certified objective 0.0")
+    assert {n: p.value for n, p in result.parameters.items()} == {n: p.value for n, p in given.items()}
+    assert result.certified["0 to 0.1"]["SettlingTime"] < 0.1
+    assert result.stats["rejected.pid.Kp"] != given.value("pid.Kp")
+
+
+def test_ctrl_c_at_once_says_that_nothing_was_found() -> None:
+    result = interrupted(after=1)
+    assert result.status.code is Code.INTERRUPTED
+    assert result.status.message.startswith("the best of 40 simulations so far ")
+    assert result.status.message.endswith("run again for an answer")

@@ -274,3 +274,29 @@ def test_any_gains_read_back(tmp_path_factory: pytest.TempPathFactory, Kp: float
     assert again.free_names == found.free_names
     for name, parameter in found.items():
         assert again.value(name) == pytest.approx(parameter.value, rel=1e-8)
+
+
+def test_a_sensor_lags_what_the_controller_sees(tmp_path: Path) -> None:
+    path = tmp_path / "tuning.toml"
+    path.write_text(TUNING + '[sensor]\nlag = "5.5 ms"   # of the encoder\n', encoding="utf-8")
+    tuning = read_tuning(path, PLANT)
+    assert tuning.parameters.value("sensor.lag") == pytest.approx(5.5e-3)
+    assert [q.name for q in tuning.loop.states if q.name.startswith("sensor.")] == ["sensor.reading"]
+    assert tuning.loop.feedback.name == "speed"
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("[sensor]\n", r'\[sensor\] says no lag; write lag = "5 ms"'),
+        ('[sensor]\nlag = "0 ms"\n', r"\[sensor\]: SensorLag: lag must be at least"),
+        ('[sensor]\nlag = "5 mm"\n', r"\[sensor\] lag"),
+        ('[sensor]\ndelay = "5 ms"\n', r"\[sensor\].*delay"),
+        ('[sensor]\nlag = { value = "5 ms", free = true }\n', r"\[sensor\] lag"),
+    ],
+)
+def test_a_bad_sensor_is_refused(tmp_path: Path, section: str, message: str) -> None:
+    path = tmp_path / "tuning.toml"
+    path.write_text(TUNING + section, encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        read_tuning(path, PLANT)

@@ -1,7 +1,7 @@
 """`ClosedLoop`: a plant, a PID and a dither, as a `System` or a `DiscreteSystem` for the solvers.
 
-Where the parts meet: the reference r and the measured output y enter the PID, dither is added to its command, the sum
-is clipped, and the result, the output "control", drives the plant's actuated input.
+Where the parts meet: the reference r and the measured output y, or what a lagging sensor shows of it, enter the PID,
+dither is added to its command, the sum is clipped, and the result, the output "control", drives the actuated input.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pneuopt.control.dither import Dither
 from pneuopt.control.pid import PID
 from pneuopt.control.rest import find_rest, sliding, wired
+from pneuopt.control.sensor import SensorLag
 from pneuopt.errors import ModelError, check_known, require
 from pneuopt.parameters import ParameterSet, Quantity
 from pneuopt.system import (
@@ -32,6 +33,7 @@ from pneuopt.system import (
 
 Array = NDArray[np.float64]
 Signals = dict[str, ca.SX]
+READING = "sensor.reading"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,8 @@ class ClosedLoop:
         The plant's input that the controller drives; by default its only one. Others stay inputs of the loop.
     measured : str, optional
         The plant's output that is fed back; by default "speed", or the only one.
+    sensor : SensorLag, optional
+        Through which the controller sees it. What the loop is judged by is the output itself.
 
     Raises
     ------
@@ -62,12 +66,16 @@ class ClosedLoop:
     dither: Dither | None = None
     actuated: str | None = None
     measured: str | None = None
+    sensor: SensorLag | None = None
 
     def __post_init__(self) -> None:
-        _check_lag(self)
+        if self.sensor is None:
+            _check_lag(self)
         reserved = {"reference": names(self.plant.inputs), "control": names(self.plant.outputs)}
         for name, taken in reserved.items():
             require(name not in taken, f"the plant has a signal {name!r} of its own; rename it", ModelError)
+        doubled = self.sensor is not None and "sensor.lag" in self.plant.parameters
+        require(not doubled, "the plant has a sensor.lag of its own; leave sensor= out", ModelError)
         _ = self.parameters
 
     def __repr__(self) -> str:
@@ -86,17 +94,19 @@ class ClosedLoop:
 
     @cached_property
     def parameters(self) -> ParameterSet:
-        """Those of the plant, "pid.*" and "dither.*", with their defaults."""
+        """Those of the plant, "pid.*", "dither.*" and "sensor.lag", with their defaults."""
         h, unit = self.pid.sample_time, self.command.unit
         dither = self.dither.parameters(unit, h) if self.dither else ParameterSet()
         pid = self.pid.parameters(self.feedback.unit, unit)
-        return self.plant.parameters | pid.prefixed("pid") | dither.prefixed("dither")
+        sensor = self.sensor.parameters() if self.sensor else ParameterSet()
+        return self.plant.parameters | pid.prefixed("pid") | dither.prefixed("dither") | sensor.prefixed("sensor")
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """The plant's, then the controller's ("pid.*")."""
+        """The plant's, a lagging sensor's "sensor.reading", then the controller's ("pid.*")."""
         own = self.pid.states(self.feedback, self.command)
-        return self.plant.states + tuple(replace(q, name=f"pid.{q.name}") for q in own)
+        reading = (replace(self.feedback, name=READING),) if self.sensor else ()
+        return (*self.plant.states, *reading, *(replace(q, name=f"pid.{q.name}") for q in own))
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
@@ -236,12 +246,12 @@ class ClosedLoop:
         error = value["pid.c"] * reference - y
         integral = command - value["pid.Kp"] * (value["pid.b"] * reference - y)
         own = [integral, error] if self.pid.sample_time is None else [integral, 0.0, error, command]
-        return np.concatenate([x, own])
+        return np.concatenate([x, [y] if self.sensor else [], own])
 
     def linear_plant(
         self, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
     ) -> Linearisation:
-        """The plant from command to measured output, linearised.
+        """The plant from command to measured output, or to what its sensor shows, linearised.
 
         Parameters
         ----------
@@ -258,15 +268,14 @@ class ClosedLoop:
             u = {self.command.name: command, **(u or {})}
         plant = self.plant.linearise(x, u or {}, parameters)
         j, i = plant.inputs.index(self.command.name), plant.outputs.index(self.feedback.name)
-        return Linearisation(
-            plant.A,
-            plant.B[:, j : j + 1],
-            plant.C[i : i + 1],
-            plant.D[i : i + 1, j : j + 1],
-            plant.states,
-            (self.command.name,),
-            (self.feedback.name,),
-        )
+        A, B, C, D = plant.A, plant.B[:, j : j + 1], plant.C[i : i + 1], plant.D[i : i + 1, j : j + 1]
+        states = plant.states
+        if self.sensor is not None:
+            rate, n = 1 / (self.parameters | parameters).value("sensor.lag"), len(A)
+            A = np.block([[A, np.zeros((n, 1))], [rate * C, np.array([[-rate]])]])
+            B, C, D = np.vstack([B, rate * D]), np.eye(1, n + 1, n), np.zeros((1, 1))
+            states = (*states, READING)
+        return Linearisation(A, B, C, D, states, (self.command.name,), (self.feedback.name,))
 
     def open_loop(
         self, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
@@ -312,14 +321,16 @@ class ClosedLoop:
             _part("pid", x), u["reference"], self._measured(t, x, u, p), self._dither(t, p), _part("pid", p)
         )
         xdot, y = self._plant(t, x, u, p, command)
-        return xdot | {f"pid.{n}": rate for n, rate in rates.items()}, y | {"control": command}
+        own = {f"pid.{n}": rate for n, rate in rates.items()} | self._sensing(x, y, p)
+        return xdot | own, y | {"control": command}
 
     def _between(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         command = x["pid.command"]
         if self.dither and self.dither.analogue:
             command = self.pid.clip(command + self.dither.sine(t, _part("dither", p)), _part("pid", p))
         xdot, y = self._plant(t, x, u, p, command)
-        return xdot | {n: ca.SX(0) for n in x if n.startswith("pid.")}, y | {"control": command}
+        own = {n: ca.SX(0) for n in x if n.startswith("pid.")} | self._sensing(x, y, p)
+        return xdot | own, y | {"control": command}
 
     def _dither(self, t: ca.SX, p: Symbols) -> ca.SX:
         """What the controller itself adds."""
@@ -329,7 +340,14 @@ class ClosedLoop:
         sampled_apart = self.dither.analogue and self.pid.sample_time is not None
         return own["offset"] if sampled_apart else own["offset"] + self.dither.sine(t, own)
 
+    def _sensing(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
+        return {READING: (y[self.feedback.name] - x[READING]) / p["sensor.lag"]} if self.sensor else {}
+
     def _measured(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
+        """What the controller sees."""
+        return x[READING] if self.sensor else self._true(t, x, u, p)
+
+    def _true(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
         return self._plant(t, x, u, p, ca.SX(0))[1][self.feedback.name]
 
     def _plant(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
@@ -339,7 +357,7 @@ class ClosedLoop:
     def _measure(self) -> ca.Function:
         t, x, u = ca.SX.sym("t"), symbols(self.plant.states), {q.name: ca.SX(0) for q in self.plant.inputs}
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        return ca.Function("measure", [t, stacked(x), stacked(p)], [self._measured(t, x, u, p)])
+        return ca.Function("measure", [t, stacked(x), stacked(p)], [self._true(t, x, u, p)])
 
 
 def _chosen(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:

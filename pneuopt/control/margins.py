@@ -211,6 +211,8 @@ def sensitivities(loop: ClosedLoop, omega: ArrayLike) -> Callable[[Array, Array,
         found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
         A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
         P = (_responses(A, B, C, w) + D) * _hold(w, h)
+        if loop.sensor is not None:
+            P = P / (1 + 1j * w * p[:, [position["sensor.lag"]]])
         a, b = _controller((p[:, [k]] for k in gains), w)
         return np.asarray(1 / np.abs(1 + P * (a + 1j * b)).min(axis=1))
 

@@ -27,7 +27,10 @@ STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recip
 RIDGE = 1e-2  # on columns of unit length: sliding one way only, Coulomb friction and a constant force are one
 LEAST_EXCESS = 0.03  # of static friction over Coulomb's, as a fraction of it (step 2)
 JUDGED = 2000  # samples of a log, about, by which a valve is judged
+PRESLIDING = 3.0  # bristle deflections since the last reversal, within which bristles still bend
 SLOW_SPEED = 1e-2  # [m/s] below it friction comes near its static level, and bristles still bend
+STATIC_LEVEL = 0.995  # quantile of the force in slow samples that counts as static friction (step 2)
+STATIC_WEIGHT = 0.003  # squared weight of that, in sliding samples (step 2)
 
 
 def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -115,12 +118,12 @@ def candidates(logs: Mapping[str, Rows]) -> Sequence[Start]:
     for velocity in dict.fromkeys(tried) if searched else (given,):
         values, _ = _regress(logs, parameters, velocity)
         own = {n: rows.parameters for n, rows in logs.items()}
-        if searched:
-            values |= named("friction.stribeck_velocity", velocity, own)
+        guess = named("friction.stribeck_velocity", velocity, own) if searched else {}
+        values |= guess
         label = f"stribeck velocity {velocity:g} m/s" if searched else "equation error"
         bristles = _bristles(logs, values)
         states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
-        starts.append(Start(states, values, label))
+        starts.append(Start(states, values, label, tuple(guess)))
     return starts
 
 
@@ -164,12 +167,20 @@ def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float
     known = np.isfinite(y)
     speed = np.abs(np.concatenate([rows.speed for rows in logs.values()]))
     sliding = known & (speed > SLIDING_SPEED)
+    if "friction.bristle_stiffness" in parameters and sliding.any():
+        level, travelled = float(np.median(np.abs(y[sliding]))), [_travelled(part) for part in logs.values()]
+        pull = {name: force for name, (_, force) in zip(logs, parts, strict=True)}
+        stiffness = np.clip(_presliding_slope(logs, pull, 0.6 * level), *STIFFNESS_RANGE)
+        sliding &= np.concatenate(travelled) > PRESLIDING * level / stiffness
     rows = sliding if np.count_nonzero(sliding) > 10 * len(free) else known
     if not free:
         return {}, y[rows]
     bases = {n: parameters[n.split("[")[0]] for n in free}
     lower, upper = _bounds(bases, float(np.median(np.abs(y[rows]))))
-    x = _robust(A[rows], y[rows], lower, upper)
+    weight = math.sqrt(STATIC_WEIGHT * np.count_nonzero(rows))
+    stuck = [(_vector(columns, free), level) for columns, level in _static_levels(logs, velocity)]
+    given = np.array([row for row, _ in stuck]).reshape(-1, len(free)), np.array([level for _, level in stuck])
+    x = _robust(A[rows], y[rows], lower, upper, (weight * given[0], weight * given[1]))
     values = dict(zip(free, x.tolist(), strict=True))
     for name in [n for n in free if n.startswith("friction.static")]:
         own = name.replace("static", "coulomb")
@@ -178,10 +189,27 @@ def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float
     return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}, y[rows] - A[rows] @ x
 
 
-def _log_columns(name: str, rows: Rows, velocity: float) -> tuple[dict[str, Array], Array]:
-    """A log's free columns ("name[log]" if its own), and its force less what is known."""
+def _vector(columns: Mapping[str, float], free: Sequence[str]) -> Array:
+    return np.array([columns.get(n, 0.0) for n in free])
+
+
+def _static_levels(logs: Mapping[str, Rows], velocity: float) -> list[tuple[dict[str, float], float]]:
+    """For each log a slow sample in which friction is about to give way: it is static there, whatever the speed."""
+    out = []
+    for name, rows in logs.items():
+        _, pull = _log_columns(name, rows, velocity)
+        slow = np.flatnonzero((np.abs(rows.speed) < SLOW_SPEED) & np.isfinite(pull))
+        columns, level = _log_columns(name, rows, velocity, np.sign(pull))
+        if slow.size and any(n.startswith("friction.static") for n in columns):
+            at = slow[np.argsort(np.abs(level[slow]))[math.ceil(STATIC_LEVEL * (slow.size - 1))]]
+            out.append(({n: float(c[at]) for n, c in columns.items()}, float(level[at])))
+    return out
+
+
+def _log_columns(name: str, rows: Rows, velocity: float, stuck: Array | None = None) -> tuple[dict[str, Array], Array]:
+    """A log's free columns ("name[log]" if its own), and its force less what is known; `stuck`: see below."""
     p = rows.parameters
-    columns = {n: c for n, c in {**rows.columns, **_friction_columns(rows, velocity)}.items() if n in p}
+    columns = {n: c for n, c in {**rows.columns, **_friction_columns(rows, velocity, stuck)}.items() if n in p}
     known = {n: p.value(n) for n in columns}
     if "friction.static" in columns:
         known["friction.static"] -= p.value("friction.coulomb")
@@ -195,12 +223,16 @@ def _log_columns(name: str, rows: Rows, velocity: float) -> tuple[dict[str, Arra
     return {f"{n}[{name}]" if p[n].per_log else n: c for n, c in columns.items() if p[n].free}, target
 
 
-def _friction_columns(rows: Rows, velocity: float) -> dict[str, Array]:
-    """What multiplies each friction parameter in the force; static friction counts as the part above Coulomb's."""
+def _friction_columns(rows: Rows, velocity: float, stuck: Array | None = None) -> dict[str, Array]:
+    """What multiplies each friction parameter in the force; static friction counts as the part above Coulomb's.
+
+    If stuck (1 or -1: the side to which a sample is pulled) friction has its static level, whatever the filtered speed.
+    """
     parameters, speed = rows.parameters, rows.speed
     smoothing = parameters.value("friction.smoothing") if "friction.smoothing" in parameters else 1e-3
-    side = np.tanh(speed / smoothing)
-    peak = np.exp(-((speed / velocity) ** 2))
+    side, peak = np.tanh(speed / smoothing), np.exp(-((speed / velocity) ** 2))
+    if stuck is not None:
+        side, peak = stuck, np.ones_like(speed)
     columns = {"friction.coulomb": side, "friction.static": side * peak, "friction.viscous": speed}
     for chamber in ("pressure_a", "pressure_b"):
         if f"friction.coulomb_{chamber}" in parameters:
@@ -209,14 +241,16 @@ def _friction_columns(rows: Rows, velocity: float) -> dict[str, Array]:
     return columns
 
 
-def _robust(A: Array, y: Array, lower: Array, upper: Array) -> Array:
-    """Bounded least squares, reweighted; what the rows do not tell apart (`RIDGE`) shares the effect."""
+def _robust(A: Array, y: Array, lower: Array, upper: Array, given: tuple[Array, Array] | None = None) -> Array:
+    """Bounded least squares, reweighted but for the given rows; what no row tells apart (`RIDGE`) shares the effect."""
     k = A.shape[1]
+    given_A, given_y = (np.empty((0, k)), np.empty(0)) if given is None else given
     scale = np.linalg.norm(A, axis=0) + 1e-300
     weight, x = np.ones(len(A)), np.zeros(k)
     for _ in range(5):
-        weighted = np.concatenate([A / scale * weight[:, None], RIDGE * np.eye(k)])
-        fit = lsq_linear(weighted, np.append(y * weight, np.zeros(k)), (lower * scale, upper * scale))
+        weighted = np.concatenate([A / scale * weight[:, None], given_A / scale, RIDGE * np.eye(k)])
+        right = np.concatenate([y * weight, given_y, np.zeros(k)])
+        fit = lsq_linear(weighted, right, (lower * scale, upper * scale))
         x = np.clip(np.asarray(fit.x) / scale, lower, upper)
         error = y - A @ x
         spread = 1.4826 * np.median(np.abs(error)) + 1e-12
@@ -267,6 +301,14 @@ def _presliding_slope(logs: Mapping[str, Rows], friction: Mapping[str, Array], l
     v = np.concatenate(speed)
     # a step of the force, or the log's edge, is no presliding: the robust weights take it out
     return float(_robust(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0]) if v.size else 0.0
+
+
+def _travelled(rows: Rows) -> Array:
+    """Distance since the speed last changed its sign [m]."""
+    v, step = rows.speed, np.diff(rows.measured.t)
+    path = np.concatenate([[0.0], np.cumsum(np.abs(v[1:] + v[:-1]) / 2 * step)])
+    turns = np.append(False, np.diff(np.sign(v)) != 0)
+    return np.asarray(path - np.maximum.accumulate(np.where(turns, path, 0.0)))
 
 
 def _friction_force(name: str, rows: Rows, values: Mapping[str, float]) -> Array:

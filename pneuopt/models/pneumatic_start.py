@@ -10,7 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,7 @@ class PneumaticStarts:
         own: dict[str, float] = {}
         for name, value in valve.items():
             own |= named(name, value, {n: log.parameters for n, log in logs.items()})
-        return [Start(s.states, {**s.parameters, **own}, s.label) for s in starts]
+        return [replace(start, parameters={**start.parameters, **own}) for start in starts]
 
 
 class _Run:

@@ -110,6 +110,10 @@ class Arrow:
             self.gradient - flat.T @ node_part,
         )
 
+    def descent(self, step: Step) -> float:
+        """Rate at which the cost falls along a step."""
+        return -float(np.sum(self.node_gradient * step.nodes) + self.gradient @ step.parameters)
+
     def _solve_nodes(self, right: Array, damping: float) -> Array:
         factor = cholesky_banded(self._banded(damping), overwrite_ab=True, check_finite=False)
         return np.asarray(cho_solve_banded((factor, False), right, check_finite=False))

@@ -5,13 +5,47 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtbtrs
 
 from pneuopt.nlp.arrow import Arrow, Reduced, indistinct, scaled_inverse
-from pneuopt.nlp.segments import Segments
+from pneuopt.nlp.segments import Correction, Segments
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Data and gaps at an iterate with their derivatives, before anything says how much a gap weighs.
+
+    Attributes
+    ----------
+    grams : ndarray, shape (m, n + c + 1, n + c + 1)
+        Gram matrix of each segment's data residuals: by its states (in nominal sizes), its sensitivity columns, and
+        last the residuals themselves.
+    squares : ndarray, shape (m, n_outputs)
+        Squared data residuals.
+    ends : ndarray, shape (m, n, n + c)
+        Sensitivity of each segment's end, in nominal sizes.
+    y : ndarray, shape (m, n_samples, n_outputs)
+        The outputs, without the correction.
+    x_end : ndarray, shape (m, n)
+        Where each segment ends, likewise.
+    gaps, off : ndarray, shape (m, n)
+        Gap behind each segment, zero where nothing follows; distance from a known start; in nominal sizes.
+    chain : ndarray, shape (k,)
+        d(parameter)/d(searched parameter).
+    """
+
+    grams: Array
+    squares: Array
+    ends: Array
+    y: Array
+    x_end: Array
+    gaps: Array
+    off: Array
+    chain: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,42 +54,44 @@ class Equations:
 
     Attributes
     ----------
+    segments : Segments
+    slopes : Slopes
     arrow : Arrow
         Of data and gaps together.
-    grams : ndarray, shape (m, n + c, n + c)
-        The data's own Gram matrix of each segment, in its states and sensitivity columns.
-    selection : ndarray, shape (m, c, k)
-        d(column)/d(searched parameter).
-    ends : ndarray, shape (m, n, n + c)
-        Sensitivity of each segment's end, in nominal sizes.
-    gaps : ndarray, shape (m, n)
-        Gap behind each segment in nominal sizes; zero where nothing follows.
-    chain : ndarray, shape (k,)
-        d(parameter)/d(searched parameter).
-    chi_square, cost, largest_gap : float
-        Squared data residuals; half the sum of all squares; largest gap in nominal sizes.
-    count : int
-        Number of data residuals.
-    misfit : ndarray, shape (n_outputs,)
-        Root mean square of each output's residuals, in noise standard deviations; 0 where nothing was measured.
+    chi_square, cost : float
+        Squared data residuals; half the sum of all squares.
     """
 
+    segments: Segments
+    slopes: Slopes
     arrow: Arrow
-    grams: Array
-    selection: Array
-    ends: Array
-    gaps: Array
-    chain: Array
     chi_square: float
     cost: float
-    largest_gap: float
-    count: int
-    misfit: Array
+
+    @property
+    def gaps(self) -> Array:
+        """Gap behind each segment in nominal sizes; zero where nothing follows."""
+        return self.slopes.gaps
+
+    @property
+    def largest_gap(self) -> float:
+        """In nominal sizes."""
+        return float(np.max(np.abs(self.gaps), initial=0.0))
 
     @property
     def gap_share(self) -> float:
         """Part of the cost that the gaps carry, 0 to 1."""
         return 1 - self.chi_square / (2 * self.cost) if 0 < self.cost < math.inf else 0.0
+
+    @property
+    def count(self) -> int:
+        """Number of data residuals."""
+        return int(self.segments.counts.sum())
+
+    @property
+    def misfit(self) -> Array:
+        """Root mean square of each output's residuals, in noise standard deviations; 0 where nothing was measured."""
+        return np.asarray(np.sqrt(self.slopes.squares.sum(axis=0) / np.maximum(self.segments.counts, 1)))
 
     def undetermined(self, reduced: Reduced, keep: Mask) -> Indices:
         """Positions, among the kept parameters, of those that the data do not tell apart; empty if they do."""
@@ -74,17 +110,29 @@ class Equations:
             return None
         bread = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
         out = np.full((len(keep), len(keep)), np.nan)
-        if noisy_gaps:
-            out[np.ix_(keep, keep)] = bread
-            return np.asarray(out * np.outer(self.chain, self.chain))
-        E = np.concatenate([-reduced.eliminated, self.selection], axis=1)[:, :, keep]
-        meat = np.einsum("mak,mab,mbl->kl", E, self.grams, E, optimize=True)
-        out[np.ix_(keep, keep)] = bread @ meat @ bread
-        return np.asarray(out * np.outer(self.chain, self.chain))
+        spread = bread if noisy_gaps else bread @ self._meat(reduced)[np.ix_(keep, keep)] @ bread
+        out[np.ix_(keep, keep)] = spread
+        return np.asarray(out * np.outer(self.slopes.chain, self.slopes.chain))
+
+    def _meat(self, reduced: Reduced) -> Array:
+        """The data's own Gram matrix of the parameters, with the nodes following them. Shape (k, k)."""
+        n, meat = self.gaps.shape[1], np.zeros_like(reduced.schur)
+        for rows, columns, unknowns in self.segments.blocks:
+            E = np.zeros((rows.stop - rows.start, self.slopes.ends.shape[2], len(meat)))
+            E[:, :n] = -reduced.eliminated[rows]
+            E[:, n + columns, unknowns] = self.slopes.chain[unknowns]
+            meat += np.tensordot(E, self.slopes.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
+        return meat
 
 
 def normal_equations(
-    segments: Segments, nodes: Array, q: Array, chain: Array, sigma: Array, substeps: int
+    segments: Segments,
+    nodes: Array,
+    q: Array,
+    chain: Array,
+    sigma: Array,
+    substeps: int,
+    correction: Correction | None = None,
 ) -> Equations:
     """Run all segments with sensitivities and assemble data and gap residuals.
 
@@ -99,100 +147,114 @@ def normal_equations(
     sigma : ndarray, shape (n,)
         Standard deviation of a gap, in nominal sizes.
     substeps : int
+    correction : Correction, optional
+        What finer steps add to the outputs and ends.
     """
-    run = segments.run(nodes, q, substeps, sensitivities=True)
-    assert run.dy is not None
-    assert run.dx_end is not None
-    m, n = nodes.shape
-    scale = np.concatenate([segments.nominal, np.ones(run.dy.shape[-1] - n)])
-    known = np.isfinite(segments.measured)
-    residual = np.where(known, run.y - segments.measured, 0.0) / segments.noise
-    E = np.where(known[..., None], run.dy, 0.0) / segments.noise[..., None] * scale
-    E = E.reshape(m, -1, E.shape[-1])
-    grams, gradient = np.swapaxes(E, 1, 2) @ E, np.einsum("mra,mr->ma", E, residual.reshape(m, -1))
-    selection = np.zeros((m, segments.unknowns.shape[1], len(chain)))
-    row, column = np.nonzero(segments.unknowns >= 0)
-    unknown = segments.unknowns[row, column]
-    selection[row, column, unknown] = chain[unknown]
-    arrow = Arrow(
-        grams[:, :n, :n].copy(),
-        np.zeros((m, n, n)),
-        grams[:, :n, n:] @ selection,
-        np.einsum("mak,mab,mbl->kl", selection, grams[:, n:, n:], selection, optimize=True),
-        gradient[:, :n].copy(),
-        np.einsum("mak,ma->k", selection, gradient[:, n:]),
-    )
-    chi_square = float(np.sum(residual**2))
-    ends = run.dx_end * scale / segments.nominal[:, None]
-    gaps = gaps_of(segments, nodes, run.x_end)
+    run = segments.gram(nodes, q, substeps, correction)
+    scale = np.concatenate([segments.nominal, np.ones(run.grams.shape[1] - nodes.shape[1])])
+    ends = run.dx_end * (scale[:-1] / segments.nominal[:, None])
     off = np.where(np.isfinite(segments.fixed_start), nodes - segments.fixed_start, 0.0) / segments.nominal
-    _add_gaps(arrow, segments, gaps, off, ends, selection, sigma)
-    cost = 0.5 * (chi_square + float(np.sum((gaps / sigma) ** 2)) + float(np.sum((off / sigma) ** 2)))
-    largest = float(np.max(np.abs(gaps), initial=0.0))
-    finite = math.isfinite(cost) and bool(np.isfinite(grams).all())
-    cost = cost if finite else math.inf
-    counts = known.sum(axis=(0, 1))
-    misfit = np.sqrt(np.sum(residual**2, axis=(0, 1)) / np.maximum(counts, 1))
-    return Equations(arrow, grams, selection, ends, gaps, chain, chi_square, cost, largest, int(counts.sum()), misfit)
+    gaps = gaps_of(segments, nodes, run.x_end if correction is None else run.x_end + correction.x_end)
+    slopes = Slopes(run.grams * np.outer(scale, scale), run.squares, ends, run.y, run.x_end, gaps, off, chain)
+    return weighed(segments, slopes, sigma)
+
+
+def weighed(segments: Segments, slopes: Slopes, sigma: Array) -> Equations:
+    """The normal equations with gaps of standard deviation `sigma`, shape (n,), in nominal sizes."""
+    chi_square = float(np.sum(slopes.squares))
+    with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
+        squares = chi_square + float(np.sum((slopes.gaps / sigma) ** 2) + np.sum((slopes.off / sigma) ** 2))
+        arrow = _assembled(segments, slopes, 1 / sigma)
+    finite = math.isfinite(squares) and bool(np.isfinite(slopes.grams).all())
+    return Equations(segments, slopes, arrow, chi_square, 0.5 * squares if finite else math.inf)
 
 
 def gaps_of(segments: Segments, nodes: Array, x_end: Array) -> Array:
     """Gap behind each segment in nominal sizes, shape (m, n); zero where nothing follows."""
     gaps = np.zeros_like(nodes)
-    here = np.flatnonzero(segments.linked)
-    gaps[here] = (x_end[here] - nodes[here + 1]) / segments.nominal
+    gaps[:-1] = np.where(segments.linked[:-1, None], (x_end[:-1] - nodes[1:]) / segments.nominal, 0.0)
     return gaps
 
 
-def reconnected(
-    segments: Segments, equations: Equations, step: Array, moved: Array, nodes: Array, x_end: Array
-) -> Array:
+def reconnected(equations: Equations, step: Array, moved: Array, nodes: Array, gaps: Array) -> Array:
     """Second-order correction of a step: shift the nodes so that the gaps become what the linear model promised.
 
     Parameters
     ----------
-    segments : Segments
     equations : Equations
         Where the step (nodes `step`, shape (m, n) in nominal sizes; parameters `moved`, shape (k,)) was computed.
-    nodes, x_end : ndarray, shape (m, n)
-        The nodes after the step, and where their segments end.
+    step, moved : ndarray
+    nodes, gaps : ndarray, shape (m, n)
+        The nodes after the step, and the gaps behind them.
 
     Returns
     -------
     ndarray, shape (m, n)
     """
-    n = nodes.shape[1]
-    here = np.flatnonzero(segments.linked)
-    own = equations.ends[:, :, :n]
-    promised = equations.gaps + np.einsum("mij,mj->mi", own, step)
-    promised += np.einsum("mic,mck,k->mi", equations.ends[:, :, n:], equations.selection, moved, optimize=True)
-    promised[here] -= step[here + 1]
-    excess = gaps_of(segments, nodes, x_end) - promised
-    shift = np.zeros_like(nodes)
-    for i in here.tolist():
-        shift[i + 1] = own[i] @ shift[i] + excess[i]
+    segments, slopes, n = equations.segments, equations.slopes, nodes.shape[1]
+    change = np.zeros(slopes.ends.shape[::2])
+    change[:, :n] = step
+    for rows, columns, unknowns in segments.blocks:
+        change[rows, n + columns] = (slopes.chain * moved)[unknowns]
+    promised = slopes.gaps + (slopes.ends @ change[..., None])[..., 0]
+    promised[:-1] -= step[1:]
+    excess = np.where(segments.linked[:, None], gaps - promised, 0.0)
+    shift = _carried(np.where(segments.linked[:, None, None], slopes.ends[:, :, :n], 0.0), excess)
     return np.asarray(nodes + shift * segments.nominal)
 
 
-def _add_gaps(
-    arrow: Arrow, segments: Segments, gaps: Array, off: Array, ends: Array, selection: Array, sigma: Array
-) -> None:
-    """Add the gaps between linked segments, and the distance from known starts, as residuals."""
-    n = gaps.shape[1]
-    weight = 1 / sigma
-    here = np.flatnonzero(segments.linked)
-    e = gaps[here] * weight
-    own = ends[here, :, :n] * weight[:, None]
-    ours = ends[here, :, n:] * weight[:, None] @ selection[here]
-    own_t = np.swapaxes(own, 1, 2)
-    arrow.diagonal[here] += own_t @ own
-    arrow.diagonal[here + 1] += np.diag(weight**2)
-    arrow.coupling[here] -= own_t * weight
-    arrow.border[here] += own_t @ ours
-    arrow.border[here + 1] -= weight[:, None] * ours
-    arrow.corner[:] += np.einsum("mak,mal->kl", ours, ours, optimize=True)
-    arrow.node_gradient[here] += (own_t @ e[..., None])[..., 0]
-    arrow.node_gradient[here + 1] -= weight * e
-    arrow.gradient[:] += np.einsum("mak,ma->k", ours, e)
-    arrow.diagonal[:, range(n), range(n)] += np.isfinite(segments.fixed_start) * weight**2
-    arrow.node_gradient[:] += off * weight**2
+def unexplained(equations: Equations, level: float, *, jumps: bool) -> str:
+    """In words, what the model leaves beyond `level` (squared residuals, in noise variances); empty if nothing.
+
+    With `jumps` the gaps stand for noise of the states.
+    """
+    segments = equations.segments
+    lead = "; the model does not explain the log to its noise: "
+    tail = ", and the intervals count that as noise: they do not hold the bias of a wrong model"
+    if jumps:
+        sizes = np.sqrt(np.mean(equations.gaps[segments.linked] ** 2, axis=0))
+        state = segments.system.states[int(np.argmax(sizes))]
+        size = f"{np.max(sizes) * state.nominal:.2g} {state.unit}"
+        return f"{lead}from segment to segment {state.name} jumps by {size} (rms){tail}"
+    misfit = equations.misfit
+    worst = int(np.argmax(misfit))
+    if misfit[worst] ** 2 <= level:
+        return ""
+    output = segments.system.outputs[worst].name
+    return f"{lead}residuals are {misfit[worst]:.2g} times the noise of {output}{tail}"
+
+
+def _carried(own: Array, excess: Array) -> Array:
+    """Shifts s of the nodes with s[0] = 0 and s[i + 1] = own[i] s[i] + excess[i], as one banded triangle."""
+    m, n, _ = own.shape
+    band = np.zeros((2 * n, m * n))
+    for a in range(n):
+        for b in range(n):
+            band[n + a - b, b::n] = -own[:, a, b]
+    right = np.concatenate([np.zeros(n), excess[:-1].ravel()])
+    return np.asarray(dtbtrs(band, right[:, None], uplo="L", diag="U")[0]).reshape(m, n)
+
+
+def _assembled(segments: Segments, slopes: Slopes, weight: Array) -> Arrow:
+    """Data, the gaps between linked segments, and the distances from known starts, as one arrow."""
+    (m, n), k = slopes.gaps.shape, len(slopes.chain)
+    W = np.concatenate([slopes.ends, slopes.gaps[..., None]], axis=2)
+    W *= np.tile(weight[:, None], W.shape[2])
+    W[~segments.linked] = 0.0
+    G = slopes.grams + np.swapaxes(W, 1, 2) @ W
+    diagonal, node_gradient = G[:, :n, :n].copy(), G[:, :n, -1].copy()
+    coupling = -np.swapaxes(W[:, :, :n], 1, 2) * weight
+    is_next = np.append(False, segments.linked[:-1])[:, None]
+    diagonal[:, range(n), range(n)] += (is_next + 1.0 * np.isfinite(segments.fixed_start)) * weight**2
+    node_gradient[1:] -= weight * W[:-1, :, -1]
+    node_gradient += slopes.off * weight**2
+    between = G[:, :n, n:-1]
+    between[1:] -= weight[:, None] * W[:-1, :, n:-1]
+    border, corner, gradient = np.zeros((m, n, k)), np.zeros((k, k)), np.zeros(k)
+    for rows, columns, unknowns in segments.blocks:
+        chain, own = slopes.chain[unknowns], n + columns
+        border[rows, :, unknowns] = between[rows][:, :, columns] * chain
+        total = G[rows].sum(axis=0)
+        corner[np.ix_(unknowns, unknowns)] += total[np.ix_(own, own)] * np.outer(chain, chain)
+        gradient[unknowns] += total[own, -1] * chain
+    return Arrow(diagonal, coupling, border, corner, node_gradient, gradient)

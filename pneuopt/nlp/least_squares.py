@@ -6,28 +6,36 @@ record's length. The gaps are tightened in stages, so that a bad start is never 
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.codegen import Run
 from pneuopt.nlp.arrow import Reduced, Step, scaled_inverse
-from pneuopt.nlp.equations import Equations, normal_equations, reconnected
-from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for, tightness
+from pneuopt.nlp.equations import Equations, normal_equations, reconnected, unexplained, weighed
+from pneuopt.nlp.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
+from pneuopt.nlp.space import Space
 from pneuopt.nlp.status import Code, Solution, Status
 from pneuopt.nlp.transcription import Transcription
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
+FIRST_DAMPING = 1e-3  # with loose gaps
+LEAST_GAIN = 0.5  # of the promised decrease, below which a step is corrected
+ENOUGH = 1e-3  # a stage ends where the promised decrease is this part of the cost
+STILL = 5e-7  # likewise the last, in noise variances: half of (0.1 % of a standard deviation)^2
 LEAST_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
 REFINEMENTS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
+STABLE = 2.0  # h |lambda| of a search's steps; RK4 is stable below 2.78
+MOVED = 0.03  # a parameter's relative change that has the stiffness judged anew
 STIFFEST = 200  # integration steps a sample beyond which a search would take hours
 MOST_REFINED = 8  # how far a stage may refine the start's integration steps
 MOST_GAP_SHARE = 0.05  # of the cost: the gaps' residuals above it mean that they take up what the model cannot
 NOISE_LEVEL = 1.2  # squared residuals a sample, in noise variances, up to which a fit is as good as the noise allows
-UNFELT = 1e-6  # squared residuals that an e-fold change of a log parameter has to move, or it stays where it is
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ class Stage:
     iterations : int
         At most.
     refine : int
-        Integration steps, as a multiple of the search's.
+        Integration steps on which the answer stands, as a multiple of the search's.
     """
 
     gap: float
@@ -60,8 +68,8 @@ class LeastSquares:
     segment_time : float
         Time between two shooting nodes [s]; math.inf for one segment a log.
     substeps : int, optional
-        Integration steps a sample; default: from the stiffness at the start of each stage, h |lambda| <= 1.4 a step,
-        half that in the last stage, and finer until halving the steps moves no estimate.
+        Integration steps a sample; default: from the stiffness at the start of each stage, h |lambda| <= 2 a step;
+        the last stage adds what finer steps change, halved until that moves no estimate.
     tolerance : float
         Of the last undamped parameter step, in the parameter's standard deviations.
     kinematic : float
@@ -141,24 +149,30 @@ class _Iterate:
         return self.equations.cost
 
 
+class _End(NamedTuple):
+    """Where a stage ended."""
+
+    nodes: Array
+    z: Array
+    cost: float
+
+
 class _Search:
     """Levenberg-Marquardt on the nodes and the free parameters of one transcription."""
 
     def __init__(self, segments: Segments, method: LeastSquares) -> None:
         self.segments, self.method = segments, method
-        parameters = segments.transcription.parameters
-        free = [p for p in parameters.values() if p.free]
-        self.q = np.array([p.value for p in parameters.values()])
-        self.log = np.array([p.log for p in free], dtype=bool)
-        self.lower, self.upper = (self._searched(np.array([getattr(p, b) for p in free])) for b in ("lower", "upper"))
+        self.space = Space(segments.transcription)
         self.tightness = tightness(segments, method.kinematic)
         self.iterations, self.stage = 0, method.stages[0]
-        self.is_loose, self.ends = False, list[_Iterate]()
+        self.correction: Correction | None
+        self.is_loose, self.ends = False, list[_End]()
         nodes = start_nodes(segments)
-        self.needed = method.substeps or substeps_for(segments, nodes, self.q)
+        self.judged = self.space.values(self.space.start)
+        self.needed = method.substeps or substeps_for(segments, nodes, self.judged, STABLE)
         self.substeps = self.coarsest = method.substeps or min(self.needed, STIFFEST)
-        z = np.clip(self._searched(self.q[segments.transcription.free]), self.lower, self.upper)
-        self.current = self._evaluate(nodes, z)
+        self.finest, self.correction, self.change = self.substeps, None, math.nan
+        self.current = self._evaluate(nodes, self.space.start)
 
     def solve(self) -> Fit:
         began = time.perf_counter()
@@ -170,140 +184,156 @@ class _Search:
 
     def _run_stages(self) -> Status:
         if self.needed > self.coarsest:
-            told = (
-                f"the model is so stiff that a sample takes {self.needed} integration steps; smooth its sharpest term "
-            )
-            return Status(
-                Code.NOT_CONVERGED, told + "(friction.smoothing to 1e-4 m/s), or give LeastSquares(substeps=)"
-            )
+            told = f"the model is so stiff that a sample takes {self.needed} integration steps; smooth its "
+            remedy = "sharpest term (friction.smoothing to 1e-4 m/s), or give LeastSquares(substeps=)"
+            return Status(Code.NOT_CONVERGED, told + remedy)
         for stage in self.method.stages:
-            self.stage, self.substeps = stage, self._steps_of(stage)
-            self.current = self._evaluate(self.current.nodes, self.current.z)
+            self._enter(stage, self.current.nodes, self.current.z)
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, "the model is not finite at the start; check values and units")
             self._run_stage()
-            self.ends.append(self.current)
+            self.ends.append(_End(self.current.nodes, self.current.z, self.current.cost))
         status = self._judge(self.current)
-        return self._refine(self._loosened(status) if self._is_torn() else status)
-
-    def _is_torn(self) -> bool:
-        """Whether the gaps take up what the model cannot; then the answer hangs on their weight."""
-        return self.current.equations.gap_share > MOST_GAP_SHARE
+        # gaps that take up what the model cannot: the answer hangs on their weight
+        is_torn = self.current.equations.gap_share > MOST_GAP_SHARE
+        return self._refine(self._loosened(status) if is_torn else status)
 
     def _loosened(self, status: Status) -> Status:
         """Allow what a wrong model leaves as noise of its states: the tightest gaps with which all residuals agree."""
         last = self.method.stages[-1]
         for stage, end in zip(self.method.stages[-2::-1], self.ends[-2::-1], strict=True):
-            if 2 * end.cost <= NOISE_LEVEL * end.equations.count:
-                tight = self.current
-                self.stage, self.is_loose = replace(stage, iterations=last.iterations, refine=last.refine), True
-                self.substeps = self._steps_of(self.stage)
-                self.current = self._evaluate(end.nodes, end.z)
+            if 2 * end.cost <= NOISE_LEVEL * self.current.equations.count:
+                tight = self.stage, self.current, self.correction, self.substeps, self.finest
+                self.is_loose = True
+                self._enter(replace(stage, iterations=last.iterations, refine=last.refine), end.nodes, end.z)
                 self._run_stage()
                 found = self._judge(self.current)
                 if found.converged:
                     return found
-                self.stage, self.is_loose, self.current = last, False, tight
+                self.stage, self.current, self.correction, self.substeps, self.finest = tight
+                self.is_loose = False
                 break
         return status
 
-    def _steps_of(self, stage: Stage) -> int:
-        """Integration steps a sample of a stage: from the stiffness where it begins, for the start may mislead."""
-        if self.method.substeps:
-            return self.method.substeps * stage.refine
-        needed = substeps_for(self.segments, self.current.nodes, self._values(self.current.z))
-        return min(needed, MOST_REFINED * self.coarsest) * stage.refine
+    def _enter(self, stage: Stage, nodes: Array, z: Array) -> None:
+        """Weigh the gaps as the stage does, with steps from the stiffness there, for the start may mislead."""
+        steps, q = self.substeps, self.space.values(z)
+        if not self.method.substeps and not np.allclose(q, self.judged, rtol=MOVED):
+            needed, self.judged = substeps_for(self.segments, nodes, q, STABLE), q
+            steps = min(max(needed, self.coarsest), MOST_REFINED * self.coarsest)
+        is_known = steps == self.substeps and self.correction is None and nodes is self.current.nodes
+        self.stage, self.substeps, self.finest, self.correction = stage, steps, steps, None
+        if is_known:
+            slopes = self.current.equations.slopes
+            self.current = _Iterate(nodes, z, weighed(self.segments, slopes, stage.gap * self.tightness))
+        else:
+            self.current = self._evaluate(nodes, z)
+        if stage.refine > 1:
+            self._correct(stage.refine * steps)
+
+    def _correct(self, steps: int) -> float:
+        """Let the current outputs and ends be those of finer steps; by how much that moves y, at most [deviations].
+
+        Derivatives need no finer steps but where residuals exceed the noise: their product with those then counts.
+        """
+        nodes, z, before = self.current.nodes, self.current.z, self._outputs()
+        if self.is_loose or 2 * self.current.cost > NOISE_LEVEL * self.current.equations.count:
+            self.substeps, self.finest, self.correction = steps, steps, None
+        else:
+            slopes, fine = self.current.equations.slopes, self._run(steps)
+            self.finest, self.correction = steps, Correction(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
+        self.current = self._evaluate(nodes, z)
+        return self._largest(self._outputs() - before)
+
+    def _outputs(self) -> Array:
+        """The model's outputs as the search sees them, shape (m, n, n_outputs)."""
+        y = self.current.equations.slopes.y
+        return y if self.correction is None else y + self.correction.y
 
     def _refine(self, status: Status) -> Status:
-        """Halve the integration steps until that moves no estimate, unless they were given."""
-        for _ in range(0 if self.method.substeps else REFINEMENTS):
+        """Halve the integration steps until that moves no estimate; steps that were given stay."""
+        for _ in range(REFINEMENTS):
             if not status.converged:
                 break
-            self.substeps *= 2
-            finer = self._evaluate(self.current.nodes, self.current.z)
-            if not math.isfinite(finer.cost) or self._judge(finer).converged:
-                self.substeps //= 2
-                return status
-            self.current = finer
+            before = self.current, self.correction, self.substeps, self.finest
+            change = self._correct(self.finest if self.method.substeps else 2 * self.finest)
+            if not math.isfinite(self.current.cost):
+                self.current, self.correction, self.substeps, self.finest = before
+                break
+            if self._judge(self.current).converged:
+                self.change = math.nan if self.method.substeps else change
+                break
             self._run_stage()
             status = self._judge(self.current)
         return status
 
     def _run_stage(self) -> None:
-        is_last = self.is_loose or self.stage is self.method.stages[-1]
-        damping = 1e-3
+        damping = min(FIRST_DAMPING, 10 * self.stage.gap**2)  # as the diagonal grows
         for _ in range(self.stage.iterations):
-            self.iterations += 1
             trial, damping = self._step(self.current, damping)
             if trial is None:
                 break
-            before, self.current = self.current, trial
-            drop = (before.cost - trial.cost) / max(before.cost, 1e-300)
-            moved = float(np.max(np.abs(trial.z - before.z) / (1e-3 + np.abs(before.z)), initial=0.0))
+            self.iterations += 1
+            self.current = trial
             self._report()
-            if drop < (1e-8 if is_last else 1e-3) and (not is_last or moved < 1e-4):
-                break
 
     def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
-        """Shorten the step until the cost falls; None where ten tries do not help."""
+        """Shorten the step until the cost falls; None where ten tries do not help, or it would hardly fall."""
         raise_by = 10.0
-        for _ in range(10):
+        for k in range(10):
             reduced = current.equations.arrow.eliminate(damping)
-            step = None if reduced is None else reduced.step(self._movable(current, reduced))
-            if reduced and step and np.max(np.abs(step.parameters[self.log]), initial=0.0) <= 2:
-                for trial in self._trials(current, reduced, step):
-                    if trial.cost < current.cost:
-                        return trial, damping * 0.1 if damping > LEAST_DAMPING else 0.0
+            step = None if reduced is None else reduced.step(self.space.movable(current.z, current.equations, reduced))
+            if reduced and step and np.max(np.abs(step.parameters[self.space.log]), initial=0.0) <= 2:
+                if k == 0 and damping <= FIRST_DAMPING and self._is_still(current, step):
+                    break
+                trial = self._trial(current, reduced, step)
+                if trial.cost < current.cost:
+                    return trial, damping * 0.1 if damping > LEAST_DAMPING else 0.0
             damping, raise_by = max(damping, LEAST_DAMPING) * raise_by, 3 * raise_by
         return None, damping
 
-    def _trials(self, current: _Iterate, reduced: Reduced, step: Step) -> Iterator[_Iterate]:
-        """The step with its gaps corrected to second order (curved valleys of tight gaps), then the step as it is."""
-        z = np.clip(current.z + step.parameters, self.lower, self.upper)
+    def _is_still(self, current: _Iterate, step: Step) -> bool:
+        """Whether a step promises next to nothing: in the last stage, no direction moves by 0.1 % of its deviation."""
+        if self.is_loose or self.stage is self.method.stages[-1]:
+            enough = STILL * max(1.0, 2 * current.cost / max(1, current.equations.count))
+        else:
+            enough = ENOUGH * current.cost
+        return 0.5 * current.equations.arrow.descent(step) < enough
+
+    def _trial(self, current: _Iterate, reduced: Reduced, step: Step) -> _Iterate:
+        """The step as it is; where it disappoints, also with its gaps corrected to second order (curved valleys)."""
+        z = self.space.within(current.z + step.parameters)
         moved = z - current.z
         shift = reduced.following(moved)  # a bound may have cut the parameters' step short
-        nodes = current.nodes + shift * self.segments.nominal
-        if self.segments.linked.any():
-            end = self.segments.run(nodes, self._values(z), self.substeps, sensitivities=False).x_end
-            with np.errstate(all="ignore"):
-                shifted = reconnected(self.segments, current.equations, shift, moved, nodes, end)
-            if np.isfinite(shifted).all():
-                yield self._evaluate(shifted, z)
-        yield self._evaluate(nodes, z)
+        trial = self._evaluate(current.nodes + shift * self.segments.nominal, z)
+        promised = 0.5 * current.equations.arrow.descent(Step(shift, moved))
+        if current.cost - trial.cost >= LEAST_GAIN * promised or not np.isfinite(trial.equations.gaps).all():
+            return trial
+        with np.errstate(all="ignore"):
+            nodes = reconnected(current.equations, shift, moved, trial.nodes, trial.equations.gaps)
+        corrected = self._evaluate(nodes, z) if np.isfinite(nodes).all() else trial
+        return corrected if corrected.cost < trial.cost else trial
 
     def _evaluate(self, nodes: Array, z: Array) -> _Iterate:
         sigma = self.stage.gap * self.tightness
-        chain = np.where(self.log, np.exp(np.where(self.log, z, 0.0)), 1.0)
         with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
-            equations = normal_equations(self.segments, nodes, self._values(z), chain, sigma, self.substeps)
+            given = (nodes, self.space.values(z), self.space.chain(z), sigma, self.substeps, self.correction)
+            equations = normal_equations(self.segments, *given)
         return _Iterate(nodes, z, equations)
-
-    def _movable(self, current: _Iterate, reduced: Reduced) -> Mask:
-        """Parameters that are neither pressed against a bound nor without any effect on the residuals here."""
-        below = (current.z <= self.lower) & (reduced.gradient > 0)
-        above = (current.z >= self.upper) & (reduced.gradient < 0)
-        return self._felt(current) & ~(below | above)
-
-    def _felt(self, current: _Iterate) -> Mask:
-        """Parameters that have an effect on the residuals here."""
-        return np.asarray(np.diag(current.equations.arrow.corner) > np.where(self.log, UNFELT, 0.0))
-
-    def _at_bound(self, current: _Iterate) -> Mask:
-        return np.asarray((current.z <= self.lower) | (current.z >= self.upper))
 
     def _judge(self, current: _Iterate) -> Status:
         """Converged means that a full undamped step would move nothing that the data can tell apart."""
         names = np.array(self.segments.transcription.parameters.free_names, dtype=object)
         equations = current.equations
         nothing = np.diag(equations.arrow.corner) == 0  # even at a bound
-        idle = ~self._felt(current) & (nothing | ~self._at_bound(current))
+        idle = ~self.space.felt(equations) & (nothing | ~self.space.at_bound(current.z))
         if idle.any():
             told = f"the data do not feel {' and '.join(names[idle])}; fix it, or log a run that does"
             return Status(Code.NOT_CONVERGED, told)
         reduced = equations.arrow.eliminate(0.0)
         if reduced is None:
             return Status(Code.NOT_CONVERGED, "the data do not determine the states; log another output")
-        keep = self._movable(current, reduced)
+        keep = self.space.movable(current.z, equations, reduced)
         alike, solved = names[keep][equations.undetermined(reduced, keep)], reduced.step(keep)
         if alike.size or solved is None:
             told = f"the data do not determine {' and '.join(alike)}; fix one, or log a run that tells them apart"
@@ -321,51 +351,44 @@ class _Search:
             remedy = "of a state's nominal size: the model cannot follow the log; check its terms, inputs and units"
             return Status(Code.NOT_CONVERGED, told + remedy)
         told = f"{self.iterations} iterations, largest gap {gap:.1g} of a state's nominal size"
-        return Status(Code.CONVERGED, told + self._unexplained(equations))
-
-    def _unexplained(self, equations: Equations) -> str:
-        """In words, what the model leaves beyond the noise; empty if nothing."""
-        lead = "; the model does not explain the log to its noise: "
-        tail = ", and the intervals count that as noise: they do not hold the bias of a wrong model"
-        if self.is_loose:
-            jumps = np.sqrt(np.mean(equations.gaps[self.segments.linked] ** 2, axis=0))
-            state = self.segments.system.states[int(np.argmax(jumps))]
-            size = f"{np.max(jumps) * state.nominal:.2g} {state.unit}"
-            return f"{lead}from segment to segment {state.name} jumps by {size} (rms){tail}"
-        worst = int(np.argmax(equations.misfit))
-        if equations.misfit[worst] ** 2 <= NOISE_LEVEL:
-            return ""
-        output = self.segments.system.outputs[worst].name
-        return f"{lead}residuals are {equations.misfit[worst]:.2g} times the noise of {output}{tail}"
+        return Status(Code.CONVERGED, told + unexplained(equations, NOISE_LEVEL, jumps=self.is_loose))
 
     def _fit(self, status: Status, seconds: float) -> Fit:
         transcription, current, equations = self.segments.transcription, self.current, self.current.equations
-        q = self._values(current.z)
+        q = self.space.values(current.z)
         free = transcription.parameters.free_names
         values = dict(zip(free, q[transcription.free].tolist(), strict=True))
-        trajectories = self.segments.trajectories(current.nodes, q, self.substeps)
+        is_run = self.correction is not None and math.isfinite(self.change)  # at these very nodes
+        run = self.correction.fine if is_run and self.correction else self._run(self.finest)
         stats = {
             "iterations": float(self.iterations),
             "seconds": seconds,
             "cost": equations.cost,
-            "substeps": float(self.substeps),
+            "substeps": float(self.finest),
             "largest_gap": equations.largest_gap,
             "gap_share": equations.gap_share,
             "gap_deviation": self.stage.gap,
-            "integration_error": self._integration_error(current.nodes, q, self.substeps),
+            "integration_error": self._integration_error(run),
         }
-        at_bound = self._at_bound(current)
-        keep = self._felt(current) & ~at_bound
+        at_bound = self.space.at_bound(current.z)
+        keep = self.space.felt(equations) & ~at_bound
         covariance = equations.covariance(keep, noisy_gaps=self.is_loose) if math.isfinite(equations.cost) else None
-        solution = Solution(trajectories, transcription.parameters.with_values(values), status, stats)
+        solution = Solution(
+            self.segments.trajectories(run), transcription.parameters.with_values(values), status, stats
+        )
         jumps = equations.gaps[self.segments.linked] if self.is_loose else None
         return Fit(solution, covariance, equations.chi_square, equations.count, at_bound, jumps)
 
-    def _integration_error(self, nodes: Array, q: Array, substeps: int) -> float:
+    def _integration_error(self, run: Run) -> float:
         """Largest change of an output when the steps are halved [noise standard deviations]."""
-        coarse, fine = (self.segments.run(nodes, q, k, sensitivities=False).y for k in (substeps, 2 * substeps))
-        error = np.abs(coarse - fine) / self.segments.noise
-        return float(np.max(error, where=np.isfinite(self.segments.measured), initial=0.0))
+        return self.change if math.isfinite(self.change) else self._largest(self._run(2 * self.finest).y - run.y)
+
+    def _largest(self, change: Array) -> float:
+        weighted = np.abs(change) * self.segments.weights
+        return float(np.max(weighted, where=np.isfinite(self.segments.measured), initial=0.0))
+
+    def _run(self, steps: int) -> Run:
+        return self.segments.run(self.current.nodes, self.space.values(self.current.z), steps, states=True)
 
     def _report(self) -> None:
         if self.method.progress is not None:
@@ -375,20 +398,3 @@ class _Search:
             self.method.progress(
                 f"{number}  iteration {self.iterations}  cost {current.cost:.6g}  largest gap {gap:.1e}"
             )
-
-    def _searched(self, values: Array) -> Array:
-        """Logarithms where the parameter asks for it; a bound that is not positive is no bound there."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.log, np.where(values > 0, np.log(values), -np.inf), values)
-
-    def _values(self, z: Array) -> Array:
-        """All the problem's parameter values at the searched ones."""
-        q = self.q.copy()
-        own = np.where(self.log, np.exp(np.where(self.log, z, 0.0)), z)
-        free = [p for p in self.segments.transcription.parameters.values() if p.free]
-        # at a bound exactly the bound, which a logarithm there and back would miss by a rounding
-        own = np.where(
-            z <= self.lower, [p.lower for p in free], np.where(z >= self.upper, [p.upper for p in free], own)
-        )
-        q[self.segments.transcription.free] = [min(max(v, p.lower), p.upper) for v, p in zip(own, free, strict=True)]
-        return q

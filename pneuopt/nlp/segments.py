@@ -1,15 +1,16 @@
 """A transcription as batched, compiled segments: every segment of every phase side by side, with its sensitivities."""
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Rollout, Run
+from pneuopt.codegen import Gram, Rollout, Run
 from pneuopt.errors import ModelError, require
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription
 from pneuopt.system import DiscreteSystem, names
@@ -19,6 +20,32 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 MOST_SUBSTEPS = 1000
+JUDGED = 100  # nodes whose stiffness is judged
+
+
+class Block(NamedTuple):
+    """Segments in a row that share their unknowns: sensitivity column `columns[i]` is free parameter `unknowns[i]`."""
+
+    rows: slice
+    columns: Indices
+    unknowns: Indices
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What finer integration steps add to a run.
+
+    Attributes
+    ----------
+    y : ndarray, shape (m, n, n_outputs)
+    x_end : ndarray, shape (m, n_states)
+    fine : Run
+        The run with the finer steps.
+    """
+
+    y: Array
+    x_end: Array
+    fine: Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +111,32 @@ class Segments:
         return np.asarray(index[self.gather[:, self.columns]])
 
     @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """All segments, in their order, by what is unknown in them."""
+        changes = np.flatnonzero(np.diff(self.unknowns, axis=0).any(axis=1)) + 1
+        edges, out = [0, *changes.tolist(), self.count], []
+        for a, b in itertools.pairwise(edges):
+            columns = np.flatnonzero(self.unknowns[a] >= 0)
+            out.append(Block(slice(a, b), columns, self.unknowns[a, columns]))
+        return tuple(out)
+
+    @cached_property
+    def weights(self) -> Array:
+        """One over the noise, shape (m, n, n_outputs)."""
+        return np.asarray(1 / self.noise)
+
+    @cached_property
+    def counts(self) -> Indices:
+        """How many samples of each output were measured, shape (n_outputs,)."""
+        return np.asarray(np.isfinite(self.measured).sum(axis=(0, 1)))
+
+    @cached_property
+    def jacobian(self) -> ca.Function:
+        """Of the states' rates: ``(t, x, u, p) -> d(xdot)/dx``, shape (n_states, n_states)."""
+        slope, s = _slope(self.system)
+        return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
+
+    @cached_property
     def sensitivities(self) -> Rollout:
         """The compiled run with sensitivities to start states and free parameters."""
         return Rollout(self.system.pieces, wrt=self.columns.tolist(), start=True)
@@ -93,14 +146,19 @@ class Segments:
         """The compiled run without sensitivities."""
         return Rollout(self.system.pieces)
 
-    def run(self, nodes: Array, q: Array, substeps: int, *, sensitivities: bool, states: bool = False) -> Run:
+    def run(self, nodes: Array, q: Array, substeps: int, *, sensitivities: bool = False, states: bool = False) -> Run:
         """Integrate all segments from their nodes, shape (m, n_states), at the problem's parameter values q."""
         rollout = self.sensitivities if sensitivities else self.plain
         return rollout.run(nodes, self.inputs, q[self.gather], self.t, self.h, substeps=substeps, states=states)
 
-    def trajectories(self, nodes: Array, q: Array, substeps: int) -> tuple[Trajectory, ...]:
-        """States and outputs at every sample, one trajectory a phase."""
-        run = self.run(nodes, q, substeps, sensitivities=False, states=True)
+    def gram(self, nodes: Array, q: Array, substeps: int, correction: Correction | None = None) -> Gram:
+        """The same with sensitivities, and the Gram matrices of the residuals, which alone are corrected."""
+        measured = self.measured if correction is None else self.measured - correction.y
+        given = (nodes, self.inputs, q[self.gather], self.t, self.h, measured, self.weights)
+        return self.sensitivities.gram(*given, substeps=substeps)
+
+    def trajectories(self, run: Run) -> tuple[Trajectory, ...]:
+        """States and outputs at every sample of a run with states, one trajectory a phase."""
         assert run.x is not None
         real = np.arange(self.t.shape[1]) < self.lengths[:, None]
         out = []
@@ -153,25 +211,28 @@ def tightness(segments: Segments, kinematic: float) -> Array:
     """How much tighter each state's gaps are kept: `kinematic` where its rate holds no free parameter, else 1."""
     slope, symbols = _slope(segments.system)
     free = symbols["p"][segments.columns.tolist()]
-    depends = [bool(ca.which_depends(slope[i], free, 1, True)[0]) for i in range(slope.numel())]
+    depends = [any(ca.which_depends(slope[i], free, 1, True)) for i in range(slope.numel())]
     return np.where(depends, 1.0, kinematic)
 
 
 def substeps_for(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
     """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
 
-    No more than `MOST_SUBSTEPS`, for a start may be absurd.
+    Judged at nodes all along it and at the extremes of every state and input; no more than `MOST_SUBSTEPS`, for a start
+    may be absurd.
     """
-    slope, s = _slope(segments.system)
-    if not slope.numel():
-        return 1
-    jacobian = ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
     m, n = nodes.shape
+    if not n:
+        return 1
+    given = np.concatenate([nodes, segments.inputs[:, 0]], axis=1)
+    even = np.linspace(0, m - 1, min(m, JUDGED)).astype(int)
+    rows = np.unique(np.concatenate([even, given.argmin(axis=0), given.argmax(axis=0)]))
     # the regularised friction is stiffest at rest, which a node may just miss
-    points = np.concatenate([nodes, nodes * 0])
-    p = np.tile(q[segments.gather], (2, 1))
-    u, t = np.tile(segments.inputs[:, 0], (2, 1)), np.tile(segments.t[:, 0], 2)
-    J = np.array(jacobian.map(2 * m)(t[None], points.T, u.T, p.T)).reshape(n, 2 * m, n).transpose(1, 0, 2)
+    points = np.concatenate([nodes[rows], nodes[rows] * 0])
+    p, u, t = (
+        np.concatenate([a, a]) for a in (q[segments.gather[rows]], segments.inputs[rows, 0], segments.t[rows, 0])
+    )
+    J = np.array(segments.jacobian.map(len(t))(t[None], points.T, u.T, p.T)).reshape(n, -1, n).transpose(1, 0, 2)
     stiffness = np.abs(np.linalg.eigvals(J[np.isfinite(J).all(axis=(1, 2))])).max(initial=0.0)
     return min(max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step)), MOST_SUBSTEPS)
 

@@ -91,8 +91,8 @@ class Residuals:
     phase : int
     outputs : tuple of str
     measured : ndarray, shape (n, len(outputs))
-    noise : ndarray, shape (len(outputs),)
-        Standard deviations [unit of the output].
+    noise : ndarray, shape (len(outputs),) or (len(outputs), n)
+        Standard deviations [unit of the output], of each sample where they differ.
     """
 
     phase: int

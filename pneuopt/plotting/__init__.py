@@ -1,9 +1,10 @@
-"""Results as matplotlib figures: a fit beside its logs, friction, step responses, a Bode plot, studies.
+"""Results as matplotlib figures: a fit beside its logs, its residuals, friction, step responses, a Bode plot, studies.
 
 No window is opened and no global state is touched: each function returns a `Figure`, `save_figure` writes it.
 """
 
 from pneuopt.plotting.canvas import check_figure_path, save_figure
+from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
 from pneuopt.plotting.fits import has_friction_map, plot_fit, plot_friction, plot_prediction
 from pneuopt.plotting.loops import Response, plot_bode, plot_steps
 from pneuopt.plotting.maps import plot_map
@@ -13,10 +14,12 @@ __all__ = [
     "check_figure_path",
     "has_friction_map",
     "plot_bode",
+    "plot_correlation",
     "plot_fit",
     "plot_friction",
     "plot_map",
     "plot_prediction",
+    "plot_residuals",
     "plot_steps",
     "save_figure",
 ]

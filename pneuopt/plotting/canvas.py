@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = ("png", "pdf", "svg")
 GREY, BLUE, ORANGE, RED = "0.55", "#1f6fb2", "#e07b00", "#c0392b"
+SCALED = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}  # SI units are too coarse or too fine for these
 MOST_COLUMNS = 3  # that can still be read at 1000 pixels
 
 

@@ -1,27 +1,31 @@
 """Fits and predictions beside their logs; the friction that the logs imply."""
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.derived import propagated
 from pneuopt.errors import require
 from pneuopt.experiments import CHANNELS, Experiment, differentiate
 from pneuopt.parameters import ParameterSet
-from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, axes_grid, legend_above, shown_of
+from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, SCALED, axes_grid, legend_above, shown_of
 from pneuopt.system import System, names, vector
 from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 Pairs = Sequence[tuple[Trajectory, Trajectory]]
+BAND = 1.96  # standard deviations, 95 %
 SLOPE_SAMPLES = 20  # of a local derivative
 MOST_POINTS = 4000  # of a measured line or cloud
-SCALED = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}  # SI units are too coarse or too fine for these
 
 
 class Fitted(Protocol):
@@ -35,6 +39,16 @@ class Fitted(Protocol):
     @property
     def trajectories(self) -> Mapping[str, Trajectory]:
         """Fitted states and outputs of each log."""
+        ...
+
+    @property
+    def estimates(self) -> "pd.DataFrame":
+        """A row a free parameter."""
+        ...
+
+    @property
+    def covariance(self) -> "pd.DataFrame":
+        """Of the estimates."""
         ...
 
 
@@ -92,7 +106,7 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
 
 
 def plot_friction(system: System, result: Fitted, experiments: Sequence[Experiment]) -> "Figure":
-    """The friction force that the logs imply against speed, with the fitted curve on top.
+    """The friction force that the logs imply against speed, with the fitted curve and its 95 % band on top.
 
     For a `MotionDrive` the force as measured, offset and pressure and all. For a `ForceDrive` the force less load and
     mass times acceleration, each derivative a local slope of the log: of the fit, only the load is in the points. Where
@@ -127,12 +141,27 @@ def plot_friction(system: System, result: Fitted, experiments: Sequence[Experime
         axes.plot(speed[::every], fitted[::every], ".", color=BLUE, ms=2.5, label="fitted")
     else:
         grid = _speeds(speed)
-        axes.plot(grid, _steady_friction(system, result.parameters, grid), color=BLUE, lw=1.6, label="fitted")
+        _curve(axes, system, result, grid)
     low, high = np.nanpercentile(force, [0.5, 99.5])
     axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
     axes.set(xlabel="speed [m/s]", ylabel="force [N]" if imposed else "friction force [N]")
     legend_above(figure, axes)
     return figure
+
+
+def _curve(axes: "Axes", system: System, result: Fitted, grid: Array) -> None:
+    """The fitted curve, and how far the estimates' covariance lets it move; no band where it does not say."""
+    shared = [n for n in result.covariance.index if n in result.parameters]
+
+    def friction(values: Mapping[str, float]) -> Array:
+        moved = {n: replace(result.parameters[n], value=values[n], lower=-math.inf, upper=math.inf) for n in shared}
+        return _steady_friction(system, result.parameters | ParameterSet(moved), grid)
+
+    force, spread = propagated(result, friction)
+    if np.isfinite(spread).all():
+        low, high = force - BAND * spread, force + BAND * spread
+        axes.fill_between(grid, low, high, color=BLUE, alpha=0.3, lw=0, label="95 % band")
+    axes.plot(grid, force, color=BLUE, lw=1.2, label="fitted")
 
 
 def has_friction_map(system: System) -> bool:

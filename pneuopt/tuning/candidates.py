@@ -1,31 +1,26 @@
-"""Candidates of a tuning: where they lie, what they are as printed, and how they respond, many at once and compiled."""
+"""Candidates of a tuning: where they lie, what they are as printed, and how a response is run and read."""
 
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import sensitivities
 from pneuopt.control.metrics import About, step_metrics
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.requirements import MaxSensitivity, Specification, read
-from pneuopt.system import Linearisation, names
+from pneuopt.system import Linearisation
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 STABLE = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
 MOST_SUBSTEPS = 100
-MOST_NEIGHBOURS = 1000
-RUNAWAY = 1e12
-LOST = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity", "Ripple", "Excess")
 POINTS = 1000  # samples of a response where the loop has no sample time
 
 
@@ -80,23 +75,44 @@ class Space:
         """Every corner of the box and the start, shape (2**n + 1, n)."""
         return np.array([*itertools.product(*self.bounds), self.start])
 
-    def printed(self, point: Array, digits: int, around: int = 0) -> Array:
-        """The point with so many significant digits, and its neighbours up to `around` last places away.
+    def vectors(self, points: Array) -> Array:
+        """Every parameter's value at each point, shape (m, n_parameters)."""
+        rows = np.tile([p.value for p in self.parameters.values()], (len(points), 1))
+        rows[:, [list(self.parameters).index(n) for n in self.names]] = np.clip(points, *self.bounds.T)
+        return rows
+
+    def printed(self, point: Array, digits: int) -> Array:
+        """The point with so many significant digits, shape (n,).
 
         Examples
         --------
         >>> gains = ParameterSet({"pid.Kp": Parameter(0.39661, "1", 0.0, 1.0, free=True)})
-        >>> Space(gains, ("pid.Kp",)).printed(np.array([0.39661]), 4, 1).ravel().tolist()
-        [0.3965, 0.3966, 0.3967]
+        >>> space = Space(gains, ("pid.Kp",))
+        >>> space.printed(space.start, 4).item(), space.neighbours(np.array([0.3966]), 4).ravel().tolist()
+        (0.3966, [0.3965, 0.3967])
         """
-        around = around if (2 * around + 1) ** len(point) <= MOST_NEIGHBOURS else 0
-        choices = []
-        for value, (low, up) in zip(point, self.bounds, strict=True):
-            place = 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1) if value else 1.0
-            steps = range(-around, around + 1) if value else (0,)
-            near = [float(f"{value + k * place:.{digits}g}") for k in steps]
-            choices.append([v for v in dict.fromkeys(near) if low <= v <= up] or [value])
-        return np.array(list(itertools.product(*choices)))
+        found = np.array(point)
+        for k, (value, (low, up)) in enumerate(zip(point.tolist(), self.bounds, strict=True)):
+            rounded = (_rounded(value + n * _place(value, digits), digits) for n in (0, -1, 1))
+            found[k] = next((v for v in rounded if low <= v <= up), value)
+        return found
+
+    def neighbours(self, printed: Array, digits: int) -> Array:
+        """The points that differ from a printed one by a last place in one coordinate, shape (m, n) with m <= 2 n."""
+        found = []
+        for k, (value, (low, up)) in enumerate(zip(printed.tolist(), self.bounds, strict=True)):
+            sides = (_rounded(value + n * _place(value, digits), digits) for n in (-1, 1)) if value else ()
+            found += [np.where(np.arange(len(printed)) == k, v, printed) for v in sides if low <= v <= up]
+        return np.reshape(found, (-1, len(printed)))
+
+
+def _place(value: float, digits: int) -> float:
+    """What one in the last of so many digits is worth."""
+    return float(10.0 ** (np.floor(np.log10(abs(value))) - digits + 1)) if value else 0.0
+
+
+def _rounded(value: float, digits: int) -> float:
+    return float(f"{value:.{digits}g}")
 
 
 def span(loop: ClosedLoop, parameters: ParameterSet) -> Space:
@@ -131,6 +147,8 @@ def measure(
     loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory, band: float
 ) -> dict[str, float]:
     """The metrics of a simulated response, the settling band around the reference.
+
+    What counts is the plant's own signal, whatever a sensor shows the controller of it.
 
     Parameters
     ----------
@@ -180,14 +198,14 @@ def spacing(loop: ClosedLoop, reference: Step) -> float:
 def fastest(loop: ClosedLoop, space: Space, states: Sequence[Array]) -> float:
     """The largest eigenvalue's size [1/s] of the loop, over the box's corners and the given states."""
     system = loop.system() if loop.pid.sample_time is None else loop.held()
-    found = 0.0
-    for corner in space.corners():
-        parameters = space.filled(corner)
-        for x in states:
-            found = max(
-                found, float(np.max(np.abs(np.linalg.eigvals(system.linearise(x, {}, parameters).A)), initial=0.0))
-            )
-    return found
+    x, p = ca.SX.sym("x", len(system.states)), ca.SX.sym("p", len(system.parameters))
+    rates = system.ode(0, x, np.zeros(len(system.inputs)), p)[0]
+    slope = ca.Function("slope", [x, p], [ca.densify(ca.jacobian(rates, x))])
+    corners = space.vectors(space.corners())
+    rows, n = len(states) * len(corners), x.numel()
+    found = slope.map(rows)(np.tile(np.array(states), (len(corners), 1)).T, np.repeat(corners, len(states), axis=0).T)
+    A = found.full().reshape(n, rows, n).transpose(1, 0, 2)
+    return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
 
 
 def substeps(rate: float, h: float) -> int:
@@ -205,116 +223,3 @@ def substeps(rate: float, h: float) -> int:
         f"{MOST_SUBSTEPS}; narrow the gains' bounds (raise the lower one of pid.Tf), smooth the friction, or shorten h",
     )
     return max(1, k)
-
-
-class Simulator:
-    """Compiled responses of many candidates to the references, and what the requirements read off them.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    references : sequence of Step
-    space : Space
-    """
-
-    def __init__(self, loop: ClosedLoop, references: Sequence[Step], space: Space) -> None:
-        self._loop, self._references, self._space = loop, tuple(references), space
-        self._rest = [_rest(loop, space, r) for r in references]
-        self._system = loop.discrete()
-        self._rollout = Rollout(self._system.pieces)
-        moving = [x for r, rest in zip(references, self._rest, strict=True) for x in self._visited(r, rest)]
-        rate = fastest(loop, space, moving)
-        self._substeps = [substeps(rate, spacing(loop, r)) for r in references]
-        slowest = 1 / max(r.horizon for r in references)
-        self._omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
-        self._sensitivities = sensitivities(loop, self._omega)
-
-    def values(self, points: Array, spec: Specification) -> list[dict[str, float]]:
-        """What the requirements read, the worst over the references, of each candidate.
-
-        Parameters
-        ----------
-        points : ndarray, shape (m, n)
-        spec : Specification
-            Its band counts, and whether the sensitivity does; "Excess" is the mean error near the end, for what never
-            settles.
-        """
-        robust = spec.concerns(MaxSensitivity)
-        found = [self._respond(k, points, spec.band, robust) for k in range(len(self._references))]
-        return [worst([{**read(m), "Excess": m["Excess"]} for m in metrics]) for metrics in zip(*found, strict=True)]
-
-    def table(self, point: Array, spec: Specification) -> list[dict[str, float]]:
-        """The metrics of one candidate, a row a reference."""
-        return [self._respond(k, point[None], spec.band, True)[0] for k in range(len(self._references))]
-
-    def _respond(self, k: int, points: Array, band: float, robust: bool) -> list[dict[str, float]]:
-        reference, m = self._references[k], len(points)
-        sets = [self._space.filled(point) for point in points]
-        h = spacing(self._loop, reference)
-        run = inputs(self._loop, reference, h)
-        u = np.tile(run.matrix(names(self._loop.inputs)), (m, 1, 1))
-        p, t = np.array([self._loop.numbers(s) for s in sets]), np.tile(run.t, (m, 1))
-        starts, steps = self._starts(k, reference, sets), np.full((m, len(run)), h)
-        with np.errstate(all="ignore"):
-            found = self._rollout.run(starts, u, p, t, steps, substeps=self._substeps[k])
-            sound = (np.abs(found.y) < RUNAWAY).all(axis=(1, 2)) & np.isfinite(found.x_end).all(axis=1)
-        outputs = names(self._loop.outputs)
-        command = outputs.index("control")
-        metrics = [dict.fromkeys(LOST, np.inf) for _ in points]
-        for i in np.flatnonzero(sound).tolist():
-            response = Trajectory(run.t, dict(zip(outputs, found.y[i].T, strict=True)))
-            metrics[i] = self._read(sets[i], reference, response, band)
-        if robust and sound.any():
-            peaks = self._peaks(p[sound], found.x_end[sound], found.y[sound, -1, command])
-            for i, peak in zip(np.flatnonzero(sound).tolist(), peaks.tolist(), strict=True):
-                metrics[i]["MaxSensitivity"] = peak
-        return metrics
-
-    def _read(self, parameters: ParameterSet, reference: Step, response: Trajectory, band: float) -> dict[str, float]:
-        metrics = measure(self._loop, parameters, reference, response, band)
-        late = response.t >= 0.8 * reference.horizon + 0.2 * reference.at
-        error = np.abs(response[self._loop.feedback.name][late] - reference.final)
-        metrics["Excess"] = float(np.mean(error)) / abs(reference.size)
-        return metrics
-
-    def _peaks(self, p: Array, x_end: Array, commands: Array) -> Array:
-        """Ms on a grid, about the states in which the responses end; an absent filter counts as in `cut`."""
-        p, filtered = p.copy(), list(self._loop.parameters).index("pid.Tf")
-        p[:, filtered] = np.where(p[:, filtered] == 0, 0.5 * (self._loop.pid.sample_time or 0.0), p[:, filtered])
-        return self._sensitivities(p, x_end[:, : len(self._loop.plant.states)], commands)
-
-    def _starts(self, k: int, reference: Step, sets: Sequence[ParameterSet]) -> Array:
-        rest = self._rest[k]
-        if rest is not None:
-            return np.tile(rest, (len(sets), 1))
-        return np.array([self._loop.initial(s, reference=reference.initial, start=reference.start) for s in sets])
-
-    def _visited(self, reference: Step, rest: Array | None) -> list[Array]:
-        """Some states along the response of the given gains, and the rest."""
-        h = spacing(self._loop, reference)
-        run = inputs(self._loop, reference, h)
-        start = rest
-        if start is None:
-            start = self._loop.initial(self._space.parameters, reference=reference.initial, start=reference.start)
-        p, u = self._loop.numbers(self._space.parameters), run.matrix(names(self._loop.inputs))
-        found = self._rollout.run(
-            start[None], u[None], p, run.t[None], np.full((1, len(run)), h), substeps=MOST_SUBSTEPS, states=True
-        ).x
-        states = (
-            [] if found is None else [x for x in found[0][:: max(1, len(run) // 10)] if bool(np.all(np.isfinite(x)))]
-        )
-        return [start, *states]
-
-
-def worst(found: Sequence[dict[str, float]]) -> dict[str, float]:
-    """The largest of each value over the references; NaN wins."""
-    return {n: float(np.max([values[n] for values in found])) for n in found[0]}
-
-
-def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array | None:
-    """The loop's rest before the step where it does not depend on the gains."""
-    first = loop.initial(space.parameters, reference=reference.initial, start=reference.start)
-    other = space.filled(space.draw(np.full(len(space.names), 0.7)))
-    second = loop.initial(other, reference=reference.initial, start=reference.start)
-    scale = np.array([q.nominal for q in loop.states])
-    return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None

@@ -4,7 +4,7 @@ For any loop, friction, clip and sampling included. Directly at a narrow band a 
 what settles within 10 % leads to what settles within 2 %.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,8 @@ from scipy.optimize import minimize
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
 from pneuopt.requirements import MaxSensitivity, Specification, name
-from pneuopt.tuning.candidates import Simulator, Space, Tell
+from pneuopt.tuning.candidates import Space, Tell
+from pneuopt.tuning.simulator import Simulator
 
 Array = NDArray[np.float64]
 PENALTY = 20.0  # weight of a limit's relative violation, in units of the objective's scale
@@ -44,7 +45,7 @@ class Screening:
     """
 
     members: int = 40
-    generations: int = 10
+    generations: int = 15
     bands: tuple[float, ...] = (0.1, 0.05)
     refinements: int = 300
     margin: float = 0.015
@@ -59,6 +60,25 @@ class Screening:
         require(self.digits is None or self.digits >= 2, f"Screening: digits must be at least 2, got {self.digits}")
 
 
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """What `screen` found.
+
+    Attributes
+    ----------
+    point : ndarray, shape (n,)
+        The best by merit.
+    count : int
+        Candidates simulated.
+    is_complete : bool
+        False where Ctrl-C cut the search short.
+    """
+
+    point: Array
+    count: int
+    is_complete: bool
+
+
 def screen(
     simulator: Simulator,
     references: Sequence[Step],
@@ -67,8 +87,8 @@ def screen(
     method: Screening,
     start: Array,
     tell: Tell,
-) -> tuple[Array, int]:
-    """The best point found, and how many candidates were simulated.
+) -> Screened:
+    """The best point found; Ctrl-C ends the search with the best so far.
 
     Parameters
     ----------
@@ -80,48 +100,58 @@ def screen(
     tell : callable
         Hears of each generation.
     """
-    judge = _Judge(simulator, space, spec, min(r.horizon - r.at for r in references))
+    judge = _Judge(simulator, space, spec, min(r.horizon - r.at for r in references), space.unit(start))
+    try:
+        _search(judge, spec, method, tell)
+    except KeyboardInterrupt:
+        return Screened(space.draw(judge.best), judge.count, is_complete=False)
+    return Screened(space.draw(judge.best), judge.count, is_complete=True)
+
+
+def _search(judge: "_Judge", spec: Specification, method: Screening, tell: Tell) -> None:
     rng = np.random.default_rng(method.seed)
-    population = _first_population(method.members, space.unit(start), rng)
+    population = _first_population(method.members, judge.best, rng)
     for band in [*(b for b in method.bands if b > spec.band), spec.band, spec.band]:
-        judge.spec = spec.with_band(band)
+        judge.ask(spec.with_band(band))
         merits = judge(population)
         for number in range(method.generations):
             population, merits = _generation(population, merits, judge, rng)
             tell(f"band {band:.3g}, generation {number + 1} of {method.generations}: best {merits.min():.4g}")
-    best = population[np.argmin(merits)]
-    return space.draw(_refined(best, judge, method.refinements) if method.refinements else best), judge.count
+    if method.refinements:
+        _refine(judge.best, judge, method.refinements)
 
 
 class _Judge:
-    """Merit of points of the unit cube, one a row; counts them."""
+    """Merit of points of the unit cube, one a row; counts them, and keeps the best under what was asked last."""
 
-    def __init__(self, simulator: Simulator, space: Space, spec: Specification, scale: float) -> None:
-        self._simulator, self._space, self._scale = simulator, space, scale
-        self.spec, self.count = spec, 0
+    def __init__(self, simulator: Simulator, space: Space, spec: Specification, scale: float, start: Array) -> None:
+        self._simulator, self._space, self._spec, self._scale = simulator, space, spec, scale
+        self.best, self._least, self.count = start, np.inf, 0
+
+    def ask(self, spec: Specification) -> None:
+        """Judge by another specification from now on."""
+        self._spec, self._least = spec, np.inf
 
     def __call__(self, unit: Array) -> Array:
-        self.count += len(unit)
-        return self._merits(unit, self.spec)
+        return self.race(unit, np.full(len(unit), np.inf))
 
     def race(self, unit: Array, rivals: Array) -> Array:
         """The merit of each point that may beat its rival, and of the others a lower bound that does not.
 
-        The sensitivity, a frequency response a point, costs more than a simulation; as a limit it only adds.
+        The sensitivity, a frequency response a point, costs as much as a simulation; as a limit it only adds.
         """
-        quick = self.spec.without(MaxSensitivity)
-        if quick.limits == self.spec.limits or quick.concerns(MaxSensitivity):
-            return self(unit)
         self.count += len(unit)
-        merits = self._merits(unit, quick)
-        ahead = merits <= rivals
-        if ahead.any():
-            merits[ahead] = self._merits(unit[ahead], self.spec)
+        responses = self._simulator.respond(self._space.draw(np.clip(unit, 0.0, 1.0)), self._spec.band)
+        merits = np.full(len(unit), -np.inf)
+        if not self._spec.weight(MaxSensitivity):
+            merits = merit(responses.values, self._spec.without(MaxSensitivity), self._scale)
+        if self._spec.concerns(MaxSensitivity):
+            ahead = merits <= rivals
+            merits[ahead] = merit(responses.robust(ahead), self._spec, self._scale)
+        k = int(np.argmin(merits))
+        if merits[k] < self._least:
+            self.best, self._least = unit[k], float(merits[k])
         return merits
-
-    def _merits(self, unit: Array, spec: Specification) -> Array:
-        found = self._simulator.values(self._space.draw(np.clip(unit, 0.0, 1.0)), spec)
-        return np.array([merit(values, spec, self._scale) for values in found])
 
 
 def _generation(population: Array, merits: Array, judge: _Judge, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -142,8 +172,8 @@ def _generation(population: Array, merits: Array, judge: _Judge, rng: np.random.
     return np.where(better[:, None], trial, population), np.where(better, found, merits)
 
 
-def _refined(best: Array, judge: _Judge, most: int) -> Array:
-    """Nelder-Mead from a small simplex."""
+def _refine(best: Array, judge: _Judge, most: int) -> None:
+    """Nelder-Mead from a small simplex; the judge keeps the best."""
     steps = np.where(best < 0.5, 0.03, -0.03) * np.eye(len(best))
     options = {"maxfev": most, "initial_simplex": np.vstack([best, best + steps]), "xatol": 1e-5, "fatol": 1e-7}
     settings: Any = {"method": "Nelder-Mead", "bounds": [(0.0, 1.0)] * len(best), "options": options}
@@ -151,25 +181,28 @@ def _refined(best: Array, judge: _Judge, most: int) -> Array:
     def cost(unit: Array) -> float:
         return float(judge(unit[None])[0])
 
-    local = minimize(cost, best, **settings)
-    return np.asarray(local.x, dtype=float)
+    minimize(cost, best, **settings)
 
 
-def merit(values: dict[str, float], spec: Specification, scale: float) -> float:
+def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
     """The objective and a penalty on what the limits forbid; graded where nothing settles, so that a search can start.
 
     Parameters
     ----------
-    values : dict
-        As `Simulator.values` gives them.
+    values : mapping of str to ndarray, shape (m,)
+        As `Responses` has them.
     scale : float
         The horizon, which stands for the settling time of what never settles [s].
     """
-    filled = {k: v if np.isfinite(v) else LOST for k, v in values.items()}
-    if not np.isfinite(values.get("SettlingTime", 0.0)):
-        filled["SettlingTime"] = scale * (2 + min(values["Excess"], LOST))
-    excess = [max(0.0, filled[name(q)] / (q.max or 1.0) - 1) for q in spec.limits]
-    return min(spec.objective(filled) + PENALTY * scale * sum(excess), LOST)
+    filled = {n: np.where(np.isfinite(value), value, LOST) for n, value in values.items()}
+    unsettled = scale * (2 + np.minimum(filled["Excess"], LOST))
+    filled["SettlingTime"] = np.where(np.isfinite(values["SettlingTime"]), filled["SettlingTime"], unsettled)
+    total = np.zeros_like(unsettled)
+    for q, weight in spec.weights.items():
+        total += weight * filled[name(q)]
+    for q in spec.limits:
+        total += PENALTY * scale * np.maximum(0.0, filled[name(q)] / (q.max or 1.0) - 1)
+    return np.minimum(total, LOST)
 
 
 def _first_population(members: int, start: Array, rng: np.random.Generator) -> Array:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_grid, sensitivity_terms
+from pneuopt.control.metrics import TAIL
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
 from pneuopt.nlp.full_space import FullSpace, prepare, solve_from
@@ -151,7 +152,7 @@ def _cost(solution: Solution) -> float:
 def _extra(references: Sequence[Step], spec: Specification) -> ParameterSet:
     """The settling time, and an unknown for each further term of the objective."""
     horizon = min(r.horizon - r.at for r in references)
-    most = min(spec.limit(SettlingTime), horizon)
+    most = min(spec.limit(SettlingTime), (1 - TAIL) * horizon)  # in the rest a metric would not call it settled
     free = spec.weight(SettlingTime) > 0
     given = {
         SETTLING: Parameter(

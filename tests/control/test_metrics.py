@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.metrics import About, step_metrics
+from pneuopt.control.metrics import About, batch_metrics, step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.errors import InputError
 from pneuopt.parameters import ParameterSet
@@ -122,6 +122,36 @@ def test_a_loop_that_hunts_or_creeps_never_settles() -> None:
     backwards = step_metrics(T, -response(), 1.0, 0.0)
     assert np.isnan(backwards["OvershootFinal"])
     assert backwards["Undershoot"] > 90
+
+
+@pytest.mark.parametrize("about", list(About))
+@pytest.mark.parametrize("final", [None, 1.0])
+def test_what_is_in_the_band_only_at_the_very_end_has_not_settled(about: About, final: float | None) -> None:
+    """A ramp through the band ends in it; so does a limit cycle that a horizon cuts at the right moment."""
+    for end, settles in ((1.0, False), (4.0, True)):
+        t = np.linspace(0.0, end, 2001)
+        ramp = np.minimum(1.0, 0.02 + t)
+        settled = step_metrics(t, ramp, 1.0, 0.0, about=about, final=final)["SettlingTime"]
+        assert settled == (pytest.approx(0.96, abs=1e-3) if settles else pytest.approx(np.nan, nan_ok=True))
+    hunting = 1.0 + 0.5 * np.sin(2 * np.pi * 4 * T / T[-1])
+    assert np.isnan(step_metrics(T, hunting, 1.0, 0.0, about=about, final=1.0)["SettlingTime"])
+
+
+def test_under_dither_two_periods_in_the_band_are_asked_for() -> None:
+    t, period = np.linspace(0.0, 1.0, 1001), 0.1
+    for begins, settles in ((0.75, True), (0.82, False)):
+        y = np.where(t < begins, 0.5, 1.0) + 0.01 * np.sin(2 * np.pi * t / period)
+        settled = step_metrics(t, y, 1.0, 0.0, about=About.REFERENCE, dither_period=period)["SettlingTime"]
+        assert np.isfinite(settled) == settles
+
+
+def test_many_responses_are_measured_as_each_alone() -> None:
+    rows = np.array([response(0.2), response(0.7, 1.3), -response(), 0.01 * T, np.ones_like(T)])
+    for period in (None, 0.25):
+        many = batch_metrics(T, rows, 1.0, 0.0, dither_period=period, control=2 * rows)
+        for k, y in enumerate(rows):
+            one = step_metrics(T, y, 1.0, 0.0, dither_period=period, control=2 * y)
+            assert one == pytest.approx({n: value[k] for n, value in many.items()}, nan_ok=True)
 
 
 def test_dither_is_averaged_without_phase_shift() -> None:

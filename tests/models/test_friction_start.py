@@ -190,3 +190,32 @@ def test_the_misfit_is_what_no_friction_explains() -> None:
     assert misfit({"run": rows}) < 1.0
     assert misfit({"run": replace(rows, force=right + wrong)}) == pytest.approx(np.mean(np.abs(wrong)), rel=0.1)
     assert misfit({"run": replace(rows, force=np.full(4000, np.nan))}) == np.inf
+
+
+def test_static_friction_shows_where_the_drive_gives_way() -> None:
+    # a slip is over before filtered samples of Stribeck's range are many: the slow samples tell its level
+    drive, t = ForceDrive(Stribeck()), np.linspace(0, 3, 3000, endpoint=False)
+    truth = true_values(drive.parameters, friction__static=60.0, friction__stribeck_velocity=0.005, load__force=0.0)
+    force = 70 * np.sin(2 * np.pi * t)
+    system = drive.system()
+    run = compute(discretise(system), force[:, None], vector(system.parameters, truth), t)
+    free = truth.freed("friction.coulomb", "friction.static", "friction.viscous", "friction.stribeck_velocity")
+    log = Trajectory(t, {"force": force, "position": run["position"]})
+    found = {s.parameters["friction.stribeck_velocity"]: s.parameters for s in starts(drive, {"run": log}, free)}
+    assert found[0.006]["friction.static"] == pytest.approx(60, rel=0.15)
+    assert found[0.006]["friction.coulomb"] == pytest.approx(30, rel=0.05)
+
+
+def test_bending_bristles_do_not_pass_for_sliding() -> None:
+    drive, t = ForceDrive(LuGre()), np.linspace(0, 4, 4000, endpoint=False)
+    truth = true_values(drive.parameters, load__force=0.0)
+    force = np.where(t > 3, 55.0, 28.0) * np.sin(2 * np.pi * 2 * t)  # mostly presliding, and not slowly
+    system = drive.system()
+    run = compute(discretise(system), force[:, None], vector(system.parameters, truth), t)
+    log = Trajectory(t, {"force": force, "position": run["position"]})
+    free = truth.freed(
+        "friction.coulomb", "friction.static", "friction.stribeck_velocity", "friction.bristle_stiffness"
+    )
+    values = starts(drive, {"run": log}, free)[0].parameters
+    assert values["friction.coulomb"] == pytest.approx(30, rel=0.1)
+    assert values["friction.bristle_stiffness"] == pytest.approx(6e4, rel=0.2)

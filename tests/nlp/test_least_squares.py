@@ -257,7 +257,7 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
     best: OptimizeResult = least_squares(partial(all_residuals, problem, fit), here, xtol=1e-13, ftol=1e-13, gtol=1e-10)
     assert fit.covariance is not None
     spread = np.sqrt(np.diag(fit.covariance))
-    assert np.abs((best.x[:4] - found(fit)) / spread).max() < 1e-3
+    assert np.abs((best.x[:4] - found(fit)) / spread).max() < 5e-3
     J: Array = np.asarray(best.jac)
     dense = np.linalg.inv(J.T @ J)[:4, :4]
     assert_allclose(np.diag(fit.covariance), np.diag(dense), rtol=1e-3)
@@ -284,7 +284,7 @@ def test_a_model_too_stiff_to_search_is_told_at_once() -> None:
     stiff = problem.parameters.with_bounds({"damping": (0.0, 1e6)}).with_values({"damping": 3e4})
     fit = solve_least_squares(replace(problem, parameters=stiff))
     assert fit.solution.status.code is Code.NOT_CONVERGED
-    assert "takes 429 integration steps" in fit.solution.status.message
+    assert "takes 300 integration steps" in fit.solution.status.message
     assert fit.solution.stats["iterations"] == 0
 
 

@@ -8,7 +8,8 @@ from pneuopt.errors import ModelError
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre
 from pneuopt.models.load import Load
-from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for, tightness
+from pneuopt.nlp.equations import normal_equations
+from pneuopt.nlp.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.system import System, discretise
@@ -60,22 +61,23 @@ def test_each_segment_knows_its_parameters() -> None:
     names = [list(segments.system.parameters)[i] for i in segments.columns]
     assert set(names) == set(FREE)
     free = segments.transcription.parameters.free_names
-    found = [[free[i] for i in row] for row in segments.unknowns]
+    found = [[free[i] for i in block.unknowns] for block in segments.blocks]
     assert found[0] == names
-    assert found[4] == [n if n != "load.mass" else "load.mass[b]" for n in names]
+    assert [block.rows for block in segments.blocks] == [slice(0, 3), slice(3, 5)]
+    assert found[1] == [n if n != "load.mass" else "load.mass[b]" for n in names]
 
 
 def test_segments_from_one_trajectory_join_to_it() -> None:
     """From the states of one long run, the segments give that run again: gaps of zero, the same outputs."""
     whole = segment(posed(phase("a", 21, nodes=every(21, 21))))
     q = np.array([p.value for p in whole.transcription.parameters.values()])
-    (run,) = whole.trajectories(start_nodes(whole), q, 5)
+    (run,) = whole.trajectories(whole.run(start_nodes(whole), q, 5, states=True))
     states = run.matrix(["position", "speed"])
     parts = segment(posed(phase("a", 21, guess=states)))
     nodes = start_nodes(parts)
     pieces = parts.run(nodes, q, 5, sensitivities=True)
     assert_allclose(pieces.x_end[:-1], nodes[1:], rtol=1e-12)
-    (again,) = parts.trajectories(nodes, q, 5)
+    (again,) = parts.trajectories(parts.run(nodes, q, 5, states=True))
     assert_allclose(again["speed"], run["speed"], rtol=1e-12)
     assert_array_equal(again.t, run.t)
 
@@ -149,3 +151,16 @@ def test_a_static_map_needs_one_step_and_has_no_states() -> None:
     assert substeps_for(segments, start_nodes(segments), np.zeros(len(problem.parameters))) == 1
     assert tightness(segments, 0.01).shape == (0,)
     assert segments.nominal.shape == (0,)
+
+
+def test_a_correction_stands_for_finer_steps() -> None:
+    """What finer steps add, added to coarse ones: the same residuals and gaps."""
+    segments = both()
+    q = np.array([p.value for p in segments.transcription.parameters.values()])
+    nodes, free = start_nodes(segments), len(segments.transcription.free)
+    coarse, fine = (segments.run(nodes, q, k) for k in (2, 20))
+    correction = Correction(fine.y - coarse.y, fine.x_end - coarse.x_end, fine)
+    given = (segments, nodes, q, np.ones(free), np.full(2, 1e-3))
+    corrected, exact = normal_equations(*given, 2, correction), normal_equations(*given, 20)
+    assert corrected.cost == pytest.approx(exact.cost, rel=1e-9)
+    assert_allclose(corrected.gaps, exact.gaps, atol=1e-12)

@@ -7,6 +7,7 @@ import b32_partial
 import emps
 import pandas as pd
 import pytest
+import real_logs
 import rig_demo
 import seal_friction
 import simulation_speed
@@ -72,6 +73,11 @@ def test_b32() -> None:
 @pytest.mark.slow
 def test_b32_partial() -> None:
     assert failed(b32_partial.main()) == []
+
+
+@pytest.mark.slow
+def test_real_logs() -> None:
+    assert failed(real_logs.main()) == []
 
 
 @pytest.mark.slow

@@ -1,0 +1,163 @@
+"""`pneuopt identify` and `pneuopt simulate --log`: from logs to parameters, and back to logs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pneuopt.commands.shared import (
+    Outputs,
+    Writers,
+    background,
+    figure_writers,
+    finish,
+    hashes,
+    warn,
+    warn_of,
+    write_csv,
+)
+from pneuopt.console import progress, screen, show_estimates, show_fit, show_selection, show_status, show_verdict
+from pneuopt.errors import InputError, require
+from pneuopt.experiments import Experiment, read_log, split
+from pneuopt.files import Drive, read_drive, write_fit
+from pneuopt.identifiability import Verdict, identifiability
+from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import friction_ladder
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.nlp.least_squares import LeastSquares
+from pneuopt.output import records
+from pneuopt.parameters import ParameterSet
+from pneuopt.plotting import (
+    has_friction_map,
+    plot_correlation,
+    plot_fit,
+    plot_friction,
+    plot_prediction,
+    plot_residuals,
+)
+from pneuopt.selection import select_model
+from pneuopt.system import System
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LEVELS = (
+    "friction.coulomb",
+    "friction.viscous",
+    "friction.static",
+    "friction.stribeck_velocity",
+    "friction.*_asymmetry",
+    "friction.bristle_*",
+)
+
+
+def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool) -> int:
+    """Identify from logs; returns the exit status."""
+    outputs.check(_inputs(drive, logs), "friction", "residuals", "correlation")
+    model, parameters = _read_free(drive)
+    system, experiments = model.system(), _experiments(logs, window)
+    for sentence in identifiability(system, experiments, parameters).sentences:
+        warn(f"before the fit: {sentence}")
+    with progress("identifying", quiet=quiet) as tell:
+        result = identify(system, experiments, parameters, method=LeastSquares(progress=tell), throw=False)
+    console = screen()
+    show_status(console, result.status)
+    show_estimates(console, result.estimates)
+    show_verdict(console, result.verdict)
+    show_fit(console, result.fit)
+    tables = {"estimates": records(result.estimates), "fit": records(result.fit), "verdict": _worded(result.verdict)}
+    writers: Writers = {}
+    if outputs.output is not None:
+        writers[outputs.output] = partial(write_fit, outputs.output, drive, result)
+    if outputs.plot is not None:
+        writers |= figure_writers(outputs.plot, _fit_figures(system, result, experiments))
+    return finish(outputs, writers, tables | background(result), result.status)
+
+
+def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool) -> int:
+    """Choose a friction model by the logs; returns the exit status."""
+    remedy = "write the model that is chosen into [friction], and identify again without --select"
+    require(outputs.output is None and outputs.plot is None, f"--select writes neither -o nor --plot; {remedy}")
+    outputs.check(_inputs(drive, logs))
+    model, parameters = _read_free(drive)
+    systems = _ladder(drive, model)
+    free = [n for n in parameters.free_names if not n.startswith("friction.")]
+    known = parameters.fixed("friction.*").select(
+        n for n in parameters if any(n in s.parameters for s in systems.values())
+    )
+    with progress("selecting", quiet=quiet) as tell:
+        chosen = select_model(
+            systems, _experiments(logs, window), known, free=[*free, *LEVELS], method=LeastSquares(progress=tell)
+        )
+    show_selection(screen(), chosen)
+    tables = {"recommended": chosen.recommended, "reason": chosen.reason, "candidates": records(chosen.table)}
+    return finish(outputs, {}, tables, chosen.fits[chosen.recommended].status)
+
+
+def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
+    """Predict a log in open loop; returns the exit status."""
+    outputs.check([fit, log, log.with_suffix(".toml")])
+    model, parameters = read_drive(fit)
+    system, experiment = model.system(), read_log(log)
+    warn_of(fit)
+    table = validate(system, [experiment], parameters)
+    show_fit(screen(), table)
+    writers: Writers = {}
+    if outputs.output is not None or outputs.plot is not None:
+        run = predict(system, experiment, parameters)
+        if outputs.plot is not None:
+            writers |= figure_writers(outputs.plot, {"": plot_prediction([run], [experiment], label="predicted")})
+        if outputs.output is not None:
+            given = {q.name: experiment.trajectory[q.name] for q in system.inputs}
+            columns = {q.name: (q.name, q.unit) for q in (*system.inputs, *system.outputs)}
+            writers[outputs.output] = partial(write_csv, outputs.output, run.with_columns(given), columns)
+    return finish(outputs, writers, {"fit": records(table), "provenance": hashes(fit, log)}, None)
+
+
+def _experiments(logs: Sequence[Path], window: float | None) -> list[Experiment]:
+    experiments = [read_log(path) for path in logs]
+    if window is None:
+        return experiments
+    require(window > 0, f"--window must be positive, got {window:g} s")
+    return [part for e in experiments for part in split(e, window)]
+
+
+def _inputs(drive: Path, logs: Sequence[Path]) -> list[Path]:
+    return [drive, *logs, *(log.with_suffix(".toml") for log in logs)]
+
+
+def _read_free(path: Path) -> tuple[Drive, ParameterSet]:
+    """A drive of which something is to be identified."""
+    model, parameters = read_drive(path)
+    remedy = 'mark what to identify, as in coulomb = { value = "40 N", free = true }'
+    require(len(parameters.free_names) > 0, f"{path}: no parameter is free; {remedy}")
+    return model, parameters
+
+
+def _ladder(path: Path, model: Drive) -> dict[str, System]:
+    """The drive with each friction model in turn."""
+    if not isinstance(model, ForceDrive | MotionDrive | PneumaticDrive):
+        raise InputError(f"{path}: --select chooses a drive's friction model; this plant is not built from one")
+    return {name: replace(model, friction=friction).system() for name, friction in friction_ladder().items()}
+
+
+def _worded(verdict: Verdict | None) -> dict[str, Any]:
+    if verdict is None:
+        return {}
+    return {"sentences": verdict.sentences, "untold": verdict.untold, "table": records(verdict.table)}
+
+
+def _fit_figures(
+    system: System, result: IdentificationResult, experiments: Sequence[Experiment]
+) -> dict[str, "Figure"]:
+    figures = {
+        "": plot_fit(result, experiments),
+        "residuals": plot_residuals(list(result.trajectories.values()), experiments),
+    }
+    if has_friction_map(system):
+        figures["friction"] = plot_friction(system, result, experiments)
+    if result.estimates["stderr"].notna().any():
+        figures["correlation"] = plot_correlation(result)
+    return figures

@@ -1,0 +1,155 @@
+"""`pneuopt tune` and `pneuopt simulate`: a loop's gains, and its response."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pneuopt.certify import evaluate, respond
+from pneuopt.commands.shared import (
+    INTERRUPTED,
+    Columns,
+    Outputs,
+    Writers,
+    background,
+    band_of,
+    beside,
+    figure_writers,
+    finish,
+    hashes,
+    read_loop,
+    write_csv,
+)
+from pneuopt.console import progress, screen, show_gains, show_metrics, show_rejected, show_status
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Step
+from pneuopt.errors import ConvergenceError, InputError, require
+from pneuopt.nlp.status import Code
+from pneuopt.output import check_outputs, records
+from pneuopt.parameters import ParameterSet
+from pneuopt.plotting import Response, plot_bode, plot_steps
+from pneuopt.trajectories import Trajectory
+from pneuopt.tune import TuningResult, tune
+from pneuopt.tuningfile import Tuning, write_tuned
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+
+def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
+    """Tune a loop; returns the exit status."""
+    outputs.check([fit, tuning], "bode")
+    asked, parameters = read_loop(fit, tuning)
+    remedy = 'add [minimise] with settling_time = { band = "2 %" }'
+    require(bool(asked.minimise), f"{tuning}: says nothing to minimise; {remedy}")
+    require(len(asked.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
+    with progress("tuning", quiet=quiet) as tell:
+        result = tune(
+            asked.loop,
+            asked.references,
+            parameters,
+            minimise=asked.minimise,
+            subject_to=asked.subject_to,
+            throw=False,
+            progress=tell,
+        )
+    result = replace(result, provenance={**result.provenance, **hashes(fit, tuning)})
+    console = screen()
+    show_status(console, result.status)
+    if result.status.converged:
+        show_gains(console, parameters, result.parameters)
+        show_metrics(console, result.certified, asked.loop, before=_before(asked, parameters), limits=asked.subject_to)
+    else:
+        word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
+        show_rejected(console, tuning, result.stats, parameters, word)
+        show_metrics(console, result.certified, asked.loop, title=word, limits=asked.subject_to)
+    if result.status.code is Code.INTERRUPTED:
+        console.print("no file is written")
+        return INTERRUPTED
+    writers: Writers = {}
+    if outputs.output is not None:
+        writers[outputs.output] = partial(write_tuned, outputs.output, tuning, result)
+    if outputs.plot is not None:
+        before_gains = parameters if result.status.converged else None
+        writers |= figure_writers(outputs.plot, _loop_figures(asked, result.parameters, before_gains))
+    return finish(outputs, writers, _tuning_tables(result) | background(result), result.status)
+
+
+def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
+    """Simulate the closed loop of a tuning's file; returns the exit status."""
+    outputs.check([fit, tuning], "bode")
+    asked, parameters = read_loop(fit, tuning)
+    metrics = evaluate(asked.loop, asked.references, parameters, band=band_of(asked))
+    show_metrics(screen(), metrics, asked.loop, limits=asked.subject_to)
+    writers: Writers = {}
+    if outputs.output is not None:
+        runs = [_with_reference(r) for r in _responses(asked, parameters)]
+        paths = numbered(outputs.output, len(runs))
+        check_outputs(paths, [fit, tuning])
+        columns = _loop_columns(asked.loop)
+        writers |= {p: partial(write_csv, p, run, columns) for p, run in zip(paths, runs, strict=True)}
+    if outputs.plot is not None:
+        writers |= figure_writers(outputs.plot, _loop_figures(asked, parameters, None))
+    tables = {"certified": records(metrics.T), "provenance": hashes(fit, tuning)}
+    return finish(outputs, writers, tables, None)
+
+
+def _before(asked: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
+    """The metrics with the gains as given; None where that loop cannot be simulated."""
+    try:
+        return evaluate(asked.loop, asked.references, parameters, band=band_of(asked))
+    except (ConvergenceError, InputError):
+        return None
+
+
+def _responses(asked: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> list[Response]:
+    loop, units = asked.loop, (asked.loop.feedback.unit, asked.loop.command.unit)
+    found = []
+    for reference in asked.references:
+        run = respond(loop, reference, parameters)
+        earlier = None if before is None else _response_before(loop, reference, before)
+        found.append(Response(run, reference, loop.feedback.name, units, earlier, loop.dither_period(parameters)))
+    return found
+
+
+def _response_before(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
+    try:
+        return respond(loop, reference, parameters)
+    except (ConvergenceError, InputError):
+        return None
+
+
+def _loop_figures(asked: Tuning, parameters: ParameterSet, before: ParameterSet | None) -> dict[str, "Figure"]:
+    """The steps, and the Bode plot about the state in which the first one ends."""
+    responses = _responses(asked, parameters, before)
+    loop, run = asked.loop, responses[0].run
+    x = np.array([run[q.name][-1] for q in loop.plant.states])
+    open_loop = loop.open_loop(parameters, x, {loop.command.name: float(run["control"][-1])})
+    return {"": plot_steps(responses, band=band_of(asked)), "bode": plot_bode(open_loop)}
+
+
+def numbered(path: Path, count: int) -> list[Path]:
+    """One file a run: run.csv, or run_1.csv, run_2.csv."""
+    return [path] if count == 1 else [beside(path, str(k)) for k in range(1, count + 1)]
+
+
+def _loop_columns(loop: ClosedLoop) -> Columns:
+    """Columns of a response as a log names them, so that it can be read as one."""
+    measured, command = loop.feedback, loop.command
+    columns = {"reference": (f"{measured.name}_reference", measured.unit)}
+    columns |= {q.name: (q.name, q.unit) for q in loop.plant.outputs}
+    return columns | {"control": (command.name, command.unit)}
+
+
+def _with_reference(response: Response) -> Trajectory:
+    run, reference = response.run, response.reference
+    return run.with_columns({"reference": np.where(run.t >= reference.at, reference.final, reference.initial)})
+
+
+def _tuning_tables(result: TuningResult) -> dict[str, Any]:
+    gains = result.parameters.select(result.parameters.free_names).to_frame()
+    tables = {"gains": gains, "claimed": result.claimed.T, "certified": result.certified.T}
+    return {name: records(table) for name, table in tables.items()} | {"active": result.active}

@@ -1,0 +1,120 @@
+"""What the commands share: the files that are wanted, and writing them once everything is computed."""
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pneuopt.console import screen, show_written
+from pneuopt.files import read_drive, read_status
+from pneuopt.identify import IdentificationResult
+from pneuopt.nlp.status import Code, Status
+from pneuopt.output import check_outputs, write_json, write_text
+from pneuopt.parameters import ParameterSet
+from pneuopt.plotting import check_figure_path, save_figure
+from pneuopt.requirements import SettlingTime
+from pneuopt.trajectories import Trajectory
+from pneuopt.tune import TuningResult
+from pneuopt.tuningfile import Tuning, read_tuning
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GOOD, NOT_GOOD, INTERRUPTED = 0, 1, 130
+Columns = Mapping[str, tuple[str, str]]
+Writers = dict[Path, Callable[[], None]]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The files that are wanted; `check` refuses early those that could not be written.
+
+    Attributes
+    ----------
+    output, json, plot : Path or None
+    """
+
+    output: Path | None
+    json: Path | None
+    plot: Path | None
+
+    def check(self, inputs: Sequence[Path], *others: str) -> None:
+        """Raise `InputError` for a file that cannot be written, or is an input; `others` name further figures."""
+        figures: list[Path] = []
+        if self.plot is not None:
+            check_figure_path(self.plot)
+            figures = [self.plot, *(beside(self.plot, name) for name in others)]
+        check_outputs([self.output, self.json, *figures], inputs)
+
+
+def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status: Status | None) -> int:
+    """Write everything, now that everything is computed."""
+    ended = {"status": {"code": status.code.value, "message": status.message}} if status else {}
+    if outputs.json is not None:
+        writers = {**writers, outputs.json: partial(write_json, outputs.json, {**ended, **tables})}
+    for write in writers.values():
+        write()
+    show_written(screen(), list(writers))
+    if status is None or status.converged:
+        return GOOD
+    return INTERRUPTED if status.code is Code.INTERRUPTED else NOT_GOOD
+
+
+def read_loop(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
+    """The loop, and all its numbers; of the plant nothing is free."""
+    model, plant = read_drive(fit)
+    asked = read_tuning(tuning, model.system())
+    warn_of(fit)
+    return asked, plant.fixed(*plant.free_names) | asked.parameters
+
+
+def warn_of(path: Path, what: str = "fit") -> None:
+    """Say on standard error if what wrote a file did not converge."""
+    status = read_status(path)
+    if status is not None and not status.converged:
+        warn(f"{path}: its {what} is {status}")
+
+
+def warn(message: str) -> None:
+    """Say on standard error what does not stop the command."""
+    screen(error=True).print(f"warning: {message}", soft_wrap=True)
+
+
+def band_of(asked: Tuning) -> float:
+    """The settling band that the requirements name; 2 % otherwise."""
+    requirements = (*asked.minimise, *asked.subject_to)
+    return next((q.band for q in requirements if isinstance(q, SettlingTime)), 0.02)
+
+
+def figure_writers(path: Path, figures: Mapping[str, "Figure"]) -> Writers:
+    """Each figure in a file of its own, the one without a name at the path itself."""
+    places = {name: beside(path, name) if name else path for name in figures}
+    return {places[name]: partial(save_figure, figure, places[name]) for name, figure in figures.items()}
+
+
+def beside(path: Path, name: str) -> Path:
+    """fit.png and "friction" make fit_friction.png."""
+    return path.with_stem(f"{path.stem}_{name}")
+
+
+def write_csv(path: Path, run: Trajectory, columns: Columns) -> None:
+    """Write a run as a log that can be read again."""
+    header = ",".join(["time [s]", *(f"{name} [{unit}]" for name, unit in columns.values())])
+    values = np.column_stack([run.t, run.matrix(columns)])
+    rows = [",".join("" if math.isnan(v) else f"{v:.9g}" for v in row) for row in values.tolist()]
+    write_text(path, "\n".join([header, *rows]) + "\n")
+
+
+def background(result: IdentificationResult | TuningResult) -> dict[str, Any]:
+    """What a JSON file holds beside the tables."""
+    return {"stats": result.stats, "provenance": result.provenance}
+
+
+def hashes(*paths: Path) -> dict[str, str]:
+    """The files' contents, in short."""
+    return {f"sha256[{path.name}]": hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}

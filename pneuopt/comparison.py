@@ -1,0 +1,150 @@
+"""`compare_logs`: whether several logs are of one and the same drive, by fitting each alone."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pneuopt.checks import check_logs
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.errors import LogError, require
+from pneuopt.experiments import Experiment
+from pneuopt.identify import IdentificationResult, identify
+from pneuopt.nlp.least_squares import LeastSquares
+from pneuopt.parameters import ParameterSet
+from pneuopt.posing import as_logged
+from pneuopt.system import System
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+APART = 4.0  # standard deviations between a log's own estimate and the others' from which they are not one drive's
+DIFFERENT = 0.02  # relative difference likewise, for tiny intervals do not hold the bias of a model
+
+
+@dataclass(frozen=True, eq=False)
+class LogComparison:
+    """What `compare_logs` found.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a parameter and log: value, stderr, others (weighted mean of the other logs' values), deviation (of the
+        one from the other, in standard deviations of the difference), unit. NaN where one log alone does not tell.
+    agree : bool
+        Whether no parameter is 4 standard deviations and 2 % apart; also where nothing could be compared.
+    reason : str
+        One sentence.
+    fits : mapping of str to IdentificationResult
+        Of each log alone, whatever its status.
+    """
+
+    table: "pd.DataFrame"
+    agree: bool
+    reason: str
+    fits: Mapping[str, IdentificationResult]
+
+    def __repr__(self) -> str:
+        return f"LogComparison {self.reason}\n{self.table.to_string()}"
+
+
+def compare_logs(
+    system: System | ClosedLoop,
+    experiments: Sequence[Experiment],
+    parameters: ParameterSet,
+    *,
+    method: LeastSquares | None = None,
+) -> LogComparison:
+    """Fit every log alone and compare what the parameters that they share come out as.
+
+    Worth the time where a joint fit does not explain its logs: one of another drive, another load, or another supply
+    than its conditions say shows as the parameter, and the log, that disagree.
+
+    Parameters
+    ----------
+    system : System or ClosedLoop
+    experiments : sequence of Experiment
+        At least two.
+    parameters : ParameterSet
+        As for `identify`; `per_log` parameters and conditions may differ and are not compared.
+    method : LeastSquares, optional
+
+    Returns
+    -------
+    LogComparison
+
+    Raises
+    ------
+    InputError
+        If there is one log only, or logs, system and parameters do not fit together.
+    """
+    require(len(experiments) > 1, f"{len(experiments)} log is not to be compared; give at least two", LogError)
+    logs = check_logs(as_logged(system), experiments, parameters)
+    fits = {}
+    for log in logs:
+        own = parameters.fixed(*(n for n in log.conditions if n in parameters))
+        if own.free_names:
+            fits[log.name] = identify(system, [log], own, method=method, throw=False)
+    shared = [n for n in parameters.free_names if not parameters[n].per_log]
+    table = _tabulated(shared, fits, parameters)
+    apart = _apart(table)
+    return LogComparison(table, not len(apart), _reason(table, apart, len(fits)), fits)
+
+
+def _tabulated(shared: Sequence[str], fits: Mapping[str, IdentificationResult], known: ParameterSet) -> "pd.DataFrame":
+    import pandas as pd
+
+    rows = []
+    for name in shared:
+        own = {log: _estimate(fit, name) for log, fit in fits.items()}
+        for log, (value, stderr) in own.items():
+            others, spread = _mean([e for n, e in own.items() if n != log])
+            deviation = (value - others) / math.hypot(stderr, spread)
+            figures = {"value": value, "stderr": stderr, "others": others, "deviation": deviation}
+            rows.append({"parameter": name, "log": log, **figures, "unit": known[name].unit})
+    return pd.DataFrame(rows).set_index(["parameter", "log"])
+
+
+def _estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
+    """Value and deviation; NaN where this log alone does not tell."""
+    if not fit.status.converged or name not in fit.estimates.index:
+        return math.nan, math.nan
+    value, stderr = (float(fit.estimates[column][name]) for column in ("value", "stderr"))
+    return (value, stderr) if math.isfinite(stderr) else (math.nan, math.nan)
+
+
+def _mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Weighted mean of those that tell, and its deviation."""
+    told = np.array([e for e in estimates if math.isfinite(e[1])]).reshape(-1, 2)
+    if not len(told):
+        return math.nan, math.nan
+    weight = 1 / np.maximum(told[:, 1], 1e-300) ** 2
+    return float(np.average(told[:, 0], weights=weight)), float(1 / math.sqrt(weight.sum()))
+
+
+def _apart(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows that disagree, the worst first."""
+    far = (table["deviation"].abs() > APART) & (
+        (table["value"] - table["others"]).abs() > DIFFERENT * table["others"].abs()
+    )
+    return table[far].sort_values("deviation", key=abs, ascending=False)
+
+
+def _reason(table: "pd.DataFrame", apart: "pd.DataFrame", logs: int) -> str:
+    compared = list(dict.fromkeys(str(n) for n, _ in table.index[np.isfinite(table["deviation"])]))
+    if not compared:
+        return "nothing could be compared: no parameter is told by two logs alone; fit fewer, or log longer runs"
+    if not len(apart):
+        return f"the {logs} logs agree in {', '.join(compared)}"
+    name, log = apart.index[0]
+    row = apart.iloc[0]
+    others = "the other log" if logs == 2 else "the other logs"
+    told = (
+        f"{name} is {row['value']:.4g} +- {row['stderr']:.2g} {row['unit']} in {log} alone, and {row['others']:.4g} in "
+    )
+    more = [str(n) for n in dict.fromkeys(n for n, _ in apart.index) if n != name]
+    tail = f"; apart are {', '.join(more)}, too" if more else ""
+    ask = "are they of one drive, and their conditions right?"
+    return f"{told}{others}, {abs(row['deviation']):.0f} standard deviations apart{tail}: {ask}"

@@ -1,0 +1,224 @@
+"""`LoggedLoop`: a sampled loop as an identification reads it from a log that holds the reference, but not the command.
+
+The controller is known; run along the logged feedback, it tells what it commanded. With that command the plant finds
+its own start; the fit itself then runs plant and controller together, with the exact sampled update and its clip.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from pneuopt.codegen import Rollout
+from pneuopt.control.loop import READING, ClosedLoop
+from pneuopt.control.rest import drifting
+from pneuopt.errors import LogError, ModelError, require
+from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.system import DiscreteSystem, Log, Start, Symbols, define, names
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+REFERENCES = {"speed": "speed_reference", "position": "position_reference"}
+ACTS = "controller_acts"  # 1 at the log's samples at which the controller computes, 0 in between
+SLACK = 1e-3  # of a sample time, by which a log's time may be off the controller's
+SMOOTHED = 21  # samples over which a position is differentiated where the fed-back speed is not logged
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedLoop:
+    """A loop with a sampled controller, its reference named as logs name it.
+
+    A log has a sample wherever the controller acts, from its first one on, and any number in between. The model's
+    controller sees the plant's output without the sensor's noise: what the noise makes a high gain command is left to
+    the residuals, and where it is not small the intervals are too narrow.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+
+    Raises
+    ------
+    ModelError
+        If the controller is continuous.
+    """
+
+    loop: ClosedLoop
+
+    def __post_init__(self) -> None:
+        told = "a log comes from a sampled controller: give the loop's PID its sample_time"
+        require(self.loop.pid.sample_time is not None, told, ModelError)
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """The plant's, then the controller's."""
+        return self.loop.states
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """What a log has to hold: "speed_reference" (or what is fed back), and inputs that are not controlled."""
+        reference, *others = self.loop.inputs
+        fed_back = self.loop.feedback.name
+        return (replace(reference, name=REFERENCES.get(fed_back, f"{fed_back}_reference")), *others)
+
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """The plant's, and "control"."""
+        return self.loop.outputs
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """The loop's."""
+        return self.loop.parameters
+
+    def check(self, parameters: ParameterSet) -> None:
+        """As `ClosedLoop.check`."""
+        self.loop.check(parameters)
+
+    def check_log(self, measured: Trajectory, name: str) -> None:
+        """Refuse a log that holds the command, or that has no sample where the controller acts."""
+        command, reference = self.loop.command.name, self.inputs[0].name
+        remedy = "identify the plant alone with it as input (loop.plant), which needs no controller; or leave it out"
+        require(command not in measured, f"{name}: the log holds the command {command!r}; {remedy}", LogError)
+        require(reference in measured, f"{name}: the loop needs the channel {reference!r} as input", LogError)
+        _acting(measured.t, self._sample_time, name)
+
+    def discrete(self) -> DiscreteSystem:
+        """The loop's sampled step; its last input says at which samples the controller acts."""
+        return _gated(self.loop.discrete(), self.inputs)
+
+    def driven(self, measured: Trajectory, name: str) -> Array:
+        """The inputs of `discrete` along a log, shape (n, n_inputs)."""
+        own = measured.matrix(names(self.inputs))
+        return np.column_stack([own, _acting(measured.t, self._sample_time, name)])
+
+    def known_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
+        """What of a log's start state no measured output feels, taken from the candidate; NaN where it is to be found.
+
+        The command is computed anew at the first sample; of previous error and derivative only a sum counts.
+        """
+        held = {"pid.command", "pid.previous_error"}
+        gain = parameters["pid.Kd"]
+        held |= set() if gain.free or gain.value else {"pid.derivative"}
+        seen = {self.loop.feedback.name, *(n for n in names(self.loop.plant.outputs) if n in measured)}
+        held |= set.intersection(*(set(drifting(self.loop.plant, n)) for n in seen))
+        return np.array([states[n][0] if n in held else np.nan for n in names(self.states)])
+
+    def reference_column(self, measured: Trajectory) -> Trajectory:
+        """The log with its reference named as `simulate` reads it."""
+        return measured.with_columns({"reference": measured[self.inputs[0].name]})
+
+    def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
+        """The plant's own candidates under the command that the controller must have given; the log began at rest.
+
+        One more believes that the controller was just switched on, its integral empty.
+        """
+        out: list[Start] = []
+        for was_at_rest in (True, False):
+            replayed = {n: self._replayed(log, n, was_at_rest=was_at_rest) for n, log in logs.items()}
+            plant = {n: self._plant_log(log, replayed[n]) for n, log in logs.items()}
+            label = "from rest" if was_at_rest else "from an empty integral"
+            for start in self.loop.plant.starts(plant)[: None if was_at_rest else 1]:
+                states = {n: run.with_columns(_own(replayed[n])) for n, run in start.states.items()}
+                out.append(Start(states, start.parameters, ", ".join(filter(None, (start.label, label)))))
+        return out
+
+    @property
+    def _sample_time(self) -> float:
+        return self.loop.pid.sample_time or 0.0
+
+    @cached_property
+    def _controller(self) -> tuple[DiscreteSystem, Rollout, ClosedLoop]:
+        """The loop's controller alone: its measured signal is an input."""
+        seen, plant = self.loop.feedback, self.loop.plant
+        logged = replace(seen, name="logged")
+
+        def rhs(_t: ca.SX, _x: Symbols, u: Symbols, _p: Symbols) -> tuple[Symbols, Symbols]:
+            return {}, {seen.name: u["logged"]}
+
+        echo = define([], [self.loop.command, logged], [seen], plant.parameters, rhs)
+        alone = replace(self.loop, plant=echo, actuated=self.loop.command.name, measured=seen.name)
+        discrete = _gated(alone.discrete(), alone.inputs)
+        return discrete, Rollout(discrete.pieces), alone
+
+    def _replayed(self, log: Log, name: str, *, was_at_rest: bool) -> Trajectory:
+        """The controller's states before each sample, and "control", along the logged feedback."""
+        discrete, rollout, alone = self._controller
+        t, seen = log.measured.t, _fed_back(log.measured, self.loop.feedback.name, self.inputs[0].name, name)
+        reference = log.measured[self.inputs[0].name]
+        acts = _acting(t, self._sample_time, name)
+        p, value = alone.numbers(log.parameters), {n: log.parameters.value(n) for n in ("pid.Kp", "pid.b", "pid.c")}
+        pushed = value["pid.Kp"] * (value["pid.b"] * reference[0] - seen[0])
+        x0 = {READING: seen[0], "pid.previous_error": value["pid.c"] * reference[0] - seen[0]}
+        x0["pid.integral"] = -pushed if was_at_rest else 0.0
+        start = np.array([[x0.get(n, 0.0) for n in names(discrete.states)]])
+        u, h = np.column_stack([reference, seen, acts]), np.append(np.diff(t), 0.0)
+        lag = log.parameters.value("sensor.lag") if alone.sensor else math.inf
+        run = rollout.run(start, u[None], p, t[None], h[None], substeps=math.ceil(h.max() / lag) or 1, states=True)
+        assert run.x is not None
+        columns = dict(zip(names(discrete.states), run.x[0].T, strict=True))
+        return Trajectory(t, columns | {"control": run.y[0, :, names(discrete.outputs).index("control")]})
+
+    def _plant_log(self, log: Log, replayed: Trajectory) -> Log:
+        plant = self.loop.plant
+        measured = log.measured.with_columns({self.loop.command.name: replayed["control"]})
+        return Log(measured, log.parameters.select(plant.parameters))
+
+
+def _own(replayed: Trajectory) -> dict[str, Array]:
+    return {n: replayed[n] for n in replayed if n != "control"}
+
+
+def _gated(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:
+    """The same, with one more input that lets the controller act (1) or rest (0)."""
+    assert discrete.update is not None
+    assert discrete.ode is not None
+    n = {k: discrete.step.size1_in(i) for i, k in enumerate(("t", "h", "x", "u", "p"))}
+    t, h, acts = ca.SX.sym("t"), ca.SX.sym("h"), ca.SX.sym(ACTS)
+    x, u, p = (ca.SX.sym(k, n[k]) for k in "xup")
+    fed = ca.vertcat(u, acts)
+    step = ca.Function(
+        "step", [t, h, x, fed, p], [*discrete.step(t, h, x, u, p)], ["t", "h", "x", "u", "p"], ["x_next", "y"]
+    )
+    ode = ca.Function("ode", [t, x, fed, p], [*discrete.ode(t, x, u, p)], ["t", "x", "u", "p"], ["xdot", "y"])
+    after = x + acts * (discrete.update(t, x, u, p) - x)
+    update = ca.Function("update", [t, x, fed, p], [after], ["t", "x", "u", "p"], ["x_after"])
+    return replace(discrete, inputs=(*inputs, Quantity(ACTS, "1")), step=step, ode=ode, update=update, sample_time=None)
+
+
+def _acting(t: Array, sample_time: float, name: str) -> Array:
+    """1 where the controller acts: at the log's first sample and every sample time after it."""
+    phase = (t - t[0]) / sample_time
+    acts = np.abs(phase - np.round(phase)) < SLACK
+    missing = np.setdiff1d(np.arange(int(phase[-1] + SLACK) + 1), np.round(phase[acts]))
+    if missing.size:
+        raise LogError(
+            f"{name}: the controller acts every {sample_time:g} s from the log's first sample on, but the log has no "
+            f"sample at t = {t[0] + missing[0] * sample_time:g} s; log at the controller's sample time or a whole "
+            "fraction of it, and leave a missing reading empty"
+        )
+    return np.asarray(acts, dtype=float)
+
+
+def _fed_back(measured: Trajectory, wanted: str, reference: str, name: str) -> Array:
+    """The fed-back signal along a log, without holes; a speed or position follows from the other."""
+    if wanted in measured:
+        return _filled(measured.t, measured[wanted])
+    t, step = measured.t, float(np.median(np.diff(measured.t)))
+    if wanted == "speed" and "position" in measured:
+        window = min(SMOOTHED, (len(t) - 1) // 2 * 2 + 1)
+        return np.asarray(savgol_filter(_filled(t, measured["position"]), window, 2, deriv=1, delta=step))
+    told = f"{name}: the loop feeds back {wanted!r}; without it, or the motion it follows from, there is no start"
+    require(wanted == "position" and "speed" in measured, told, LogError)
+    speed = _filled(t, measured["speed"])
+    travel = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
+    return np.asarray(measured[reference][0] + travel)
+
+
+def _filled(t: Array, column: Array) -> Array:
+    known = np.isfinite(column)
+    return np.interp(t, t[known], column[known])

@@ -1,0 +1,121 @@
+"""`derived`: a figure computed from estimates, with the confidence interval that theirs imply."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pneuopt.parameters import ParameterSet
+from pneuopt.statistics import confidence_interval
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Values = Mapping[str, float]
+STEP = 1e-3  # standard deviations over which a slope is taken
+
+
+class Estimated(Protocol):
+    """What a derived figure needs of an identification's result."""
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """All parameters, the free ones as found."""
+        ...
+
+    @property
+    def estimates(self) -> "pd.DataFrame":
+        """A row a free parameter, its value among the columns."""
+        ...
+
+    @property
+    def covariance(self) -> "pd.DataFrame":
+        """Of the estimates; NaN for what has no interval."""
+        ...
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A figure with its 95 % confidence interval.
+
+    Attributes
+    ----------
+    value, stderr, ci_low, ci_high : float
+        NaN but for the value where the figure hangs on a parameter that has no interval.
+    """
+
+    value: float
+    stderr: float
+    ci_low: float
+    ci_high: float
+
+
+def derived(result: Estimated, function: Callable[[Values], float]) -> Derived:
+    """A function of the parameters, with its interval by the delta method.
+
+    Parameters
+    ----------
+    result : IdentificationResult
+    function : callable
+        Takes all parameters' values by name, "name[log]" for one of a log; returns a number.
+
+    Returns
+    -------
+    Derived
+        ``stderr = sqrt(g C g')`` with g the slope at the estimates (central differences) and C their covariance: right
+        where the function is nearly linear within the intervals.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> import pandas as pd
+    >>> from pneuopt.parameters import Parameter
+    >>> names = ["static", "coulomb"]
+    >>> fit = SimpleNamespace(
+    ...     parameters=ParameterSet({n: Parameter(v, "N") for n, v in zip(names, (60.0, 40.0))}),
+    ...     estimates=pd.DataFrame({"value": [60.0, 40.0]}, index=names),
+    ...     covariance=pd.DataFrame([[4.0, 0.0], [0.0, 1.0]], index=names, columns=names),
+    ... )
+    >>> ratio = derived(fit, lambda p: p["static"] / p["coulomb"])
+    >>> ratio.value, round(ratio.stderr, 4)
+    (1.5, 0.0625)
+    """
+    values, stderr = propagated(result, lambda p: [function(p)])
+    value, spread = float(values[0]), float(stderr[0])
+    return Derived(value, spread, *confidence_interval(value, spread, log=False))
+
+
+def propagated(result: Estimated, function: Callable[[Values], ArrayLike]) -> tuple[Array, Array]:
+    """Several figures at once, and the standard deviation of each; a curve over a grid, say.
+
+    Parameters
+    ----------
+    result : IdentificationResult
+    function : callable
+        As for `derived`; returns n numbers.
+
+    Returns
+    -------
+    (ndarray, ndarray)
+        Each of shape (n,).
+    """
+    known = {n: p.value for n, p in result.parameters.items()}
+    at = {**known, **{str(n): float(v) for n, v in result.estimates["value"].items()}}
+    covariance = result.covariance.to_numpy(dtype=float)
+    variances = np.diag(covariance)
+    slopes = [_slope(function, at, str(n), v) for n, v in zip(result.covariance.index, variances, strict=True)]
+    value = np.asarray(function(at), dtype=float)
+    J = np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
+    used = np.any(J != 0, axis=0)  # of a parameter without an interval, only one that does not count is harmless
+    variance = np.einsum("ni,ij,nj->n", J[:, used], covariance[np.ix_(used, used)], J[:, used])
+    return value, np.sqrt(variance)
+
+
+def _slope(function: Callable[[Values], ArrayLike], at: Values, name: str, variance: float) -> Array:
+    step = STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
+    up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
+    return np.asarray((up - down) / (2 * step))

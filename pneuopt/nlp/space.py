@@ -1,0 +1,71 @@
+"""The free parameters as a search moves them: logarithms where that is asked for, and within their bounds."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.nlp.arrow import Reduced
+from pneuopt.nlp.equations import Equations
+from pneuopt.nlp.transcription import Transcription
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+UNFELT = 1e-6  # squared residuals that an e-fold change of a log parameter has to move, or it stays where it is
+
+
+class Space:
+    """Free parameters as searched (z, shape (k,)), and all the problem's values at them.
+
+    Attributes
+    ----------
+    log : ndarray of bool, shape (k,)
+    lower, upper : ndarray, shape (k,)
+        As searched.
+    start : ndarray, shape (k,)
+        The given values, within the bounds.
+    """
+
+    def __init__(self, transcription: Transcription) -> None:
+        self._free = [p for p in transcription.parameters.values() if p.free]
+        self._positions = transcription.free
+        self._given = np.array([p.value for p in transcription.parameters.values()])
+        self.log = np.array([p.log for p in self._free], dtype=bool)
+        self.lower, self.upper = (
+            self._searched(np.array([getattr(p, b) for p in self._free])) for b in ("lower", "upper")
+        )
+        self.start = self.within(self._searched(self._given[self._positions]))
+
+    def within(self, z: Array) -> Array:
+        """The nearest point within the bounds."""
+        return np.asarray(np.clip(z, self.lower, self.upper))
+
+    def values(self, z: Array) -> Array:
+        """All the problem's parameter values."""
+        q = self._given.copy()
+        own = np.where(self.log, np.exp(np.where(self.log, z, 0.0)), z)
+        # at a bound exactly the bound, which a logarithm there and back would miss by a rounding
+        low, up = ([getattr(p, b) for p in self._free] for b in ("lower", "upper"))
+        own = np.where(z <= self.lower, low, np.where(z >= self.upper, up, own))
+        q[self._positions] = [min(max(v, p.lower), p.upper) for v, p in zip(own, self._free, strict=True)]
+        return q
+
+    def chain(self, z: Array) -> Array:
+        """d(parameter)/d(searched parameter), shape (k,)."""
+        return np.where(self.log, np.exp(np.where(self.log, z, 0.0)), 1.0)
+
+    def at_bound(self, z: Array) -> Mask:
+        """Which lie on a bound."""
+        return np.asarray((z <= self.lower) | (z >= self.upper))
+
+    def felt(self, equations: Equations) -> Mask:
+        """Which have an effect on the residuals here."""
+        return np.asarray(np.diag(equations.arrow.corner) > np.where(self.log, UNFELT, 0.0))
+
+    def movable(self, z: Array, equations: Equations, reduced: Reduced) -> Mask:
+        """Which are neither pressed against a bound nor without any effect on the residuals here."""
+        below, above = (z <= self.lower) & (reduced.gradient > 0), (z >= self.upper) & (reduced.gradient < 0)
+        return self.felt(equations) & ~(below | above)
+
+    def _searched(self, values: Array) -> Array:
+        """Logarithms where the parameter asks for it; a bound that is not positive is no bound there."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.log, np.where(values > 0, np.log(values), -np.inf), values)

@@ -1,0 +1,214 @@
+"""What a fit leaves: residuals and what is still in them; how its estimates hang together."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.errors import require
+from pneuopt.experiments import CHANNELS, Experiment
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, SCALED, axes_grid, shown_of
+from pneuopt.statistics import correlation, ljung_box
+from pneuopt.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+LAGS = 40  # samples
+MOST_CHANNELS = 4
+MOST_POINTS = 4000
+MOST_NUMBERED = 12  # parameters whose correlations have room for a figure
+BAND = 1.96  # standard deviations, 95 %
+
+
+class Spread(Protocol):
+    """What `plot_correlation` needs of an identification's result."""
+
+    @property
+    def covariance(self) -> "pd.DataFrame":
+        """Of the estimates."""
+        ...
+
+
+def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> "Figure":
+    """Residuals of each channel: over time, against themselves, against the inputs, and their distribution.
+
+    Parameters
+    ----------
+    runs : sequence of Trajectory
+        Fitted or predicted, one an experiment.
+    experiments : sequence of Experiment
+        Correlations are taken within each, then averaged; the band is what 95 % of white residuals stay in.
+
+    Returns
+    -------
+    Figure
+    """
+    require(len(runs) == len(experiments) > 0, f"{len(runs)} runs do not match {len(experiments)} experiments")
+    pairs = list(zip(runs, experiments, strict=True))
+    channels = [n for n in CHANNELS if any(n in e.trajectory and n in r for r, e in pairs)]
+    require(bool(channels), "the runs and the logs have no channel in common")
+    shown = channels[:MOST_CHANNELS]
+    figure, grid = axes_grid(len(shown), 4, [2.4] * len(shown), width=13.0)
+    for (over_time, own, crossed, spread), channel in zip(grid, shown, strict=True):
+        _over_time(over_time, pairs, channel)
+        _autocorrelation(own, pairs, channel)
+        _crosscorrelation(crossed, pairs, channel)
+        _distribution(spread, pairs, channel)
+    for axes, title in zip(
+        grid[0], ("residuals", "autocorrelation", "correlation with inputs", "distribution"), strict=True
+    ):
+        axes.set_title(title, fontsize=10)
+    for axes, label in zip(grid[-1], ("time [s]", "lag [samples]", "lag [samples]", ""), strict=True):
+        axes.set_xlabel(label)
+    shown_of(figure, len(shown), len(channels), "channels")
+    return figure
+
+
+def plot_correlation(result: Spread) -> "Figure":
+    """How the estimates hang together: a cell a pair, 1 or -1 where only a combination of both is known.
+
+    Parameters
+    ----------
+    result : IdentificationResult
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If no estimate has a standard deviation.
+    """
+    covariance = result.covariance
+    known = np.isfinite(np.diag(covariance.to_numpy()))
+    require(bool(known.any()), "no estimate has a standard deviation, so that there is no correlation to draw")
+    names = [str(n) for n in covariance.index[known]]
+    values, count = correlation(covariance.to_numpy()[np.ix_(known, known)]), len(names)
+    side = max(3.2, min(8.0, 0.62 * count))
+    figure, ((axes,),) = axes_grid(1, 1, [side], width=side + 3.0)
+    image = axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
+    figure.colorbar(image, ax=axes, pad=0.02, shrink=0.9)
+    axes.grid(False)
+    axes.set_xticks(range(count), names, rotation=40, ha="right", fontsize=8)
+    axes.set_yticks(range(count), names, fontsize=8)
+    if count <= MOST_NUMBERED:
+        for (row, column), value in np.ndenumerate(values):
+            colour = "white" if abs(value) > 0.6 else "black"
+            axes.text(column, row, _short(value), ha="center", va="center", fontsize=8, color=colour)
+    axes.set_title("correlation of the estimates", fontsize=10)
+    shown_of(figure, count, len(covariance), "estimates have a standard deviation")
+    return figure
+
+
+def _short(value: float) -> str:
+    """Two digits, but never a 1.00 that is none."""
+    return f"{value:.2f}" if abs(value) < 0.995 or abs(value) > 1 - 1e-9 else f"{math.trunc(1e4 * value) / 1e4:.4f}"
+
+
+def _residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> list[tuple[Trajectory, Array]]:
+    return [
+        (e.trajectory, e.trajectory[channel] - run[channel])
+        for run, e in pairs
+        if channel in e.trajectory and channel in run
+    ]
+
+
+def _over_time(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    factor, unit = SCALED.get(CHANNELS[channel], (1.0, CHANNELS[channel]))
+    found = _residuals(pairs, channel)
+    every = max(1, sum(len(log) for log, _ in found) // MOST_POINTS)
+    for number, (log, e) in enumerate(found):
+        colour = (BLUE, ORANGE)[number % 2] if len(found) <= 4 else BLUE
+        axes.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
+    axes.axhline(0, color=GREY, lw=0.8)
+    axes.set_ylabel(f"{channel} [{unit}]")
+
+
+def _autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    found = [e for _, e in _residuals(pairs, channel)]
+    rho = _mean([_correlogram(e, e) for e in found])
+    axes.vlines(range(1, len(rho)), 0, rho[1:], color=BLUE, lw=1.4)
+    _band(axes, found)
+    p = [ljung_box(e)[1] for e in found]
+    known = [q for q in p if math.isfinite(q)]
+    told = (
+        f"Ljung-Box p {_probability(min(known))}" + (f" (least of {len(known)})" if len(known) > 1 else "")
+        if known
+        else ""
+    )
+    axes.text(0.98, 0.03, told, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
+    _scale(axes, rho[1:])
+
+
+def _crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    found = _residuals(pairs, channel)
+    outputs = {n for run, _ in pairs for n in run}
+    inputs = [n for n in CHANNELS if n not in outputs and any(n in log for log, _ in found)]
+    every = []
+    for name, colour in zip(inputs, (BLUE, ORANGE, RED), strict=False):
+        rho = _mean([_correlogram(e, log[name]) for log, e in found if name in log])
+        axes.plot(range(len(rho)), rho, color=colour, lw=1.2, label=name)
+        every.append(rho)
+    _band(axes, [e for _, e in found])
+    if inputs:
+        axes.legend(fontsize=8, frameon=False, loc="upper right")
+        _scale(axes, np.concatenate(every))
+
+
+def _distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    """Residuals over their noise, beside the normal distribution that they should have."""
+    scaled = np.concatenate(
+        [
+            (e.trajectory[channel] - run[channel]) / e.noise.get(channel, math.nan)
+            for run, e in pairs
+            if channel in e.trajectory and channel in run
+        ]
+    )
+    label = "residual / noise"
+    if not np.isfinite(scaled).any():  # no noise is declared: the residuals' own deviation
+        scaled = np.concatenate([e for _, e in _residuals(pairs, channel)])
+        scaled, label = scaled / np.nanstd(scaled), "residual / its deviation"
+    scaled = scaled[np.isfinite(scaled)]
+    edge = max(4.0, float(np.quantile(np.abs(scaled), 0.999)))
+    axes.hist(np.clip(scaled, -edge, edge), bins=60, range=(-edge, edge), density=True, color=BLUE, alpha=0.5)
+    x = np.linspace(-edge, edge, 200)
+    axes.plot(x, np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi), color=ORANGE, lw=1.2)
+    axes.set_yticks([])
+    axes.set_ylabel(label, fontsize=8)
+
+
+def _correlogram(e: Array, other: Array) -> Array:
+    """Correlation of residuals with what another column was 0 to `LAGS` samples before; NaN where nothing varies."""
+    known = np.isfinite(e) & np.isfinite(other)
+    a, b = (np.where(known, v - np.mean(v[known]), 0.0) if known.any() else np.zeros(len(v)) for v in (e, other))
+    size = math.sqrt(float(a @ a) * float(b @ b))
+    lags = min(LAGS, len(e) - 2) + 1
+    return np.array([a[k:] @ b[: len(b) - k] for k in range(lags)]) / size if size > 0 else np.full(lags, np.nan)
+
+
+def _mean(rows: Sequence[Array]) -> Array:
+    n = min(len(row) for row in rows)
+    finite = [row[:n] for row in rows if np.isfinite(row[:n]).all()]
+    return np.mean(finite, axis=0) if finite else np.zeros(n)
+
+
+def _band(axes: "Axes", residuals: Sequence[Array]) -> None:
+    width = BAND / math.sqrt(sum(int(np.isfinite(e).sum()) for e in residuals))
+    axes.axhspan(-width, width, color=GREY, alpha=0.25, lw=0)
+    axes.axhline(0, color=GREY, lw=0.8)
+
+
+def _scale(axes: "Axes", rho: Array) -> None:
+    edge = min(1.05, max(0.2, 1.3 * float(np.max(np.abs(rho), initial=0.0))))
+    axes.set_ylim(-edge, edge)
+
+
+def _probability(p: float) -> str:
+    return f"{p:.2g}" if p >= 1e-4 else "< 1e-4"

@@ -1,0 +1,316 @@
+"""Profile likelihood: how far a parameter can move while the others make up for it."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from scipy.stats import chi2
+
+from pneuopt.checks import check_logs
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.errors import check_known, require
+from pneuopt.experiments import Experiment
+from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.parameters import ParameterSet
+from pneuopt.posing import Problem, as_logged
+from pneuopt.system import Start, System, names
+from pneuopt.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_POINTS = 14  # refits on one side
+CLOSE = 0.003  # of the level's root, to which an end is located
+LONGEST = 1.5  # e-folds of a log parameter between two refits
+PROBE = 0.3  # e-folds, at most, over which the curvature at the estimate is measured
+ITERATIONS = 40  # of a refit
+
+
+class Fitted(Protocol):
+    """What a profile needs of an identification's result."""
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """All parameters, the free ones as found."""
+        ...
+
+    @property
+    def estimates(self) -> "pd.DataFrame":
+        """A row a free parameter: value and stderr."""
+        ...
+
+    @property
+    def fit(self) -> "pd.DataFrame":
+        """A row a log and channel, its noise among the columns."""
+        ...
+
+    @property
+    def trajectories(self) -> Mapping[str, Trajectory]:
+        """Fitted states of each log."""
+        ...
+
+    @property
+    def stats(self) -> Mapping[str, float]:
+        """Of the search, and the residuals' level and correlation."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """What the logs say of one parameter when all others are free to follow.
+
+    Attributes
+    ----------
+    name, unit : str
+    estimate : float
+    low, high : float
+        Ends of the confidence interval; infinite where the logs set no limit within the parameter's bounds.
+    level : float
+    curve : DataFrame
+        A row a refit, by rising value: value, deviance (twice the cost above the least, in the variance and correlation
+        of the fit's own residuals), and what the other parameters became.
+    """
+
+    name: str
+    unit: str
+    estimate: float
+    low: float
+    high: float
+    level: float
+    curve: "pd.DataFrame"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether an end is missing."""
+        return math.isinf(self.low) or math.isinf(self.high)
+
+    def __repr__(self) -> str:
+        return f"Profile of {self.name}: {self.told}"
+
+    @property
+    def threshold(self) -> float:
+        """The deviance up to which a value is believed."""
+        return float(chi2.ppf(self.level, 1))
+
+    @property
+    def told(self) -> str:
+        """The interval in words."""
+        low, high = f"{self.low:.5g} {self.unit}", f"{self.high:.5g} {self.unit}"
+        tried = self.curve["value"]
+        if math.isinf(self.low) and math.isinf(self.high):
+            return f"anything from {tried.min():.2g} to {tried.max():.2g} {self.unit} fits as well"
+        if math.isinf(self.high):
+            return f"above {low}; the logs set no upper limit"
+        if math.isinf(self.low):
+            return f"below {high}; the logs set no lower limit"
+        return f"{low} to {high}"
+
+
+def profile(
+    system: System | ClosedLoop,
+    experiments: Sequence[Experiment],
+    result: Fitted,
+    name: str,
+    *,
+    level: float = 0.95,
+    method: LeastSquares | None = None,
+) -> Profile:
+    """Profile-likelihood interval of one parameter: the others are fitted again at each of its values.
+
+    Parameters
+    ----------
+    system : System or ClosedLoop
+    experiments : sequence of Experiment
+        Those that `result` was made from.
+    result : IdentificationResult
+        A converged one: every refit starts from it, no start is searched for.
+    name : str
+        As in the result's estimates, "name[log]" for one of a log.
+    level : float
+        Of confidence.
+    method : LeastSquares, optional
+        The one that made the result.
+
+    Returns
+    -------
+    Profile
+        Its ends are where the deviance reaches the chi-square quantile (Venzon, Moolgavkar, Applied Statistics 37(1),
+        1988), in the units in which the curvature at the estimate is that of the estimate's own standard error.
+
+    Raises
+    ------
+    InputError
+        If the parameter is not among the estimates, or the logs are not those of the result.
+    """
+    check_known("estimate", [name], result.estimates.index)
+    require(0 < level < 1, f"a level lies between 0 and 1, got {level:g}")
+    model = as_logged(system)
+    logs = check_logs(model, experiments, result.parameters)
+    given = tuple(e.name for e in logs)
+    require(
+        given == tuple(result.trajectories), f"the result is of {', '.join(result.trajectories)}, not of these logs"
+    )
+    logs = [e.with_noise(result.fit["noise"][e.name].to_dict()) for e in logs]
+    problem = Problem(model, tuple(logs), model.parameters | result.parameters, method or LeastSquares())
+    return traced(problem, result, name, level)
+
+
+def traced(problem: Problem, result: Fitted, name: str, level: float = 0.95) -> Profile:
+    """`profile`, of a problem already posed."""
+    if problem.method.progress is not None:
+        problem.method.progress(f"how far {name} can move")
+    refits = _Refits(problem, result, name)
+    target = math.sqrt(float(chi2.ppf(level, 1)))
+    for side in (-1, 1):
+        _bracket(refits, side, target)
+    p = refits.parameter
+    low, high = (_end(refits, side, target) for side in (-1, 1))
+    return Profile(name, p.unit, p.value, low, high, level, refits.curve())
+
+
+class _Point(NamedTuple):
+    """A refit."""
+
+    z: float
+    fit: Fit
+
+    @property
+    def cost(self) -> float:
+        return self.fit.solution.stats["cost"]
+
+
+class _Refits:
+    """Fits with one parameter held, each started from the nearest one."""
+
+    def __init__(self, problem: Problem, result: Fitted, name: str) -> None:
+        self.problem, self.name = problem, name
+        values = {str(n): float(v) for n, v in result.estimates["value"].items()}
+        self.start = Start(_states(names(problem.system.states), result.trajectories), values, "fit")
+        self.parameter = replace(problem.unknowns()[name], value=values[name])
+        last, steps = Stage(result.stats["gap_deviation"], ITERATIONS, refine=2), int(result.stats["substeps"])
+        self.method = replace(problem.method, stages=(last,), substeps=max(1, steps // 2), progress=None)
+        self.spread = self._searched_spread(float(result.estimates["stderr"][name]))
+        self.points: list[_Point] = []
+        self.at(self.searched(self.parameter.value))
+        self.scale = self._scale(result.stats["chi_square_ratio"] * result.stats["correlation_time"])
+
+    @property
+    def centre(self) -> float:
+        """The estimate, as searched."""
+        return self.searched(self.parameter.value)
+
+    def searched(self, value: float) -> float:
+        """A value as it is searched; a bound that is not positive is none for a logarithm."""
+        if self.parameter.log:
+            return math.log(value) if value > 0 else -math.inf
+        return value
+
+    def value(self, z: float) -> float:
+        """The parameter's value at a searched one."""
+        return math.exp(z) if self.parameter.log else z
+
+    def at(self, z: float) -> _Point:
+        """The fit with the parameter held there."""
+        start = self.start
+        if self.points:
+            nearest = min(self.points, key=lambda known: abs(known.z - z)).fit.solution
+            runs = dict(zip((e.name for e in self.problem.experiments), nearest.trajectories, strict=True))
+            values = {n: nearest.parameters.value(n) for n in start.parameters}
+            start = Start(_states(names(self.problem.system.states), runs), values)
+        posed = self.problem.transcription(start)
+        held = replace(self.parameter, value=self.value(z), lower=self.value(z), upper=self.value(z))
+        posed = replace(posed, parameters=posed.parameters | ParameterSet({self.name: held}))
+        point = _Point(z, solve_least_squares(posed, self.method))
+        self.points.append(point)
+        return point
+
+    def root(self, point: _Point) -> float:
+        """Distance from the best fit, in standard deviations were the model linear; infinite where nothing fits."""
+        least = min(p.cost for p in self.points)
+        return math.sqrt(max(0.0, 2 * (point.cost - least) / self.scale)) if math.isfinite(point.cost) else math.inf
+
+    def curve(self) -> "pd.DataFrame":
+        """All refits, by rising value."""
+        import pandas as pd
+
+        rows = []
+        for point in sorted(self.points, key=lambda known: known.z):
+            others = {n: point.fit.solution.parameters.value(n) for n in self.start.parameters if n != self.name}
+            rows.append({"value": self.value(point.z), "deviance": self.root(point) ** 2, **others})
+        return pd.DataFrame(rows)
+
+    def _searched_spread(self, stderr: float) -> float:
+        return stderr / self.parameter.value if self.parameter.log else stderr
+
+    def _scale(self, noise: float) -> float:
+        """Cost that is worth one variance: soft gaps rise less than the likelihood, which the standard error knows."""
+        if not (math.isfinite(self.spread) and self.spread > 0):
+            return noise
+        step = min(self.spread, PROBE) if self.parameter.log else self.spread
+        around = [self.centre + step, self.centre - step]
+        lower, upper = self.searched(self.parameter.lower), self.searched(self.parameter.upper)
+        if not all(lower <= z <= upper for z in around):
+            return noise
+        middle = self.points[0].cost
+        rise = sum(self.at(z).cost - middle for z in around)
+        found = rise * (self.spread / step) ** 2
+        return min(max(found, 0.1 * noise), noise) if math.isfinite(found) else noise
+
+
+def _states(own: Sequence[str], runs: Mapping[str, Trajectory]) -> Mapping[str, Trajectory]:
+    """What a start takes of fitted runs."""
+    return {log: Trajectory(run.t, {n: run[n] for n in own}) for log, run in runs.items()}
+
+
+def _bracket(refits: _Refits, side: int, target: float) -> None:
+    """Refit on one side until the profile has left the level, then closely around that; or to the bound."""
+    p = refits.parameter
+    bound = refits.searched(p.lower if side < 0 else p.upper)
+    inside, step = refits.points[0], _first_step(refits, target)
+    for _ in range(MOST_POINTS):
+        z = side * min(side * inside.z + step, side * bound)
+        if z == inside.z:
+            return
+        point = refits.at(z)
+        if refits.root(point) >= target:
+            _locate(refits, inside, point, target)
+            return
+        gained = refits.root(point) - refits.root(inside)
+        wanted = (target - refits.root(point)) * abs(z - inside.z) / gained if gained > 0 else math.inf
+        inside, step = point, min(max(1.05 * wanted, 0.1 * step), 3 * step, LONGEST if p.log else math.inf)
+
+
+def _end(refits: _Refits, side: int, target: float) -> float:
+    """The outermost crossing of the level on one side; infinite where the outermost refit is still believed."""
+    points = sorted(refits.points, key=lambda known: -side * known.z)
+    for outside, inside in itertools.pairwise(points):
+        a, b = refits.root(inside), refits.root(outside)
+        if a < target <= b:
+            share = (target - a) / (b - a) if math.isfinite(b) else 0.5
+            return refits.value(inside.z + share * (outside.z - inside.z))
+        if b < target:
+            break
+    return side * math.inf
+
+
+def _first_step(refits: _Refits, target: float) -> float:
+    """To where the linear interval ends, as searched, and a little further."""
+    p, linear = refits.parameter, 1.05 * target * refits.spread
+    if p.log:
+        return min(linear, LONGEST) if math.isfinite(linear) else LONGEST
+    return linear if math.isfinite(linear) and linear > 0 else 0.1 * max(abs(p.value), 1e-6)
+
+
+def _locate(refits: _Refits, inside: _Point, outside: _Point, target: float) -> None:
+    """Refit ever nearer to the crossing, by false position on the root of the deviance, which is nearly linear."""
+    for _ in range(MOST_POINTS):
+        a, b = refits.root(inside), refits.root(outside)
+        if not a < target <= b:  # a refit has found a better fit, from which all are counted now
+            return
+        share = (target - a) / (b - a) if math.isfinite(b) else 0.5
+        point = refits.at(inside.z + min(max(share, 0.05), 0.95) * (outside.z - inside.z))
+        if abs(refits.root(point) - target) < CLOSE * target:
+            return
+        inside, outside = (point, outside) if refits.root(point) < target else (inside, point)

@@ -1,0 +1,247 @@
+"""`fitted`: a candidate's fit, repeated with weights for outliers (`Huber`, `SoftL1`) and noise levels from residuals.
+
+Iteratively reweighted least squares: each sample's noise is divided by the root of its weight psi(r)/r, where r is its
+residual over the channel's own scale (1.4826 MAD), and the next fit starts where the last one ended.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.checks import measured_outputs
+from pneuopt.errors import require
+from pneuopt.experiments import Experiment
+from pneuopt.nlp.least_squares import NOISE_LEVEL, Fit, LeastSquares, solve_least_squares
+from pneuopt.nlp.status import Code, Status
+from pneuopt.posing import Problem
+from pneuopt.statistics import noise_level
+from pneuopt.system import Start
+from pneuopt.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+REFITS = 12
+STILL = 0.05  # standard deviations that an estimate may still move from refit to refit
+SETTLED = 0.02  # relative change of a noise level, likewise
+WARM_STAGES = 3  # of the method's last, for a refit starts near its answer
+LEAST_WEIGHT = 1e-8
+OUTLYING = 4.0  # of a channel's own scale: one in 16 000 samples of normal noise
+
+
+class Loss(Protocol):
+    """How much a residual counts beyond the noise."""
+
+    def weight(self, r: Array) -> Array:
+        """psi(r)/r: 1 for small residuals; r in standard deviations."""
+        ...
+
+    def slope(self, r: Array) -> Array:
+        """psi'(r)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Huber:
+    """Quadratic up to a threshold, linear beyond (Huber 1964).
+
+    Parameters
+    ----------
+    threshold : float
+        In standard deviations; at 1.345 the estimates' variance is 5 % above the least where there are no outliers.
+
+    Examples
+    --------
+    >>> Huber(1.0).weight(np.array([-0.5, 4.0])).tolist()
+    [1.0, 0.25]
+    """
+
+    threshold: float = 1.345
+
+    def __post_init__(self) -> None:
+        require(self.threshold > 0, f"Huber: the threshold must be positive, got {self.threshold:g}")
+
+    def weight(self, r: Array) -> Array:
+        """psi(r)/r."""
+        return np.asarray(self.threshold / np.maximum(np.abs(r), self.threshold))
+
+    def slope(self, r: Array) -> Array:
+        """psi'(r)."""
+        return np.asarray(np.abs(r) <= self.threshold, dtype=float)
+
+
+@dataclass(frozen=True)
+class SoftL1:
+    """``2 c^2 (sqrt(1 + (r/c)^2) - 1)``: a Huber loss without a corner.
+
+    Parameters
+    ----------
+    threshold : float
+        c, in standard deviations.
+
+    Examples
+    --------
+    >>> SoftL1(1.0).weight(np.array([0.0])).tolist()
+    [1.0]
+    """
+
+    threshold: float = 1.345
+
+    def __post_init__(self) -> None:
+        require(self.threshold > 0, f"SoftL1: the threshold must be positive, got {self.threshold:g}")
+
+    def weight(self, r: Array) -> Array:
+        """psi(r)/r."""
+        return np.asarray(1 / np.sqrt(1 + (r / self.threshold) ** 2))
+
+    def slope(self, r: Array) -> Array:
+        """psi'(r)."""
+        return np.asarray((1 + (r / self.threshold) ** 2) ** -1.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """A fit, and the problem with the weights and noise levels that it solved.
+
+    Attributes
+    ----------
+    problem : Problem
+    fit : Fit
+    spread : float
+        By how much the estimates' variance exceeds what the weighted squares say.
+    """
+
+    problem: Problem
+    fit: Fit
+    spread: float = 1.0
+
+
+def fitted(problem: Problem, candidate: Start, loss: Loss | None = None, *, estimate_noise: bool = False) -> Refit:
+    """Fit from one candidate; again with new weights and noise levels until neither they nor the estimates move.
+
+    Parameters
+    ----------
+    problem : Problem
+    candidate : Start
+    loss : Loss, optional
+    estimate_noise : bool
+        Each channel's noise becomes the white part of its residuals (`noise_level`): what a wrong model leaves in them
+        varies slowly, does not count, and so stays visible.
+
+    Returns
+    -------
+    Refit
+        Its spread is Huber's sandwich ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for all.
+    """
+    found = Refit(problem, solve_least_squares(problem.transcription(candidate), problem.method))
+    if loss is None and not estimate_noise:
+        return found
+    warm = replace(problem.method, stages=problem.method.stages[-WARM_STAGES:])
+    fits = [found.fit]
+    for _ in range(REFITS):
+        if found.fit.solution.status.code in (Code.DIVERGED, Code.INTERRUPTED):
+            break
+        before, found = found, _again(found, loss, warm, estimate_noise=estimate_noise)
+        fits.append(found.fit)
+        if _is_settled(before, found):
+            break
+    return _summed_up(replace(found, problem=replace(found.problem, method=problem.method)), fits, loss)
+
+
+def _summed_up(found: Refit, fits: Sequence[Fit], loss: Loss | None) -> Refit:
+    """The last fit with the effort of all, and a status that judges the bulk of the samples, not the outliers."""
+    solution = found.fit.solution
+    effort = {n: sum(fit.solution.stats[n] for fit in fits) for n in ("iterations", "seconds")}
+    status = solution.status
+    if loss is not None and status.converged and found.fit.jumps is None:
+        status = Status(status.code, _told(found, len(fits)))
+    solution = replace(solution, stats={**solution.stats, **effort, "refits": len(fits) - 1.0}, status=status)
+    return replace(found, fit=replace(found.fit, solution=solution))
+
+
+def _told(found: Refit, fits: int) -> str:
+    """In words: outliers, and what the model leaves beyond the noise in the other samples."""
+    worst, level, beyond, count = "", 1.0, 0, 0
+    runs = _runs(found)
+    for e in found.problem.experiments:
+        residuals = _residuals(found.problem, e, runs[e.name])
+        scales = _scales(residuals)
+        beyond += int(np.sum(np.abs(residuals) > OUTLYING * scales))
+        count += int(np.isfinite(residuals).sum())
+        if scales.max() > level:
+            level, channel = float(scales.max()), measured_outputs(found.problem.system, e)[int(np.argmax(scales))]
+            worst = f"{channel} of {e.name}"
+    told = f"{fits - 1} refits, {beyond} of {count} samples are outliers, beyond {OUTLYING:g} standard deviations"
+    if level**2 <= NOISE_LEVEL:
+        return told
+    return f"{told}; the model does not explain the log to its noise: residuals are {level:.2g} times that of {worst}"
+
+
+def _again(found: Refit, loss: Loss | None, method: LeastSquares, *, estimate_noise: bool) -> Refit:
+    problem, runs = found.problem, _runs(found)
+    if estimate_noise:
+        problem = replace(
+            problem, experiments=tuple(_with_noise(problem, e, runs[e.name]) for e in problem.experiments)
+        )
+    residuals = {e.name: _residuals(problem, e, runs[e.name]) for e in problem.experiments}
+    scales = {n: _scales(r) for n, r in residuals.items()}
+    weights = (
+        {} if loss is None else {n: np.fmax(loss.weight(r / scales[n]), LEAST_WEIGHT) for n, r in residuals.items()}
+    )
+    problem = replace(problem, weights={n: np.nan_to_num(w, nan=1.0) for n, w in weights.items()}, method=method)
+    own = found.fit.solution.parameters
+    start = Start(runs, {n: own.value(n) for n in own.free_names}, "refit")
+    fit = solve_least_squares(problem.transcription(start), method)
+    return Refit(problem, fit, 1.0 if loss is None else _spread(loss, residuals, scales, weights))
+
+
+def _runs(found: Refit) -> Mapping[str, Trajectory]:
+    logs = (e.name for e in found.problem.experiments)
+    return dict(zip(logs, found.fit.solution.trajectories, strict=True))
+
+
+def _residuals(problem: Problem, experiment: Experiment, run: Trajectory) -> Array:
+    """In noise standard deviations, shape (n, n_measured)."""
+    outputs = measured_outputs(problem.system, experiment)
+    noise = np.array([experiment.noise[o] for o in outputs])
+    return np.asarray((experiment.trajectory.matrix(outputs) - run.matrix(outputs)) / noise)
+
+
+def _scales(residuals: Array) -> Array:
+    """Each channel's own: 1.4826 MAD, or the noise where more than half of the residuals vanish."""
+    scales = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
+    return np.where(scales > 0, scales, 1.0)
+
+
+def _with_noise(problem: Problem, experiment: Experiment, run: Trajectory) -> Experiment:
+    levels = {}
+    for channel in measured_outputs(problem.system, experiment):
+        level = noise_level(experiment.trajectory[channel] - run[channel], run.t)
+        levels[channel] = level if level > 0 else experiment.noise[channel]
+    return experiment.with_noise(levels)
+
+
+def _spread(
+    loss: Loss, residuals: Mapping[str, Array], scales: Mapping[str, Array], weights: Mapping[str, Array]
+) -> float:
+    """Huber's sandwich at the scale of each channel, over the variance that a weighted least squares takes."""
+    parts = [(r, np.broadcast_to(scales[n], r.shape), weights[n]) for n, r in residuals.items()]
+    r, s, w = (np.concatenate([part[i].ravel() for part in parts]) for i in range(3))
+    known = np.isfinite(r)
+    r, s, w = r[known], s[known], w[known]
+    return float(np.mean((w * r) ** 2) * np.mean(w) / (np.mean(loss.slope(r / s)) ** 2 * np.mean(w * r**2)))
+
+
+def _is_settled(before: Refit, after: Refit) -> bool:
+    old, new = before.fit.solution.parameters, after.fit.solution.parameters
+    free = new.free_names
+    moved = np.array([new.value(n) - old.value(n) for n in free])
+    if after.fit.covariance is None:
+        return False
+    deviation = np.sqrt(np.diag(after.fit.covariance))
+    steps = np.abs(moved[deviation > 0]) / deviation[deviation > 0]
+    logs = zip(before.problem.experiments, after.problem.experiments, strict=True)
+    levels = [abs(math.log(b.noise[n] / a.noise[n])) for a, b in logs for n in b.noise]
+    return bool(np.max(steps, initial=0.0) < STILL and max(levels, default=0.0) < SETTLED)

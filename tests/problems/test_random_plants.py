@@ -1,0 +1,63 @@
+"""Random plants: what is drawn, how exact the logs are, what the rows say; the slow part identifies a few."""
+
+from pathlib import Path
+
+import b32
+import numpy as np
+import pandas as pd
+import pytest
+import random_plants
+
+from pneuopt.models import catalog
+
+
+@pytest.mark.parametrize("kind", random_plants.KINDS)
+def test_what_is_drawn_stays_in_its_ranges_and_does_not_change(kind: str) -> None:
+    plants = pd.DataFrame([random_plants.drawn(kind, seed) for seed in range(1000, 1200)])
+    for name, (low, high) in random_plants.RANGES.items():
+        if name in plants:
+            assert low <= plants[name].min() < 1.1 * low + 0.1 * high
+            assert 0.8 * high < plants[name].max() <= high
+    excess = plants["friction.static"] / plants["friction.coulomb"]
+    assert (excess.min(), excess.max()) == pytest.approx(random_plants.EXCESS, abs=0.05)
+    assert random_plants.drawn(kind, 1000)["friction.coulomb"] == pytest.approx(48.89007296837907)
+
+
+@pytest.mark.parametrize("kind", random_plants.KINDS)
+def test_its_logs_are_those_of_tight_integration(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(random_plants, "SAMPLES", 1000)
+    monkeypatch.setattr(random_plants, "NOISE", dict.fromkeys(b32.NOISE, 1e-12))
+    monkeypatch.setattr(b32, "NOISE", dict.fromkeys(b32.NOISE, 1e-12))
+    drive, given = catalog.b32(kind == "lugre")
+    truth = given.with_values(random_plants.drawn(kind, 1003))
+    ours = random_plants.generate(kind, truth, 1003).trajectory
+    tight = b32.generate(drive, truth, seconds=1.0).trajectory
+    for channel, most in {"position": 1e-7, "pressure_a": 1.0, "pressure_b": 1.0, "valve_voltage": 1e-6}.items():
+        assert np.max(np.abs(ours[channel] - tight[channel])) < most, channel
+
+
+def test_encoder_and_outliers() -> None:
+    truth = catalog.b32()[1]
+    plain, coarse = (random_plants.generate("stribeck", truth, 1, *extra) for extra in ((), (1e-4, 0.01)))
+    sigma = coarse.noise["position"]
+    off = np.abs(coarse.trajectory["position"] - plain.trajectory["position"]) > 10 * sigma
+    assert sigma == pytest.approx(1e-4 / np.sqrt(12))
+    assert 0.007 < off.mean() < 0.013
+    steps = coarse.trajectory["position"][~off] / 1e-4
+    assert np.max(np.abs(steps - np.round(steps))) < 1e-6
+
+
+def test_a_lie_is_counted() -> None:
+    rows = {"converged": [1.0, 1.0, 0.0], "outside": [0.5, 3.0, 9.0], "percent": [0.1, 30.0, 80.0]}
+    plants = pd.DataFrame({**rows, "simulations": [10.0, 20.0, 30.0], "cpu": [1.0, 2.0, 3.0]})
+    claims = {c.name: c for c in random_plants._claims("stribeck", plants, held=True)}
+    assert (claims["stribeck.lies"].value, claims["stribeck.lies"].holds) == (1, False)
+    assert claims["stribeck.converged"].value == pytest.approx(200 / 3)
+    assert claims["stribeck.within_2_percent"].value == 50
+
+
+@pytest.mark.slow
+def test_random_plants(tmp_path: Path) -> None:
+    rows = random_plants.main(4, out=tmp_path)
+    assert list(rows.loc[~rows["holds"].astype(bool), "name"]) == []
+    assert len(pd.read_csv(tmp_path / "random_plants.csv")) == 8

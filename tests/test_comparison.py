@@ -1,0 +1,62 @@
+"""Whether logs are of one drive."""
+
+import numpy as np
+import pytest
+
+from pneuopt.comparison import compare_logs
+from pneuopt.errors import LogError
+from pneuopt.experiments import Experiment
+from pneuopt.identify import identify
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb
+from pneuopt.simulate import simulate
+from pneuopt.trajectories import Trajectory
+
+TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
+DRIVE = ForceDrive(Coulomb()).system()
+FREE = DRIVE.parameters.freed(*TRUTH)
+
+
+def pushed(name: str, seed: int, **other: float) -> Experiment:
+    t = np.arange(1000) * 1e-3
+    force = 50 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t + seed)
+    truth = {**TRUTH, **{n.replace("__", "."): v for n, v in other.items()}}
+    run = simulate(DRIVE, Trajectory(t, {"force": force}), DRIVE.parameters.with_values(truth))
+    noisy = run["position"] + 2e-5 * np.random.default_rng(seed).standard_normal(t.size)
+    return Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": 2e-5}, name=name)
+
+
+def test_the_parameter_and_the_log_that_disagree_are_named() -> None:
+    logs = [pushed("a", 1), pushed("b", 2), pushed("other", 3, friction__coulomb=36.0)]
+    joint = identify(DRIVE, logs, FREE, throw=False)
+    assert "compare_logs tells whether the logs are of one drive" in joint.status.message
+    found = compare_logs(DRIVE, logs, FREE)
+    assert not found.agree
+    assert found.reason.startswith("friction.coulomb is 36")
+    assert "in other alone, and 30" in found.reason
+    deviation = found.table["deviation"].abs()
+    assert deviation["friction.coulomb"]["other"] > 20
+    assert deviation["load.mass"].max() < 4
+
+
+def test_logs_of_one_drive_agree_whatever_is_each_ones_own() -> None:
+    logs = [pushed("a", 1, load__force=-4.0), pushed("b", 2, load__force=9.0)]
+    found = compare_logs(DRIVE, logs, FREE.per_log("load.force"))
+    assert found.agree, found
+    assert "load.force" not in found.table.index.get_level_values("parameter")
+    assert found.reason == "the 2 logs agree in load.mass, friction.coulomb, friction.viscous"
+    masses = [pushed("a", 1), pushed("b", 2, load__mass=6.0).with_conditions({"load.mass": 6.0})]
+    assert compare_logs(DRIVE, masses, FREE).agree
+
+
+def test_what_no_two_logs_tell_is_not_compared() -> None:
+    known = FREE.fixed(*TRUTH).freed("load.mass")
+    logs = [pushed("a", 1), pushed("b", 2).with_conditions({"load.mass": 3.0})]
+    found = compare_logs(DRIVE, logs, known)
+    assert found.agree
+    assert found.reason.startswith("nothing could be compared")
+
+
+def test_one_log_is_not_to_be_compared() -> None:
+    with pytest.raises(LogError, match="at least two"):
+        compare_logs(DRIVE, [pushed("a", 1)], FREE)

@@ -1,0 +1,57 @@
+import numpy as np
+
+from pneuopt.excitation import missing, motion, remedy
+from pneuopt.experiments import Experiment
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import LuGre
+from pneuopt.trajectories import Array, Trajectory
+
+VALUES = ForceDrive(LuGre()).parameters  # 5 kg, 30 N, Stribeck velocity 20 mm/s
+T = np.arange(0, 4, 1e-3)
+
+
+def seen(speed: Array) -> Experiment:
+    return Experiment(Trajectory(T, {"speed": speed}), name="log")
+
+
+def test_a_sine_excites_everything() -> None:
+    found = motion([seen(0.3 * np.sin(2 * np.pi * T))], {}, VALUES, VALUES)
+    assert found is not None
+    assert 0.45 < found.forward < 0.55
+    assert 6 <= found.reversals <= 8
+    assert abs(found.acceleration - 0.3 * 2 * np.pi / np.sqrt(2)) < 0.1
+    free = [f"friction.{n}" for n in ("coulomb", "static", "viscous", "stribeck_velocity", "bristle_stiffness")]
+    assert all(missing(name, [*free, "load.mass", "load.force"], found) is None for name in free)
+
+
+def test_what_is_lacking_counts_only_where_it_confuses() -> None:
+    found = motion([seen(np.full(T.size, 0.2))], {}, VALUES, VALUES)
+    both = ["friction.coulomb", "friction.viscous", "load.force"]
+    for name, words in (("friction.viscous", "too near for a slope"), ("load.force", "moves forwards only")):
+        lack = missing(name, both, found)
+        assert lack is not None
+        assert words in lack[0]
+    assert missing("friction.viscous", ["friction.viscous"], found) is None
+    assert missing("load.force[run 1]", ["load.force[run 1]"], found) is None
+    assert missing("valve.leak", ["valve.leak"], found) is None
+    bristle = missing("friction.bristle_damping", ["friction.bristle_damping"], found)
+    assert bristle is not None
+    assert bristle[0].startswith("the motion never reverses")
+    assert missing("load.mass", ["load.mass"], found) is not None
+
+
+def test_states_stand_in_for_a_speed_that_is_not_logged() -> None:
+    log = Experiment(Trajectory(T, {"position": T}), name="log")
+    assert motion([log], {}, VALUES, VALUES) is None
+    found = motion([log], {"log": Trajectory(T, {"speed": np.full(T.size, -0.1)})}, VALUES, VALUES)
+    assert found is not None
+    assert found.forward == 0
+    assert missing("friction.viscous", ["friction.viscous", "friction.coulomb"], None) is None
+
+
+def test_the_remedy_suits_the_pair() -> None:
+    assert "turn the axis round" in remedy(["load.force[a]", "friction.coulomb_asymmetry"])
+    assert "five Stribeck velocities" in remedy(["friction.coulomb", "friction.viscous"])
+    assert "slow ramps" in remedy(["friction.static", "friction.stribeck_velocity"])
+    assert remedy(["rig.area"]) == "fix it, or log a run that moves differently"
+    assert remedy(["rig.area", "rig.area_bias"]).startswith("fix one of them")

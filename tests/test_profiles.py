@@ -1,0 +1,100 @@
+import math
+
+import numpy as np
+import pytest
+
+from pneuopt.errors import InputError, UnknownNameError
+from pneuopt.experiments import Experiment
+from pneuopt.identify import IdentificationResult, identify
+from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
+from pneuopt.parameters import ParameterSet
+from pneuopt.profiles import profile
+from pneuopt.simulate import simulate
+from pneuopt.system import System
+from pneuopt.trajectories import Trajectory
+
+LEVELS = {"friction.coulomb": 30.0, "friction.static": 42.0, "friction.stribeck_velocity": 0.025}
+CURVE = ("friction.coulomb", "friction.static", "friction.stribeck_velocity")
+
+
+def moved(static: float, noise: float, fastest: float = 0.2, seed: int = 0) -> Experiment:
+    """A rig's log at speeds spread evenly over the logarithm, 1 mm/s to the fastest, both ways."""
+    rng = np.random.default_rng(seed)
+    speed = np.geomspace(1e-3, fastest, 300) * np.where(np.arange(300) % 2, 1, -1)
+    g = 30.0 + (static - 30.0) * np.exp(-((speed / 0.025) ** 2))
+    force = g * np.tanh(speed / 1e-3) + 60.0 * speed + noise * rng.standard_normal(300)
+    t = np.arange(300) * 1e-2
+    return Experiment(Trajectory(t, {"speed": speed, "force": force}), {"force": noise}, name="map")
+
+
+def fitted(friction: FrictionModel, log: Experiment, *free: str) -> tuple[System, IdentificationResult]:
+    rig = MotionDrive(friction, chamber=False)
+    known = {n: v for n, v in LEVELS.items() if n in rig.parameters} | {"friction.viscous": 60.0}
+    return rig.system(), identify(rig.system(), [log], rig.parameters.with_values(known).freed(*free))
+
+
+def test_of_a_linear_model_it_is_the_linear_interval() -> None:
+    log = moved(30.0, 0.5)
+    system, result = fitted(Coulomb(), log, "friction.coulomb", "friction.viscous")
+    for name in ("friction.coulomb", "friction.viscous"):
+        found, row = profile(system, [log], result, name), result.estimates.loc[name]
+        assert not found.is_open
+        assert found.low - row["value"] == pytest.approx(row["ci_low"] - row["value"], rel=0.01)
+        assert found.high - row["value"] == pytest.approx(row["ci_high"] - row["value"], rel=0.01)
+        deviance = np.interp(row["value"] + row["stderr"], found.curve["value"], found.curve["deviance"])
+        assert deviance < 2.0
+
+
+def test_of_a_drive_with_soft_gaps_it_is_the_linear_interval() -> None:
+    system = ForceDrive(Coulomb()).system()
+    truth = ForceDrive(Coulomb()).parameters.with_values({"load.mass": 3.0})
+    t = np.arange(0, 1.0, 1e-3)
+    force = 60 * np.sin(2 * np.pi * 2 * t) + 30 * np.sin(2 * np.pi * 5 * t)
+    run = simulate(system, Trajectory(t, {"force": force}), truth)
+    noisy = run["position"] + 2e-5 * np.random.default_rng(0).standard_normal(t.size)
+    log = Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": 2e-5}, name="run")
+    result = identify(system, [log], truth.freed("load.mass", "friction.coulomb", "friction.viscous"))
+    found, row = profile(system, [log], result, "friction.viscous"), result.estimates.loc["friction.viscous"]
+    assert found.high - found.low == pytest.approx(row["ci_high"] - row["ci_low"], rel=0.03)
+
+
+def test_a_weakly_told_stribeck_velocity_has_unequal_sides() -> None:
+    log = moved(42.0, 16.0)
+    system, result = fitted(Stribeck(), log, *CURVE)
+    found = profile(system, [log], result, "friction.stribeck_velocity")
+    assert not found.is_open
+    assert found.low < 0.025 < found.high
+    below, above = math.log(found.estimate / found.low), math.log(found.high / found.estimate)
+    assert max(below, above) > 1.15 * min(below, above)
+    assert "m/s to" in found.told
+    wider = profile(system, [log], result, "friction.stribeck_velocity", level=0.99)
+    assert wider.low < found.low < found.high < wider.high
+
+
+def test_a_curve_that_is_not_there_has_open_ends_and_no_interval() -> None:
+    """Fitted to pure Coulomb friction, any Stribeck velocity will do."""
+    log = moved(30.0, 0.5, seed=2)
+    system, result = fitted(Stribeck(), log, *CURVE)
+    name = "friction.stribeck_velocity"
+    found = profile(system, [log], result, name)
+    assert found.is_open
+    row = result.estimates.to_dict(orient="index")[name]
+    assert row["note"] == "not told"
+    assert math.isnan(float(row["stderr"]))
+    assert (row["ci_low"], row["ci_high"]) == (-math.inf, math.inf)
+    assert f"the logs do not tell {name}: anything from 0.0001 to 1 m/s fits as well; log" in str(result.verdict)
+    assert np.isnan(result.covariance[name]).all()
+    assert f"the logs do not tell {name}" in result.status.message
+
+
+def test_bad_input_is_named() -> None:
+    log = moved(30.0, 0.5)
+    system, result = fitted(Coulomb(), log, "friction.coulomb", "friction.viscous")
+    with pytest.raises(UnknownNameError, match=r"friction\.colomb"):
+        profile(system, [log], result, "friction.colomb")
+    with pytest.raises(InputError, match="a level lies between 0 and 1, got 95"):
+        profile(system, [log], result, "friction.coulomb", level=95)
+    with pytest.raises(InputError, match="the result is of map, not of these logs"):
+        profile(system, [log, log], result, "friction.coulomb")
+    assert isinstance(result.parameters, ParameterSet)

@@ -1,0 +1,91 @@
+"""The order of starts: the model's first, then all, settled with their guesses held."""
+
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from pneuopt import starting
+from pneuopt.checks import check_logs
+from pneuopt.codegen import Rollout
+from pneuopt.experiments import Experiment
+from pneuopt.identify import identify
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
+from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.nlp.status import Code
+from pneuopt.nlp.transcription import Transcription
+from pneuopt.parameters import ParameterSet
+from pneuopt.posing import Problem
+from pneuopt.system import Start, discretise, vector
+from pneuopt.trajectories import Trajectory
+
+VELOCITY = "friction.stribeck_velocity"
+TRUTH = {"friction.coulomb": 30.0, "friction.static": 42.0, VELOCITY: 0.012, "friction.viscous": 60.0}
+
+
+def free(friction: FrictionModel) -> ParameterSet:
+    own = ForceDrive(friction).parameters
+    return own.freed(*(n for n in TRUTH if n in own))
+
+
+def posed(friction: FrictionModel) -> Problem:
+    """Half a second of a pushed drive that turns, sticks and slips."""
+    system, t = ForceDrive(friction).system(), np.arange(500) * 1e-3
+    force = 60 * np.sin(2 * np.pi * 4 * t)
+    p = vector(
+        system.parameters, system.parameters.with_values({n: v for n, v in TRUTH.items() if n in free(friction)})
+    )
+    run = Rollout(discretise(system).pieces).run(
+        np.zeros((1, 2)), force[None, :, None], p, t[None], np.full((1, 500), 1e-3), substeps=40
+    )
+    position = run.y[0, :, 0] + 1e-5 * np.random.default_rng(3).standard_normal(500)
+    log = Experiment(Trajectory(t, {"force": force, "position": position}), {"position": 1e-5}, name="run")
+    return Problem(system, tuple(check_logs(system, [log], free(friction))), free(friction), LeastSquares())
+
+
+def test_the_first_start_costs_nothing_more() -> None:
+    problem = posed(Stribeck())
+    first = next(starting.attempts(problem))
+    assert first.label == problem.candidates()[0].label
+    assert first.tried == (VELOCITY,)
+
+
+def test_the_others_settle_with_their_guess_held_and_come_by_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    costs = []
+
+    def spied(transcription: Transcription, method: LeastSquares) -> Fit:
+        fit = solve_least_squares(transcription, method)
+        costs.append(fit.solution.stats["cost"])
+        return fit
+
+    monkeypatch.setattr(starting, "solve_least_squares", spied)
+    problem = posed(Stribeck())
+    candidates = problem.candidates()
+    _, *settled = starting.attempts(problem)
+    order = [candidates[i].parameters[VELOCITY] for i in np.argsort(costs)]
+    assert [s.parameters[VELOCITY] for s in settled] == order
+    assert all(s.label.endswith("settled") and s.states["run"].names == ("position", "speed") for s in settled)
+    assert settled[0].parameters["friction.coulomb"] == pytest.approx(30, rel=0.05)
+
+
+def test_without_guesses_the_candidates_are_tried_as_they_are() -> None:
+    assert [s.label for s in starting.attempts(posed(Coulomb()))] == ["equation error"]
+
+
+def test_an_interruption_keeps_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(problem: Problem) -> Iterator[Start]:
+        wrong = problem.candidates()[0]
+        yield Start(wrong.states, {**wrong.parameters, "friction.coulomb": 3.0})
+        raise KeyboardInterrupt
+
+    module = sys.modules["pneuopt.identify"]  # the package shows the verb of that name
+    monkeypatch.setattr(module, "attempts", interrupted)
+    problem = posed(Stribeck())
+    hasty = LeastSquares(stages=(Stage(1e-2, 1),))
+    result = identify(
+        ForceDrive(Stribeck()).system(), problem.experiments, problem.parameters, method=hasty, throw=False
+    )
+    assert result.status.code is Code.INTERRUPTED
+    assert "best of 1 starts" in result.status.message
