@@ -225,7 +225,7 @@ def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple
     fits: list[tuple[Refit, str]] = []
     interrupted = False
     try:
-        for candidate in attempts(problem):
+        for candidate in attempts(problem, lambda: _misses(fits[0][0].fit)):
             found = fitted(problem, candidate, loss, estimate_noise=estimate_noise)
             fit = found.fit
             if fit.solution.status.code is Code.INTERRUPTED or _is_at_noise(fit):
@@ -251,6 +251,11 @@ def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple
 def _is_at_noise(fit: Fit) -> bool:
     """Whether nothing better is to be found; a wrong basin of soft bristles has left 1.1 noise variances a sample."""
     return fit.solution.status.converged and fit.jumps is None and fit.chi_square <= AT_NOISE * fit.count
+
+
+def _misses(fit: Fit) -> bool:
+    """Whether it is the optimum of a model that the log's states do not quite follow."""
+    return fit.solution.status.converged and fit.jumps is not None
 
 
 def _rank(fit: Fit) -> tuple[int, float]:

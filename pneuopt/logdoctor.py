@@ -16,6 +16,15 @@ BLOCKS = 20  # of a log, whose means tell motion from noise
 VACUUM = 0.3  # of the atmosphere: no pneumatic chamber is exhausted further
 RETURNS = 0.3  # of the path: a log that ends this near to its beginning does no net work on a load
 AGAINST = -0.2  # of the power's absolute value: what a brake would take, not a drive
+AREA_RATIOS = (
+    0.7,
+    0.75,
+    0.8,
+    0.85,
+    0.9,
+    0.95,
+    1.0,
+)  # of the rod's side to the other: any real cylinder has one of these
 SLOPES = (0.8, 1.25)  # of a speed over its position's slope
 CLIPPED = 0.02  # share of the samples at exactly the largest value
 
@@ -123,8 +132,11 @@ def _braking(log: Trajectory) -> Iterator[Finding]:
     for name, (told, remedy) in drives.items():
         if name == "force" and name not in log:
             continue
-        push = log[name] if name == "force" else log["pressure_a"] - log["pressure_b"]
-        share = _work_share(log.t, push, motion, centred=name != "force")
+        if name == "force":
+            share = _work_share(log.t, log["force"], motion, centred=False)
+        else:
+            pushes = (log["pressure_a"] - ratio * log["pressure_b"] for ratio in AREA_RATIOS)
+            share = max(_work_share(log.t, push, motion, centred=True) for push in pushes)
         if share < AGAINST:
             why = f"{told} the motion on balance ({100 * share:.0f} % of its power), which no drive does"
             yield Finding(name, f"{why}: change the sign of {remedy}", True)

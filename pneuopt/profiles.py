@@ -189,8 +189,8 @@ class _Refits:
         values = {str(n): float(v) for n, v in result.estimates["value"].items()}
         self.start = Start(_states(names(problem.system.states), result.trajectories), values, "fit")
         self.parameter = replace(problem.unknowns()[name], value=values[name])
-        last, steps = Stage(result.stats["gap_deviation"], ITERATIONS, refine=2), int(result.stats["substeps"])
-        self.method = replace(problem.method, stages=(last,), substeps=max(1, steps // 2), progress=None)
+        last, steps = Stage(result.stats["gap_deviation"], ITERATIONS, refine=4), int(result.stats["substeps"])
+        self.method = replace(problem.method, stages=(last,), substeps=max(1, steps // 4), progress=None)
         self.spread = self._searched_spread(float(result.estimates["stderr"][name]))
         self.points: list[_Point] = []
         self.at(self.searched(self.parameter.value))

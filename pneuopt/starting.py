@@ -4,7 +4,7 @@ What a start finder could only guess (`Start.tried`, as the Stribeck velocity) i
 the other parameters settle to each guess; from there the right basin is near, and its cost tells it from the others.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from pneuopt.nlp.least_squares import Fit, solve_least_squares
@@ -16,12 +16,15 @@ HELD_STAGES = 3  # of the search; tighter gaps would force a wrong guess on the 
 HELD = 1e-9  # relative width of the bounds that hold a guess: the compiled equations stay those of the search
 
 
-def attempts(problem: Problem) -> Iterator[Start]:
+def attempts(problem: Problem, confirms: Callable[[], bool] = lambda: False) -> Iterator[Start]:
     """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
 
     Parameters
     ----------
     problem : Problem
+    confirms : callable
+        Asked after the first start: whether it led to an optimum that only needs confirmation (of a model that misses
+        the log, say). The others are then taken as they are; settling all would cost more.
 
     Yields
     ------
@@ -34,7 +37,7 @@ def attempts(problem: Problem) -> Iterator[Start]:
     """
     candidates = problem.candidates()
     yield candidates[0]
-    guessed = [c for c in candidates if c.tried]
+    guessed = [] if confirms() else [c for c in candidates if c.tried]
     settled = [_settled(problem, c) for c in guessed] if len(guessed) > 1 else []
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
     yield from [c for c in candidates[1:] if not settled or not c.tried]

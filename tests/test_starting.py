@@ -1,7 +1,7 @@
 """The order of starts: the model's first, then all, settled with their guesses held."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ def test_without_guesses_the_candidates_are_tried_as_they_are() -> None:
 
 
 def test_an_interruption_keeps_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(problem: Problem) -> Iterator[Start]:
+    def interrupted(problem: Problem, _confirms: Callable[[], bool]) -> Iterator[Start]:
         wrong = problem.candidates()[0]
         yield Start(wrong.states, {**wrong.parameters, "friction.coulomb": 3.0})
         raise KeyboardInterrupt

@@ -36,7 +36,7 @@ def test_emps() -> None:
 def test_seal_friction() -> None:
     rows = seal_friction.main(DATASETS / "zillen_seal_friction")
     assert failed(rows) == []
-    assert len(rows) == 13
+    assert len(rows) == 17
 
 
 @pytest.mark.slow
