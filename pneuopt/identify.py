@@ -181,10 +181,10 @@ def _predicted(system: Model, experiment: Experiment, fixed: ParameterSet) -> Tr
     inputs, known = experiment.trajectory, conditioned(fixed, experiment)
     if not system.states:
         return free_run(system, inputs, known, {})
-    whole = LeastSquares(segment_time=math.inf)
-    problem = Problem(system, (experiment,), fixed, whole)
+    method = LeastSquares()  # over the whole log in one segment, stiction would trap the start in a local optimum
+    problem = Problem(system, (experiment,), fixed, method)
     start = problem.candidates()[0]
-    initial = solve_least_squares(problem.transcription(start), whole).solution.trajectories[0]
+    initial = solve_least_squares(problem.transcription(start), method).solution.trajectories[0]
     state = {s.name: float(initial[s.name][0]) for s in system.states}
     return free_run(system, inputs, known, state)
 

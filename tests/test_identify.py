@@ -334,10 +334,11 @@ def test_a_wrong_basin_is_not_the_answer_if_another_start_is_better() -> None:
 
 def test_a_held_out_run_is_predicted() -> None:
     free = ForceDrive(Stribeck()).parameters.freed(*CASES["stribeck"][1])
-    fit = identify(ForceDrive(Stribeck()).system(), [pushed(Stribeck())], free)
+    logs = [pushed(Stribeck(), "position", "speed", seed=seed) for seed in range(4)]
+    fit = identify(ForceDrive(Stribeck()).system(), logs, free)
     held_out = pushed(Stribeck(), "position", "speed", seed=7, seconds=1.0)
     table = validate(ForceDrive(Stribeck()).system(), [held_out], fit.parameters)
-    assert read(table, ("run 7", "position"), "rmse") < 5 * NOISE["position"]  # a free run of 1 s through stiction
+    assert read(table, ("run 7", "position"), "rmse") < 1.5 * NOISE["position"]
     assert read(table, ("run 7", "speed"), "fit_percent") > 95
     wrong = validate(
         ForceDrive(Stribeck()).system(), [held_out], fit.parameters.with_values({"friction.coulomb": 20.0})

@@ -149,7 +149,7 @@ def test_a_known_start_state_is_kept() -> None:
     assert (np.diag(fit.covariance) < np.diag(free.covariance)).all()
 
 
-@pytest.mark.parametrize(("bounds", "value"), [((1.0, 25.0), 25.0), ((31.0, 200.0), 31.0)])
+@pytest.mark.parametrize(("bounds", "value"), [((1.0, 25.0), 25.0), ((40.0, 200.0), 40.0)])
 def test_a_bound_stops_it_and_is_marked(bounds: tuple[float, float], value: float) -> None:
     problem = two_logs()
     parameters = problem.parameters.with_values({"stiffness": value}).with_bounds({"stiffness": bounds})
@@ -257,7 +257,7 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
     best: OptimizeResult = least_squares(partial(all_residuals, problem, fit), here, xtol=1e-13, ftol=1e-13, gtol=1e-10)
     assert fit.covariance is not None
     spread = np.sqrt(np.diag(fit.covariance))
-    assert np.abs((best.x[:4] - found(fit)) / spread).max() < 5e-3
+    assert np.abs((best.x[:4] - found(fit)) / spread).max() < 1e-3
     J: Array = np.asarray(best.jac)
     dense = np.linalg.inv(J.T @ J)[:4, :4]
     assert_allclose(np.diag(fit.covariance), np.diag(dense), rtol=1e-3)
