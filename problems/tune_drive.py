@@ -7,7 +7,8 @@ steps at once: small and large, forwards and backwards, from rest and from motio
 the lag of an encoder (difference over a sample, 5 ms of filter). The rig has what the model leaves out: Karnopp
 friction of the same levels, 0.4 % of hysteresis in the valve, an encoder of 10 um. All figures are those of the true
 speed. What the smooth model does not foretell is the overshoot of a piston that really sticks: on the rig the
-break-away to 0.1 m/s passes it by up to a fifth.
+break-away to 0.1 m/s passes it by more than the 15 % that this script is held to, and the row fails. "blind" is the PID
+alone, tuned as if the controller saw the true speed at once.
 
 saved_by_dither compares the settling times on the rig; for a step that never settles its horizon stands, so it is a
 lower bound.
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from claims import METRICS, Claim, arguments, design, finish, frame
+from supply_and_load import RANGES
 
 import pneuopt as po
 from pneuopt.models.catalog import s32
@@ -38,19 +40,9 @@ STEPS = [
     po.Step(0.15, initial=0.10, horizon=HORIZON, start=SLOW),
 ]
 HAND = {"pid.Kp": 1.0, "pid.Ki": 10.0, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
-RANGES = {
-    "pid.Kp": (0.2, 60.0),
-    "pid.Ki": (0.5, 400.0),
-    "pid.Kd": (0.0, 0.5),
-    "pid.Tf": (0.002, 0.05),
-    "dither.amplitude": (0.0, 2.0),
-    "dither.offset": (-1.5, 1.5),
-}
-# What `tune` finds on the same drive where the controller sees the true speed at once.
-BLIND = {"pid.Kp": 2.462, "pid.Ki": 86.18, "pid.Kd": 0.0561, "pid.Tf": 0.002714, "dither.offset": -0.08653}
 LIMITS = (po.Overshoot(0.02), po.MaxSensitivity(1.6))
 SMOOTH = {"settling_time": "<= 0.16", "overshoot": "<= 2", "max_sensitivity": "<= 1.6"}
-REAL = {"settling_time": "<= 0.2", "overshoot": "<= 20"}
+REAL = {"settling_time": "<= 0.2", "overshoot": "<= 15"}
 SAMPLE, HYSTERESIS, COUNT, FILTER = 1e-3, 0.04, 1e-5, 5e-3  # [s], [V] of 10 V, [m], [s]
 COLOURS = {"hand": GREY, "pid_only": ORANGE, "tuned": BLUE}
 VALVE: dict[str, Any] = {"pid_only": {"lw": 1.4, "zorder": 3}, "tuned": {"lw": 0.8, "alpha": 0.6}}
@@ -71,12 +63,15 @@ class Job:
 def run() -> Job:
     loop, rig, given = loops()
     designs, seconds, smooth = {"hand": given}, {}, {}
-    for name, free in (("pid_only", given.fixed("dither.amplitude")), ("tuned", given)):
+    alone, seeing = given.fixed("dither.amplitude"), replace(loop, sensor=None)
+    for name, free in (("pid_only", alone), ("tuned", given)):
         begin = time.perf_counter()
         best = po.tune(loop, STEPS, free, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)
         designs[name], smooth[name], seconds[name] = best.parameters, best.certified, time.perf_counter() - begin
     smooth["hand"] = po.evaluate(loop, STEPS, given)
-    shown = designs | {"blind": given.with_values(BLIND)}
+    fast = alone.select(n for n in alone if n in seeing.parameters)
+    blind = po.tune(seeing, STEPS, fast, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)
+    shown = designs | {"blind": given | blind.parameters}
     return Job(loop, rig, designs, smooth, {n: po.evaluate(rig, STEPS, p) for n, p in shown.items()}, seconds)
 
 
