@@ -16,6 +16,7 @@ from pneuopt.experiments import Experiment, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder
+from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.parameters import ParameterSet
 from pneuopt.plotting import (
     Response,
@@ -124,6 +125,26 @@ def test_the_friction_map_is_that_of_the_equations() -> None:
     assert texts(figure.axes[0]) == "speed [m/s]|friction force [N]|"
 
 
+def test_the_friction_map_of_a_pneumatic_drive_with_bristles_is_the_stribeck_curve() -> None:
+    drive = PneumaticDrive(friction=LuGre())
+    system = drive.system()
+    inputs = Trajectory(t := np.arange(600) * 1e-3, {"valve_voltage": 1.0 * np.sin(12 * t)})
+    run = simulate(system, inputs, drive.parameters, initial={"position": 0.1})
+    logged = run.select(["position", "pressure_a", "pressure_b"])
+    log = Experiment(logged.with_columns({"valve_voltage": inputs["valve_voltage"]}))
+    (axes,) = plot_friction(system, Fit(drive.parameters, {"log 1": run}), [log]).axes
+    v, force = line(axes, "fitted")
+    Fc, Fs, vs, B = (
+        drive.parameters.value(f"friction.{n}") for n in ("coulomb", "static", "stribeck_velocity", "viscous")
+    )
+    curve = np.sign(v) * (Fc + (Fs - Fc) * np.exp(-((v / vs) ** 2))) + B * v
+    assert np.allclose(force, curve, atol=0.02 * Fc)
+    speed, implied = line(axes, "from the logs")
+    fast = np.isfinite(implied) & (np.abs(speed) > 4 * vs)
+    assert fast.sum() > 100
+    assert np.median(np.abs(implied - Fc * np.sign(speed) - B * speed)[fast]) < 0.05 * Fc
+
+
 def test_the_friction_maps_band_is_that_of_the_estimates() -> None:
     experiment, run = fitted()
     result = Fit(TRUTH, {"run_0": run}, table({"friction.coulomb": 4.0, "friction.viscous": 25.0}))
@@ -185,7 +206,6 @@ def test_a_rig_shows_its_measured_force() -> None:
     assert np.array_equal(line(figure.axes[0], "from the logs")[1], measured)
     assert np.array_equal(line(figure.axes[0], "fitted")[1], measured + 1)
     assert figure.axes[0].get_ylabel() == "force [N]"
-    assert not has_friction_map(ForceDrive(LuGre()).system())
     assert not has_friction_map(FirstOrder().system())
     with pytest.raises(InputError, match="a friction map is drawn for"):
         plot_friction(FirstOrder().system(), Fit(rig.parameters, {}), [experiment])

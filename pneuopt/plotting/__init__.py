@@ -5,7 +5,8 @@ No window is opened and no global state is touched: each function returns a `Fig
 
 from pneuopt.plotting.canvas import check_figure_path, save_figure
 from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
-from pneuopt.plotting.fits import has_friction_map, plot_fit, plot_friction, plot_prediction
+from pneuopt.plotting.fits import plot_fit, plot_prediction
+from pneuopt.plotting.friction_map import has_friction_map, plot_friction
 from pneuopt.plotting.loops import Response, plot_bode, plot_steps
 from pneuopt.plotting.maps import plot_map
 

@@ -1,0 +1,160 @@
+"""The friction that the logs imply over speed, with the fitted curve and its band."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.derived import propagated
+from pneuopt.errors import require
+from pneuopt.experiments import Experiment, differentiate
+from pneuopt.parameters import ParameterSet
+from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
+from pneuopt.plotting.fits import MOST_POINTS, Fitted
+from pneuopt.system import System, names, vector
+from pneuopt.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+BAND = 1.96  # standard deviations, 95 %
+SLOPE_SAMPLES = 20  # of a local derivative
+INERTIA = "load.mass"
+
+
+def plot_friction(system: System, result: Fitted, experiments: Sequence[Experiment]) -> "Figure":
+    """The friction force that the logs imply against speed, with the fitted curve and its 95 % band on top.
+
+    For a `MotionDrive` the force as measured, offset and pressure and all. For a drive with a mass what pushes it (the
+    logged force or pressures, less the load) less mass times acceleration, each derivative a local slope of the log:
+    the fit has no part in the points but for what is not logged, and the load. Where the motion reverses there are
+    none, for a slope taken across the jump is none. The curve is that of steady motion, at the pressures' median.
+
+    Parameters
+    ----------
+    system : System
+    result : Fitted
+    experiments : sequence of Experiment
+        Those that it was made from, in the same order.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        If the system is neither (`has_friction_map`).
+    """
+    require(has_friction_map(system), "a friction map is drawn for a drive with a mass, or for a MotionDrive")
+    imposed = not system.states
+    figure, ((axes,),) = axes_grid(1, 1, [4.2], width=7.0)
+    clouds = [
+        _imposed(e) if imposed else _implied(system, result, e, name)
+        for name, e in zip(result.trajectories, experiments, strict=True)
+    ]
+    speed, force = (np.concatenate(part) for part in zip(*clouds, strict=True))
+    every = max(1, len(speed) // MOST_POINTS)
+    axes.plot(speed[::every], force[::every], ".", color=GREY, ms=2.5, alpha=0.6, label="from the logs")
+    if imposed:
+        fitted = np.concatenate([run["force"] for run in result.trajectories.values()])
+        axes.plot(speed[::every], fitted[::every], ".", color=BLUE, ms=2.5, label="fitted")
+    else:
+        _curve(axes, system, result, _speeds(speed))
+    low, high = np.nanpercentile(force, [0.5, 99.5])
+    axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+    axes.set(xlabel="speed [m/s]", ylabel="force [N]" if imposed else "friction force [N]")
+    legend_above(figure, axes)
+    return figure
+
+
+def has_friction_map(system: System) -> bool:
+    """Whether `plot_friction` can draw it: speed in and force out, or a mass that moves."""
+    states, inputs = names(system.states), names(system.inputs)
+    imposed = not states and "speed" in inputs and names(system.outputs) == ("force",)
+    return imposed or ({"position", "speed"} <= set(states) and INERTIA in system.parameters)
+
+
+def _imposed(experiment: Experiment) -> tuple[Array, Array]:
+    return experiment.trajectory["speed"], experiment.trajectory["force"]
+
+
+def _implied(system: System, result: Fitted, experiment: Experiment, name: str) -> tuple[Array, Array]:
+    """Speed, and what pushes the mass without accelerating it."""
+    log, run = experiment.trajectory, result.trajectories[name]
+    found = {str(n): float(v) for n, v in result.estimates["value"].items()}
+    own = {n.partition("[")[0]: v for n, v in found.items() if n.endswith(f"[{name}]")}
+    known = {n: v for n, v in experiment.conditions.items() if n in result.parameters}
+    parameters = result.parameters.with_values({**own, **known})
+    speed = log["speed"] if "speed" in log else _slope(log.t, log["position"])
+    seen = {n: log[n] if n in log else run[n] for n in names(system.states)}
+    idle = {n: np.zeros(len(log)) for n in seen if n == "speed" or n.startswith("friction.")}
+    pushed = _rates(system, parameters, {**seen, **idle}, {q: log[q] for q in names(system.inputs)})["speed"]
+    force = parameters.value(INERTIA) * (pushed - _slope(log.t, speed))
+    reverses = np.convolve(np.abs(np.diff(np.sign(speed), prepend=np.nan)) > 0, np.ones(2 * SLOPE_SAMPLES), "same")
+    return speed, np.where(reverses > 0, np.nan, force)
+
+
+def _curve(axes: "Axes", system: System, result: Fitted, grid: Array) -> None:
+    """The fitted curve, and how far the estimates' covariance lets it move; no band where it does not say."""
+    shared = [n for n in result.covariance.index if n in result.parameters]
+    usual = {
+        n: float(np.median(np.concatenate([run[n] for run in result.trajectories.values()])))
+        for n in names(system.states)
+    }
+
+    def friction(values: Mapping[str, float]) -> Array:
+        moved = {n: replace(result.parameters[n], value=values[n], lower=-math.inf, upper=math.inf) for n in shared}
+        return _steady_friction(system, result.parameters | ParameterSet(moved), usual, grid)
+
+    force, spread = propagated(result, friction)
+    if np.isfinite(spread).all():
+        low, high = force - BAND * spread, force + BAND * spread
+        axes.fill_between(grid, low, high, color=BLUE, alpha=0.3, lw=0, label="95 % band")
+    axes.plot(grid, force, color=BLUE, lw=1.2, label="fitted")
+
+
+def _steady_friction(system: System, parameters: ParameterSet, usual: Mapping[str, float], speeds: Array) -> Array:
+    """What speed alone takes from the mass, the bristles bent as far as it bends them.
+
+    A bristle's rate is linear in its deflection: two points tell where it is zero.
+    """
+    inputs = {n: np.zeros(len(speeds)) for n in names(system.inputs)}
+    still = {n: np.full(len(speeds), 0.0 if n == "speed" else value) for n, value in usual.items()}
+    bristles = {s.name: s.nominal for s in system.states if s.name.startswith("friction.")}
+    still |= {n: np.zeros(len(speeds)) for n in bristles}
+    moving, bent = {**still, "speed": speeds}, {n: np.full(len(speeds), size) for n, size in bristles.items()}
+    straight = _rates(system, parameters, moving, inputs)
+    other = _rates(system, parameters, {**moving, **bent}, inputs)
+    ends = {n: size * straight[n] / (straight[n] - other[n]) for n, size in bristles.items()}
+    rest, steady = (_rates(system, parameters, x, inputs)["speed"] for x in (still, {**moving, **ends}))
+    return np.asarray(parameters.value(INERTIA) * (rest - steady))
+
+
+def _rates(
+    system: System, parameters: ParameterSet, x: Mapping[str, Array], u: Mapping[str, Array]
+) -> dict[str, Array]:
+    """The states' rates at many points at once."""
+    count = len(next(iter(x.values())))
+    given = [np.array([part[q.name] for q in group]) for part, group in ((x, system.states), (u, system.inputs))]
+    p = np.tile(vector(system.parameters, parameters)[:, None], (1, count))
+    found = system.ode.map(count)(np.zeros((1, count)), *given, p)[0].full()
+    return dict(zip(names(system.states), np.asarray(found), strict=True))
+
+
+def _slope(t: Array, y: Array) -> Array:
+    window = SLOPE_SAMPLES * float(np.median(np.diff(t)))
+    return differentiate(Experiment(Trajectory(t, {"position": y})), window=window).trajectory["speed"]
+
+
+def _speeds(speed: Array) -> Array:
+    """A grid over the range, dense around zero."""
+    low, high = float(np.nanmin(speed)), float(np.nanmax(speed))
+    near = np.geomspace(1e-4, 1.0, 120) * max(-low, high)
+    grid = np.unique(np.concatenate([np.linspace(low, high, 200), near, -near]))
+    return np.asarray(grid[(grid >= low) & (grid <= high) & (grid != 0)])
