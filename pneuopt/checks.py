@@ -1,14 +1,16 @@
 """Whether logs, a system and parameters fit together: refused here, before anything is solved, with the remedy."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from pneuopt.control.loop_start import LoggedLoop
-from pneuopt.errors import InputError, LogError, ModelError, check_known, require
+from pneuopt.errors import InputError, LogError, ModelError, PhysicsWarning, check_known, require
 from pneuopt.experiments import Experiment
+from pneuopt.finders import Log
 from pneuopt.logdoctor import Finding, examine
 from pneuopt.parameters import ParameterSet
 from pneuopt.statistics import noise_level
@@ -59,6 +61,21 @@ def check_content(experiments: Sequence[Experiment]) -> None:
     for faults in found.values():
         name, fault = next(iter(faults.items()))
         require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}", LogError)
+
+
+def doubts(system: Model, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
+    """What the model tells against logs that `check_logs` has passed, as a gauge pressure read as absolute.
+
+    Each sentence is warned of, too. A loop's logs hold no command, without which its plant tells nothing.
+    """
+    if isinstance(system, LoggedLoop):
+        return ()
+    every = system.parameters | parameters
+    known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
+    found = system.doubts({e.name: Log(e.trajectory, known[e.name]) for e in experiments})
+    for sentence in found:
+        warnings.warn(sentence, PhysicsWarning, stacklevel=3)
+    return tuple(found)
 
 
 def check_smooth(system: Model) -> None:

@@ -6,7 +6,7 @@ interrupted. Whatever is heavy is imported by the command that needs it, so that
 
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -168,13 +168,10 @@ def info() -> None:
 def _guarded() -> Iterator[None]:
     """Turn what a user can mend into one message and an exit status, and a warning of the physics into one line."""
     try:
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings():
             warnings.simplefilter("always", PhysicsWarning)
-            try:
-                yield
-            finally:
-                for line in dict.fromkeys(f"warning: {warning.message}" for warning in told):
-                    typer.echo(line, err=True)
+            warnings.showwarning = _teller()
+            yield
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(BAD_INPUT) from None
@@ -184,6 +181,19 @@ def _guarded() -> Iterator[None]:
     except KeyboardInterrupt:
         typer.echo("interrupted: no file was left half-written", err=True)
         raise typer.Exit(INTERRUPTED) from None
+
+
+def _teller() -> Callable[..., None]:
+    """What shows a warning, once, as soon as it comes."""
+    told: set[str] = set()
+
+    def show(message: Warning | str, *_: object) -> None:
+        line = f"warning: {message}"
+        if line not in told:
+            told.add(line)
+            typer.echo(line, err=True)
+
+    return show
 
 
 def _expanded(paths: Sequence[Path]) -> list[Path]:

@@ -10,7 +10,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import casadi as ca
@@ -252,7 +252,8 @@ class Rollout:
         function = self._library.rollout
         function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int, ctypes.c_longlong] + [ctypes.c_void_p] * 14
         function.restype = None
-        pointers = [a.ctypes.data if a is not None else None for a in (*given, *others)]
+        arrays = (*given, *others)
+        pointers = [a.ctypes.data if a is not None else None for a in arrays]
         blocks = -(-m // self.lanes)
         parts = max(1, min(self._threads, blocks))
         edges = [min(m, blocks * i // parts * self.lanes) for i in range(parts + 1)]
@@ -261,12 +262,9 @@ class Rollout:
         if len(calls) == 1:
             function(*calls[0])
         else:
-            running = [_pool(self._threads).submit(function, *call) for call in calls]
-            try:
-                for each in running:
-                    each.result()
-            finally:
-                wait(running)  # Ctrl-C must not free the arrays under the threads
+            running = [_pool(self._threads).submit(_called, function, call, arrays) for call in calls]
+            for each in running:
+                each.result()
 
     def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
@@ -293,6 +291,11 @@ class Rollout:
             return Run(run_y, x_end, run_x)
         run_dy = np.stack([_unstacked(a, ny, m, ns) for a in dys], axis=1)
         return Run(run_y, x_end, run_x, run_dy, _unstacked(S, nx, m, ns))
+
+
+def _called(function: Callable[..., None], call: tuple[object, ...], arrays: tuple[Array | None, ...]) -> None:  # noqa: ARG001
+    """Run a thread's part; it holds the arrays, so that Ctrl-C in the main thread cannot free them meanwhile."""
+    function(*call)
 
 
 def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:

@@ -35,10 +35,8 @@ class LogComparison:
         one from the other, in standard deviations of the difference), unit. NaN where one log alone does not tell.
     agree : bool
         Whether no parameter is 4 standard deviations and 2 % apart; also where nothing could be compared.
-    reason : str
-        One sentence.
-    fits : mapping of str to IdentificationResult
-        Of each log alone, whatever its status.
+    reason, fits
+        As of a `ModelSelection`; the fits are of each log alone.
     """
 
     table: "pd.DataFrame"

@@ -37,7 +37,7 @@ def build(source: str, *definitions: str) -> ctypes.CDLL | None:
         try:
             library = _loaded(cc, (*FLAGS, f"-D{definition}") if definition else FLAGS, source)
         except (OSError, subprocess.SubprocessError) as error:
-            detail = detail or (getattr(error, "stderr", None) or str(error))[:400]
+            detail = detail or _reason(error)[:400]
             continue
         if detail:
             say_once(f"{cc} compiles no SIMD lanes: models run several times slower, with the same answers: {detail}")
@@ -71,6 +71,16 @@ def cache_directory() -> Path:
 def _temporary_folder(reason: str) -> Path:
     log.warning("the cache of compiled models cannot be written (%s): compiling anew in each run", reason)
     return Path(tempfile.mkdtemp(prefix="pneuopt-"))
+
+
+def _reason(error: OSError | subprocess.SubprocessError) -> str:
+    """What a compiler said; of one that was killed before it could, the signal."""
+    if isinstance(error, subprocess.CalledProcessError) and not error.stderr:
+        code = error.returncode
+        return f"it was killed by signal {-code}" if code < 0 else f"it ended with exit status {code}"
+    if isinstance(error, subprocess.TimeoutExpired):
+        return f"it took more than {error.timeout:g} s"
+    return str(getattr(error, "stderr", None) or error)
 
 
 def _loaded(cc: str, flags: tuple[str, ...], source: str) -> ctypes.CDLL:

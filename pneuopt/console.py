@@ -98,7 +98,8 @@ def show_selection(console: Console, chosen: ModelSelection) -> None:
     table = _table("model", "free", "BIC above best", "contains", "p of chance", "")
     for row in chosen.table.reset_index(names="model").to_dict(orient="records"):
         figures = [str(row["free"]), _figure(row["bic_above"], 4), str(row["contains"]), _figure(row["p_value"], 2)]
-        table.add_row(str(row["model"]), *figures, "" if row["converged"] else "not converged")
+        note = "" if row["converged"] else "not converged"
+        table.add_row(str(row["model"]), *figures, note or (f"{NOT_TOLD}: {row['untold']}" if row["untold"] else ""))
     console.print(table)
 
 

@@ -104,7 +104,8 @@ def propagated(result: Estimated, function: Callable[[Values], ArrayLike]) -> tu
         Each of shape (n,).
     """
     known = {n: p.value for n, p in result.parameters.items()}
-    at = {**known, **{str(n): float(v) for n, v in result.estimates["value"].items()}}
+    found = {str(n): float(v) for n, v in result.estimates["value"].items()}
+    at = {**known, **{n: known[n.partition("[")[0]] if math.isnan(v) else v for n, v in found.items()}}
     covariance = result.covariance.to_numpy(dtype=float)
     variances = np.diag(covariance)
     slopes = [_slope(function, at, str(n), v) for n, v in zip(result.covariance.index, variances, strict=True)]

@@ -49,7 +49,7 @@ class HardwareError(InputError):
 
 
 class PhysicsWarning(UserWarning):
-    """A simulation has left what its model describes: the piston hit an end stop, or a chamber was emptied."""
+    """A simulation leaves what its model describes (end stop, empty chamber), or a log contradicts the model."""
 
 
 class ConvergenceError(PneuoptError):

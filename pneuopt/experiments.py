@@ -271,6 +271,8 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
         said = tomllib.loads(raw.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise LogError(f"{side}: not valid TOML: {error}") from None
+    other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
+    require(sidecar is not None or "drive" not in said, other, LogError)
     check_known("key", said, ("columns", "noise", "conditions"), str(side))
     for key, section in said.items():
         require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)

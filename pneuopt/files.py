@@ -37,6 +37,8 @@ from pneuopt.units import read_value
 if TYPE_CHECKING:
     import pandas as pd
 
+    from pneuopt.identifiability import Verdict
+
 Sections = Mapping[str, Mapping[str, Any]]
 
 FRICTION: Mapping[str, Callable[[], FrictionModel]] = {
@@ -50,7 +52,7 @@ SPOOLS = {spool.name.lower(): spool for spool in Spool}
 PLANTS = ("first_order", "second_order", "integrator")
 CHAMBERS = ("pressure_a", "pressure_b")
 NOMINAL, CONDUCTANCE, RATIO = "nominal_flow", "valve.conductance", "valve.critical_ratio"
-RESULTS = ("estimates", "status", "provenance")
+RESULTS = ("estimates", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
 # What a section says about the drive's structure; every other key of it is a parameter.
@@ -102,6 +104,11 @@ class Fitted(Protocol):
     @property
     def status(self) -> Status:
         """How it ended."""
+        ...
+
+    @property
+    def verdict(self) -> "Verdict | None":
+        """What the logs do not tell, and why."""
         ...
 
     @property
@@ -166,7 +173,9 @@ def read_status(path: str | Path) -> Status | None:
 
 
 def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
-    """Write a drive's file with the values found: the user's text and comments, [estimates], [status], [provenance].
+    """Write a drive's file with the values found: the user's text and comments, [estimates], [status], [verdict], ...
+
+    A parameter that the logs do not tell keeps its given value and text (see `IdentificationResult`).
 
     Parameters
     ----------
@@ -191,6 +200,8 @@ def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
     rows = result.estimates.to_dict(orient="index")
     document["estimates"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
+    if result.verdict is not None:
+        document["verdict"] = toml_table(result.verdict.worded())
     document["provenance"] = toml_table(plain(result.provenance))
     write_text(path, tomlkit.dumps(document))
 

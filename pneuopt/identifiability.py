@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,13 @@ from pneuopt.checks import check_content, check_free, check_logs, check_smooth
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.excitation import missing, motion, remedy
 from pneuopt.experiments import Experiment
+from pneuopt.finders import Start
 from pneuopt.nlp.least_squares import STIFFEST, LeastSquares
 from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.posing import Problem, as_logged
 from pneuopt.profiles import Profile
-from pneuopt.system import Start, System
+from pneuopt.system import System
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,11 +28,14 @@ Mask = NDArray[np.bool_]
 VAGUE = 0.3  # relative standard deviation beyond which a number says nothing (PHYSICS section 6)
 ALIKE = 30.0  # times that a standard deviation shrinks if the others were known, from which parameters act alike
 LOOSE = 0.01  # relative standard deviation below which a combination does no harm, whatever the model's own error
+VAGUEST = 10 / 3  # beyond which a factor of ten about the value says more
 WIDE = 4 * VAGUE  # of an interval, over the value
 HOPELESS = 1.0  # the same, beyond which a fit need not be tried
+HIDDEN = 1e5  # times of that kind that are as good as infinite
 MEMBER = 0.3  # of a weak combination's largest part
 UNFELT = 1e-9  # root of information, relative to the largest, that is rounding
 AT_ONCE = 2000  # segments whose sensitivities are reduced together
+_VAGUER = "they say less of it than a factor of ten about its value would"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +51,14 @@ class Verdict:
         Parameters that only count together.
     reasons : mapping of str to str
         By parameter: why the logs do not tell it, or only roughly, and what run would.
+    kept : tuple of str
+        Parameters that a fit left at their given values.
     """
 
     table: "pd.DataFrame"
     together: tuple[tuple[str, ...], ...]
     reasons: Mapping[str, str]
+    kept: tuple[str, ...] = ()
 
     @property
     def untold(self) -> tuple[str, ...]:
@@ -68,7 +75,20 @@ class Verdict:
             f"the logs {'do not tell' if untold else 'tell only roughly'} {listed(names)}: {reason}"
             for (untold, reason), names in by_reason.items()
         ]
-        return (*single, *(_alike(group, self.table["inflation"]) for group in self.together))
+        groups = [_alike(group, self.table["inflation"]) for group in self.together]
+        return (*single, *groups, *([self._stays()] if self.kept else []))
+
+    def _stays(self) -> str:
+        """What became of the parameters that a fit has left alone."""
+        values = listed([f"{n} ({self.table['value'][n]:.4g})" for n in self.kept])
+        verb = "keep their given values" if len(self.kept) > 1 else "keeps its given value"
+        return f"{values} {verb}, on which the other intervals do not rest"
+
+    def worded(self) -> dict[str, Any]:
+        """All but the table, for a file."""
+        reasons = {str(n): reason for n, reason in self.reasons.items()}
+        words = {"sentences": list(self.sentences), "untold": list(self.untold), "kept": list(self.kept)}
+        return {**words, "together": [list(group) for group in self.together], "reasons": reasons}
 
     def with_profiles(self, profiles: Mapping[str, Profile]) -> "Verdict":
         """The verdict with what profiles have found: a parameter with two open ends is not told."""
@@ -79,7 +99,19 @@ class Verdict:
             reasons.pop(name, None)
             if not found.high - found.low < WIDE * abs(found.estimate):
                 reasons[name] = f"{found.told}; {remedy([name])}"
-        return Verdict(self.table.assign(told=told), self.together, reasons)
+        return replace(self, table=self.table.assign(told=told), reasons=reasons)
+
+    def with_untold(self, names: Sequence[str], seen: "Verdict", kept: Sequence[str]) -> "Verdict":
+        """The verdict with parameters that rest on a prior, as the sensitivities alone have `seen` them."""
+        table, own = self.table.copy(), list(names)
+        table.loc[own] = seen.table.loc[own]
+        table.loc[own, "told"] = False
+        together = tuple(group for group in seen.together if {*group} & {*names})
+        grouped = {n for group in together for n in group}
+        reasons = {n: reason for n, reason in self.reasons.items() if n not in names}
+        vague = {n: f"{_VAGUER}; {remedy([n])}" for n in names if n not in grouped}
+        reasons |= {**vague, **{n: seen.reasons[n] for n in names if n in seen.reasons}}
+        return Verdict(table, (*self.together, *together), reasons, tuple(str(n) for n in table.index if n in kept))
 
     def __str__(self) -> str:
         return "\n".join(self.sentences) or "the logs tell every free parameter"
@@ -178,7 +210,7 @@ def _worded(
         unit, size = p.value if p.log else 1.0, 1.0 if p.log else _size(name, p, problem)
         relative = spread[i] / size if size > 0 else math.nan
         lack = None if trusted else missing(name, names, seen)
-        is_blind = lack is not None or math.isinf(spread[i]) or (judged is None and relative > HOPELESS)
+        is_blind = lack is not None or math.isinf(spread[i]) or relative > (HOPELESS if judged is None else VAGUEST)
         if is_blind or relative > VAGUE:
             reasons[name] = _reason(name, alone[i], relative, lack)
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
@@ -208,13 +240,14 @@ def _reason(name: str, alone: float, relative: float, lack: tuple[str, str] | No
         return f"{lack[0]}; {lack[1]}"
     if math.isinf(alone):
         return "nothing measured depends on it; fix it, or log a run that does"
-    return f"within {relative:.0%} (1 standard deviation); {remedy([name])}"
+    told = f"within {relative:.0%} (1 standard deviation)" if relative < VAGUEST else _VAGUER
+    return f"{told}; {remedy([name])}"
 
 
 def _alike(group: Sequence[str], inflation: "pd.Series[float]") -> str:
     times = float(inflation[list(group)].max())
-    lead = f"{listed(group)} only count together (known {times:.0f} times better if the others were)"
-    return f"{lead}: {remedy(group)}"
+    told = f"known {times:.0f} times better if the others were" if times < HIDDEN else "nothing tells them apart"
+    return f"{listed(group)} only count together ({told}): {remedy(group)}"
 
 
 def listed(names: Sequence[str]) -> str:

@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.checks import check_content, check_free, check_logs, check_smooth, measured_outputs
+from pneuopt.checks import check_content, check_free, check_logs, check_smooth, doubts, measured_outputs
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import ConvergenceError
 from pneuopt.experiments import Experiment
 from pneuopt.identifiability import Verdict
-from pneuopt.nlp.least_squares import NOISE_LEVEL, Fit, LeastSquares, solve_least_squares
+from pneuopt.nlp.judge import NOISE_LEVEL
+from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.posing import Model, Problem, as_logged, conditioned, free_run
 from pneuopt.provenance import provenance
-from pneuopt.reweighting import Loss, Refit, fitted
+from pneuopt.reweighting import Loss, Refit, fitted, white_squares
 from pneuopt.scrutiny import scrutinised
 from pneuopt.starting import attempts
 from pneuopt.statistics import agreement, confidence_interval, correlation_time, cross_correlation, ljung_box
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
+BORROWED = 0.1  # of a variance: what rests on a prior by more than that, the logs do not tell
+NOTHING = "the logs tell none of the free parameters by itself; fix some, or log runs that tell them apart"
 AT_NOISE = 1.05  # squared residuals a sample, in noise variances, up to which no other start is tried (NUMERICS 3.6)
 
 
@@ -42,11 +45,14 @@ class IdentificationResult:
     Attributes
     ----------
     parameters : ParameterSet
-        The system's, with the given values and the estimates; a `per_log` parameter keeps its given value here.
+        The system's, with the given values and the estimates; a `per_log` parameter keeps its given value here, and so
+        does one that the logs do not tell, unless they refuse that value or tell it only together with another: then
+        it is where the other estimates stand.
     estimates : DataFrame
         A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
-        at_bound, unit, source, note. No interval at a bound, where the data do not determine the parameter, or without
-        convergence. Where a linear interval would lie it is the profile likelihood's, infinite at an open end.
+        at_bound, unit, source, note. The value is NaN where the note is "not told". No interval there, at a bound, or
+        without convergence. Where a linear interval would lie it is the profile likelihood's, infinite at an open end.
+        What is not told may lie a factor of ten from where it stays: the other intervals allow for that.
     covariance : DataFrame
         Of the estimates, scaled by the residuals' own level and correlation; NaN for what has no interval.
     fit : DataFrame
@@ -118,9 +124,12 @@ def identify(
     experiments = check_logs(model, experiments, parameters)
     check_free(experiments, parameters)
     check_content(experiments)
+    doubted = doubts(model, experiments, parameters)
     problem = Problem(model, tuple(experiments), model.parameters | parameters, method)
     found, label = _best(problem, loss, estimate_noise=estimate_noise)
-    result = scrutinised(found.problem, _result(found, label, loss))
+    result = scrutinised(found.problem, *_result(found, label, loss))
+    if doubted:
+        result = replace(result, status=replace(result.status, message="; ".join((result.status.message, *doubted))))
     if throw and not result.status.converged:
         raise ConvergenceError(f"identification {result.status}", result)
     return result
@@ -189,10 +198,11 @@ def _predicted(system: Model, experiment: Experiment, fixed: ParameterSet) -> Tr
     return free_run(system, inputs, known, state)
 
 
-def _result(found: Refit, label: str, loss: Loss | None) -> IdentificationResult:
-    """Read the solver's answer back into parameters and tables."""
+def _result(found: Refit, label: str, loss: Loss | None) -> tuple[IdentificationResult, tuple[str, ...]]:
+    """Read the solver's answer back into parameters and tables; and what the logs do not tell by themselves."""
     problem, fit, solution = found.problem, found.fit, found.fit.solution
     free = solution.parameters.free_names
+    estimates = problem.unknowns().with_values({n: solution.parameters.value(n) for n in free}).select(free)
     shared = [n for n in free if n in problem.parameters]
     values = {n: solution.parameters.value(n) for n in shared}
     runs = {e.name: t for e, t in zip(problem.experiments, solution.trajectories, strict=True)}
@@ -201,13 +211,19 @@ def _result(found: Refit, label: str, loss: Loss | None) -> IdentificationResult
     variance = squares / max(1, fit.count - len(free) - starts)
     correlated = max(_correlated(problem.system, problem.experiments, runs), _correlated_jumps(fit.jumps))
     covariance = None if fit.covariance is None else fit.covariance * variance * correlated * found.spread
-    return IdentificationResult(
+    leaning = np.zeros(len(free), dtype=bool)
+    if covariance is not None and fit.borrowed is not None:
+        covariance = covariance + fit.borrowed
+        leaning = np.diag(fit.borrowed) > BORROWED * np.diag(covariance)
+    untold = tuple(n for n, leans in zip(free, leaning, strict=True) if leans or n in problem.held)
+    status = Status(Code.NOT_CONVERGED, NOTHING) if free and set(untold) == set(free) else solution.status
+    result = IdentificationResult(
         problem.parameters.with_values(values),
-        _estimates(solution.parameters.select(free), covariance, fit.at_bound, solution.status),
+        _estimates(estimates, covariance, fit.at_bound, status),
         _square(free, covariance),
         _fit_table(problem.system, problem.experiments, runs),
         runs,
-        solution.status,
+        status,
         {**solution.stats, "chi_square_ratio": variance, "correlation_time": correlated},
         {
             **provenance(problem.method, *([loss] if loss else [])),
@@ -215,6 +231,7 @@ def _result(found: Refit, label: str, loss: Loss | None) -> IdentificationResult
             **{f"sha256[{e.name}]": e.sha256 for e in problem.experiments},
         },
     )
+    return result, untold
 
 
 def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple[Refit, str]:
@@ -223,22 +240,24 @@ def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple
     A wrong basin can converge, too; its residuals then exceed the noise.
     """
     fits: list[tuple[Refit, str]] = []
-    interrupted = False
+    interrupted, tightest = False, problem.method.stages[-1].gap
     try:
         for candidate in attempts(problem, lambda: _misses(fits[0][0].fit)):
             found = fitted(problem, candidate, loss, estimate_noise=estimate_noise)
-            fit = found.fit
-            if fit.solution.status.code is Code.INTERRUPTED or _is_at_noise(fit):
+            if _is_at_noise(found) and not found.problem.held:
                 return found, candidate.label
             fits.append((found, candidate.label))
-            fits.sort(key=lambda each: _rank(each[0].fit))
-            if len(fits) > 1 and _are_alike(fits[0][0].fit, fits[1][0].fit):
+            fits.sort(key=lambda each: _rank(each[0].fit, tightest))
+            interrupted = found.fit.solution.status.code is Code.INTERRUPTED
+            if interrupted or (len(fits) > 1 and _are_alike(fits[0][0].fit, fits[1][0].fit)):
                 break
     except KeyboardInterrupt:
+        if not fits:
+            raise
         interrupted = True
     found, label = fits[0]
     status = found.fit.solution.status
-    if interrupted:
+    if interrupted and (len(fits) > 1 or status.code is not Code.INTERRUPTED):
         status = Status(Code.INTERRUPTED, f"the best of {len(fits)} starts so far; run again for an answer")
     elif not status.converged and len(fits) > 1:
         status = Status(status.code, f"none of {len(fits)} starts will do; in the best, {status.message}")
@@ -248,9 +267,15 @@ def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple
     return replace(found, fit=replace(found.fit, solution=solution)), label
 
 
-def _is_at_noise(fit: Fit) -> bool:
-    """Whether nothing better is to be found; a wrong basin of soft bristles has left 1.1 noise variances a sample."""
-    return fit.solution.status.converged and fit.jumps is None and fit.chi_square <= AT_NOISE * fit.count
+def _is_at_noise(found: Refit) -> bool:
+    """Whether nothing better is to be found; a wrong basin of soft bristles has left 1.1 noise variances a sample.
+
+    Where the log states too little noise, the white part of the residuals is what is left of it.
+    """
+    fit = found.fit
+    if not fit.solution.status.converged or fit.jumps is not None:
+        return False
+    return fit.chi_square <= AT_NOISE * fit.count or fit.chi_square <= AT_NOISE * white_squares(found)
 
 
 def _misses(fit: Fit) -> bool:
@@ -258,8 +283,13 @@ def _misses(fit: Fit) -> bool:
     return fit.solution.status.converged and fit.jumps is not None
 
 
-def _rank(fit: Fit) -> tuple[int, float]:
-    """The order of fits: by cost, but noise of the states explains too much to be compared with a fit without."""
+def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
+    """The order of fits: by cost, but noise of the states explains too much to be compared with a fit without.
+
+    And so do the loose gaps, wider than the last stage's, in which an interruption may leave a search.
+    """
+    if fit.solution.status.code is Code.INTERRUPTED and fit.solution.stats["gap_deviation"] > tightest:
+        return 3, _cost(fit)
     if fit.jumps is not None:
         return 1, _cost(fit)
     return 0 if 2 * _cost(fit) <= NOISE_LEVEL * fit.count else 2, _cost(fit)
@@ -272,7 +302,8 @@ def _cost(fit: Fit) -> float:
 def _are_alike(best: Fit, second: Fit) -> bool:
     """Whether both converged, at the same cost."""
     converged = best.solution.status.converged and second.solution.status.converged
-    return converged and _rank(best)[0] == _rank(second)[0] and _cost(second) <= 1.001 * _cost(best)
+    same = (best.jumps is None) == (second.jumps is None)
+    return converged and same and _cost(second) <= 1.001 * _cost(best)
 
 
 def _fit_table(system: Model, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":

@@ -26,6 +26,9 @@ AREA_RATIOS = (
     1.0,
 )  # of the rod's side to the other: any real cylinder has one of these
 SLOPES = (0.8, 1.25)  # of a speed over its position's slope
+LATE = 0.1  # [s] within which a drive's speed follows its valve
+OPPOSED = (-0.6, 0.3)  # correlations of command and speed: the least below, and the largest below that, is a wrong sign
+TO_AND_FRO = 1.9  # times its range that a piston travels only if something commands it to come back
 CLIPPED = 0.02  # share of the samples at exactly the largest value
 
 
@@ -59,7 +62,8 @@ def examine(experiment: Experiment) -> tuple[Finding, ...]:
     -------
     tuple of Finding
         Faults first: nothing moves; a channel is constant; position and speed disagree in sign or unit; the force, or
-        the pressures, brake the motion on balance, which no drive does; a pressure is a vacuum, or above the supply.
+        the pressures, brake the motion on balance, which no drive does; the piston runs against the valve's command, or
+        to and fro without one; a pressure is a vacuum, or above the supply.
         Then notes: jitter, a clipped sensor, a coarse resolution.
 
     Examples
@@ -72,7 +76,10 @@ def examine(experiment: Experiment) -> tuple[Finding, ...]:
     the force brakes the motion on balance (-100 % of its power), which no drive does: change the sign of 'force'
     """
     log = experiment.trajectory
-    checks = (_silent(experiment), _contradicting(log), _braking(log), _pressures(experiment), _sampling(log))
+    checks = (
+        *(_silent(experiment), _contradicting(log), _braking(log), _commanded(log)),
+        *(_pressures(experiment), _sampling(log)),
+    )
     found = [finding for check in checks for finding in check]
     return tuple(sorted(found, key=lambda f: not f.fault))
 
@@ -123,7 +130,7 @@ def _contradicting(log: Trajectory) -> Iterator[Finding]:
 
 def _braking(log: Trajectory) -> Iterator[Finding]:
     """Whatever drives has to do work against friction, once the load is back where it was."""
-    motion = log["speed"] if "speed" in log else _slope(log) if "position" in log else None
+    motion = _motion(log)
     if motion is None:
         return
     drives = {"force": ("the force brakes", "'force'")}
@@ -140,6 +147,39 @@ def _braking(log: Trajectory) -> Iterator[Finding]:
         if share < AGAINST:
             why = f"{told} the motion on balance ({100 * share:.0f} % of its power), which no drive does"
             yield Finding(name, f"{why}: change the sign of {remedy}", True)
+
+
+def _commanded(log: Trajectory) -> Iterator[Finding]:
+    """A piston that does not do what its valve is told."""
+    motion = _motion(log)
+    if motion is None or "valve_voltage" not in log:
+        return
+    known = np.isfinite(motion) & np.isfinite(log["valve_voltage"])
+    t, command, motion = log.t[known], log["valve_voltage"][known], motion[known]
+    if len(t) < 2 * BLOCKS:
+        return
+    if not np.any(np.diff(command)):
+        travel = np.cumsum(motion[1:] * np.diff(t))[:: max(1, len(t) // (5 * BLOCKS))]  # coarse: noise is no travel
+        if float(np.abs(np.diff(travel)).sum()) > TO_AND_FRO * float(np.ptp(travel)) > 0:
+            told = "'valve_voltage' is constant while the piston goes to and fro: log the command that moves it"
+            yield Finding("valve_voltage", told, True)
+        return
+    lowest, highest = _correlations(t, command, motion)
+    if lowest < OPPOSED[0] and highest < OPPOSED[1]:
+        told = f"the piston runs against the valve's command (correlation {lowest:.2f}): change the sign of "
+        yield Finding("valve_voltage", told + "'valve_voltage', or of the motion", True)
+
+
+def _correlations(t: Array, command: Array, motion: Array) -> tuple[float, float]:
+    """The least and the largest correlation of a speed with the command up to `LATE` before; NaN where it is still."""
+    grid = np.linspace(t[0], t[-1], t.size)
+    u, v = np.interp(grid, t, command), np.interp(grid, t, motion)
+    most = min(round(LATE / float(grid[1] - grid[0])), t.size // 4)
+    lags = range(0, most + 1, max(1, most // BLOCKS))
+    if np.ptp(v) == 0 or any(np.ptp(u[: u.size - k]) == 0 for k in lags):
+        return math.nan, math.nan
+    found = [float(np.corrcoef(u[: u.size - k], v[k:])[0, 1]) for k in lags]
+    return min(found), max(found)
 
 
 def _work_share(t: Array, push: Array, motion: Array, *, centred: bool) -> float:
@@ -192,6 +232,11 @@ def _sampling(log: Trajectory) -> Iterator[Finding]:
         if name in ("position", "speed") and 2 < levels < min(50, y.size // 4):
             told = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
             yield Finding(name, told, False)
+
+
+def _motion(log: Trajectory) -> Array | None:
+    """The speed, as logged or from the position."""
+    return log["speed"] if "speed" in log else _slope(log) if "position" in log else None
 
 
 def _slope(log: Trajectory) -> Array:

@@ -12,11 +12,12 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.errors import InputError
 from pneuopt.experiments import Experiment
+from pneuopt.finders import Log, Start
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.simulate import simulate
-from pneuopt.system import DiscreteSystem, Log, Start, System, discretise, names
+from pneuopt.system import DiscreteSystem, System, discretise, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -35,6 +36,8 @@ class Problem:
     method : LeastSquares
     weights : mapping of str to ndarray, each of shape (n, n_measured_outputs)
         By log: of each sample's squared residual; absent ones are 1.
+    held : mapping of str to float
+        Free parameters that the logs do not tell, and where they stay.
     """
 
     system: Model
@@ -42,6 +45,7 @@ class Problem:
     parameters: ParameterSet
     method: LeastSquares
     weights: Mapping[str, Array] = field(default_factory=dict)
+    held: Mapping[str, float] = field(default_factory=dict)
 
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
@@ -67,6 +71,8 @@ class Problem:
         phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
         residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
         parameters = self.unknowns().with_values(candidate.parameters)
+        held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.held.items()}
+        parameters = parameters | ParameterSet(held)
         return Transcription(self._sampled(), parameters, phases, residuals)
 
     def _sampled(self) -> DiscreteSystem:

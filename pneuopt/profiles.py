@@ -12,10 +12,11 @@ from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import check_known, require
 from pneuopt.experiments import Experiment
+from pneuopt.finders import Start
 from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.parameters import ParameterSet
 from pneuopt.posing import Problem, as_logged
-from pneuopt.system import Start, System, names
+from pneuopt.system import System, names
 from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
@@ -186,7 +187,8 @@ class _Refits:
 
     def __init__(self, problem: Problem, result: Fitted, name: str) -> None:
         self.problem, self.name = problem, name
-        values = {str(n): float(v) for n, v in result.estimates["value"].items()}
+        given, found = problem.unknowns(), {str(n): float(v) for n, v in result.estimates["value"].items()}
+        values = {n: v if math.isfinite(v) else given.value(n) for n, v in found.items()}
         self.start = Start(_states(names(problem.system.states), result.trajectories), values, "fit")
         self.parameter = replace(problem.unknowns()[name], value=values[name])
         last, steps = Stage(result.stats["gap_deviation"], ITERATIONS, refine=4), int(result.stats["substeps"])

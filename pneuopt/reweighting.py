@@ -15,18 +15,19 @@ from numpy.typing import NDArray
 from pneuopt.checks import measured_outputs
 from pneuopt.errors import require
 from pneuopt.experiments import Experiment
-from pneuopt.nlp.least_squares import NOISE_LEVEL, Fit, LeastSquares, solve_least_squares
+from pneuopt.finders import Start
+from pneuopt.nlp.judge import NOISE_LEVEL
+from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status
 from pneuopt.posing import Problem
+from pneuopt.silence import WARM_STAGES, solved
 from pneuopt.statistics import noise_level
-from pneuopt.system import Start
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 REFITS = 12
 STILL = 0.05  # standard deviations that an estimate may still move from refit to refit
 SETTLED = 0.02  # relative change of a noise level, likewise
-WARM_STAGES = 3  # of the method's last, for a refit starts near its answer
 LEAST_WEIGHT = 1e-8
 OUTLYING = 4.0  # of a channel's own scale: one in 16 000 samples of normal noise
 
@@ -135,7 +136,7 @@ def fitted(problem: Problem, candidate: Start, loss: Loss | None = None, *, esti
     Refit
         Its spread is Huber's sandwich ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for all.
     """
-    found = Refit(problem, solve_least_squares(problem.transcription(candidate), problem.method))
+    found = Refit(*solved(problem, candidate))
     if loss is None and not estimate_noise:
         return found
     warm = replace(problem.method, stages=problem.method.stages[-WARM_STAGES:])
@@ -148,6 +149,22 @@ def fitted(problem: Problem, candidate: Start, loss: Loss | None = None, *, esti
         if _is_settled(before, found):
             break
     return _summed_up(replace(found, problem=replace(found.problem, method=problem.method)), fits, loss)
+
+
+def white_squares(found: Refit) -> float:
+    """What the squared residuals of a fit would sum up to, in noise variances, were they white at their own level.
+
+    A wrong basin leaves more, for what varies slowly does not count (`noise_level`). With weights of a loss, nothing.
+    """
+    problem, runs, total = found.problem, _runs(found), 0.0
+    if problem.weights:
+        return total
+    for e in problem.experiments:
+        levels = _with_noise(problem, e, runs[e.name]).noise
+        for channel in measured_outputs(problem.system, e):
+            samples = int(np.isfinite(e.trajectory[channel]).sum())
+            total += samples * (levels[channel] / e.noise[channel]) ** 2
+    return total
 
 
 def _summed_up(found: Refit, fits: Sequence[Fit], loss: Loss | None) -> Refit:

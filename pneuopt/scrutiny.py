@@ -1,7 +1,7 @@
 """A second look at a fit: which intervals lie, what the logs do not tell, and where a fit that failed falls short."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.checks import measured_outputs
+from pneuopt.finders import Start
 from pneuopt.identifiability import Verdict, expected, from_covariance, listed
 from pneuopt.nlp.equations import gaps_of
-from pneuopt.nlp.least_squares import NOISE_LEVEL
+from pneuopt.nlp.judge import NOISE_LEVEL
 from pneuopt.nlp.segments import segment, start_nodes
 from pneuopt.nlp.status import Code, Status
 from pneuopt.posing import Problem
 from pneuopt.profiles import Profile, traced
-from pneuopt.system import Start
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,7 @@ NO_GAP = 1e-4  # of a nominal size
 AT_BOUND, NOT_TOLD = "at its bound", "not told"
 
 
-def scrutinised(problem: Problem, result: "IdentificationResult") -> "IdentificationResult":
+def scrutinised(problem: Problem, result: "IdentificationResult", untold: Sequence[str] = ()) -> "IdentificationResult":
     """Mark what the fit says without knowing it.
 
     Parameters
@@ -40,6 +40,8 @@ def scrutinised(problem: Problem, result: "IdentificationResult") -> "Identifica
     problem : Problem
     result : IdentificationResult
         As the search left it.
+    untold : sequence of str
+        Free parameters that rest on a prior: those held, and those that hang on them.
 
     Returns
     -------
@@ -56,7 +58,7 @@ def scrutinised(problem: Problem, result: "IdentificationResult") -> "Identifica
             if result.status.code is Code.INTERRUPTED
             else _located(problem, start, result.status, verdict)
         )
-        blank = result.estimates.assign(stderr=math.nan, ci_low=math.nan, ci_high=math.nan)
+        blank = _blank(result.estimates, result.estimates.index)
         return replace(
             result,
             estimates=_noted(blank, verdict),
@@ -64,16 +66,39 @@ def scrutinised(problem: Problem, result: "IdentificationResult") -> "Identifica
             status=status,
             verdict=verdict,
         )
+    result = replace(result, estimates=_blank(result.estimates, untold))
     profiles = _profiles(problem, result)
     trusted = result.stats["chi_square_ratio"] <= NOISE_LEVEL
-    verdict = from_covariance(problem, start, result.covariance, trusted=trusted).with_profiles(profiles)
+    verdict = from_covariance(problem, start, _without(result.covariance, untold), trusted=trusted)
+    verdict = verdict.with_profiles(profiles)
+    if untold:
+        verdict = verdict.with_untold(untold, _at(problem, start, result), _kept(problem))
     estimates = _noted(_corrected(result.estimates, profiles, verdict), verdict)
-    covariance, unknown = result.covariance.copy(), estimates.index[estimates["stderr"].isna()]
-    covariance.loc[unknown] = math.nan
-    covariance[unknown] = math.nan
+    covariance = _without(result.covariance, estimates.index[estimates["stderr"].isna()])
     told = f"{result.status.message}; the logs do not tell {listed(verdict.untold)}" if verdict.untold else ""
     status = Status(result.status.code, told) if told else result.status
     return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
+
+
+def _without(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
+    """NaN for these."""
+    out, gone = covariance.copy(), list(names)
+    out.loc[gone] = math.nan
+    out[gone] = math.nan
+    return out
+
+
+def _blank(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
+    """No interval for these."""
+    out = estimates.copy()
+    out.loc[list(names), ["stderr", "ci_low", "ci_high"]] = math.nan
+    return out
+
+
+def _kept(problem: Problem) -> tuple[str, ...]:
+    """Of what is held, that which stays at its given value."""
+    given = problem.unknowns()
+    return tuple(n for n, v in problem.held.items() if v == given.value(n))
 
 
 def _at(problem: Problem, start: Start, result: "IdentificationResult") -> Verdict:
@@ -110,9 +135,7 @@ def _dragged(profile: Profile, estimates: "pd.DataFrame") -> Iterator[str]:
 
 def _corrected(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdict: Verdict) -> "pd.DataFrame":
     """The profiles' intervals in place of the linear ones; no standard deviation where there is no closed interval."""
-    out = estimates.copy()
-    for name in verdict.untold:
-        out.loc[name, ["stderr", "ci_low", "ci_high"]] = math.nan
+    out = _blank(estimates, verdict.untold)
     for name, found in profiles.items():
         out.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
         if found.is_open:
@@ -121,10 +144,11 @@ def _corrected(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdi
 
 
 def _noted(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
-    """A note beside each number that is none."""
+    """A note beside each number that is none, and no number where nothing is told."""
     untold, bound = set(verdict.untold), estimates["at_bound"]
     notes = [AT_BOUND if bound[n] else NOT_TOLD if n in untold else "" for n in estimates.index]
-    return estimates.assign(note=notes)
+    out = estimates.assign(note=notes)
+    return out.assign(value=out["value"].where(out["note"] != NOT_TOLD))
 
 
 def _located(problem: Problem, start: Start, status: Status, verdict: Verdict) -> Status:

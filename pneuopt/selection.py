@@ -11,6 +11,7 @@ from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify, validate
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.parameters import ParameterSet
+from pneuopt.scrutiny import AT_BOUND, NOT_TOLD
 from pneuopt.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.system import System, names
 
@@ -29,7 +30,8 @@ class ModelSelection:
     ----------
     table : DataFrame
         A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's),
-        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse, message.
+        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse, untold and
+        at_bound (names of parameters that the logs do not tell, or that ended at a bound), message.
     recommended : str
         A candidate's name.
     reason : str
@@ -86,7 +88,8 @@ def select_model(
     -----
     The deviance is the squared residuals over their variance in the best candidate, and over their correlation time: as
     if only independent samples counted. Between nested candidates it falls as chi-square with the extra parameters
-    (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978).
+    (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). What the logs do not tell counts among the k, so
+    that a candidate with such parameters gives way to a simpler one that fits as well.
     """
     require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
     given = {name: _given(system, parameters, free) for name, system in candidates.items()}
@@ -113,6 +116,8 @@ class _Judged:
     contains: str
     p_value: float
     held_out_nrmse: float
+    untold: str
+    at_bound: str
     message: str
 
 
@@ -163,8 +168,14 @@ def _judged(
         if inside:
             p = likelihood_ratio_p(_chi_square(fits[inside]) / scale - deviance, k - len(fits[inside].estimates))
         held_out = predicted.get(name, math.nan)
-        rows[name] = _Judged(fit.status.converged, k, deviance, bic, inside, p, held_out, fit.status.message)
+        told = _noted(fit, NOT_TOLD), _noted(fit, AT_BOUND), fit.status.message
+        rows[name] = _Judged(fit.status.converged, k, deviance, bic, inside, p, held_out, *told)
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
+
+
+def _noted(fit: IdentificationResult, note: str) -> str:
+    """The parameters with this note."""
+    return ", ".join(str(n) for n, said in fit.estimates["note"].items() if said == note)
 
 
 def _contained(
@@ -219,5 +230,9 @@ def _reason(rows: Mapping[str, _Judged], chosen: str, passed_over: str) -> str:
         told += f"; {row.contains}, which it contains, is refuted (p = {row.p_value:.2g})"
     if math.isfinite(row.held_out_nrmse):
         told += f"; it predicts held-out runs with an NRMSE of {row.held_out_nrmse:.2%}"
+    if row.untold:
+        told += f"; the logs do not tell its {row.untold}"
+    if row.at_bound:
+        told += f"; at a bound: {row.at_bound}"
     failed = [n for n in rows if n not in good]
     return told + (f"; not converged: {', '.join(failed)}" if failed else "")

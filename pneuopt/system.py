@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from pneuopt.codegen import Pieces
 from pneuopt.errors import ConvergenceError, ModelError, check_known, require
+from pneuopt.finders import Doubter, Log, RestFinder, Start, StartFinder
 from pneuopt.guards import Checker, Guard
 from pneuopt.parameters import ParameterSet, Quantity
 from pneuopt.runge_kutta import rk4
@@ -21,57 +21,6 @@ Symbols = Mapping[str, ca.SX]
 Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
 Update = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
 DIRECTION = "friction.direction"  # of Karnopp's friction: what a simulation switches
-
-
-class Log(NamedTuple):
-    """One log as a start finder sees it: its channels, and the parameters as they are in it (conditions included)."""
-
-    measured: Trajectory
-    parameters: ParameterSet
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """A candidate to start an identification from.
-
-    Attributes
-    ----------
-    states : mapping of str to Trajectory
-        States along each log, by the log's name.
-    parameters : mapping of str to float
-        By name; a `per_log` one as "name[log]".
-    label : str
-    tried : tuple of str
-        Those of the parameters that the log does not tell, and the candidates try: one value each.
-    """
-
-    states: Mapping[str, Trajectory]
-    parameters: Mapping[str, float]
-    label: str = ""
-    tried: tuple[str, ...] = ()
-
-
-class StartFinder(Protocol):
-    """What a model knows about starting from logs (equation error); see `System.starts`."""
-
-    def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
-        """Return candidates, the most plausible first."""
-        ...
-
-
-class Rest(NamedTuple):
-    """A plant at rest: its states, and the inputs that keep it there; absent ones are zero."""
-
-    states: Mapping[str, float]
-    inputs: Mapping[str, float]
-
-
-class RestFinder(Protocol):
-    """What a model knows about resting where an equilibrium from zeros would not be found (a drive under pressure)."""
-
-    def __call__(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
-        """Return a rest at which the named outputs have these values, or raise `InputError`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -107,6 +56,8 @@ class System:
         Which of its numbers are impossible.
     guards : tuple of Guard
         What a simulation of it watches.
+    doubter : Doubter, optional
+        What it can tell against logs.
     """
 
     states: tuple[Quantity, ...]
@@ -118,6 +69,7 @@ class System:
     rest_finder: RestFinder | None = None
     checker: Checker | None = None
     guards: tuple[Guard, ...] = ()
+    doubter: Doubter | None = None
 
     def __repr__(self) -> str:
         return describe(self)
@@ -156,6 +108,10 @@ class System:
         if self.start_finder is not None:
             return self.start_finder(logs)
         return [Start({name: self._as_logged(log.measured) for name, log in logs.items()}, {}, "as given")]
+
+    def doubts(self, logs: Mapping[str, Log]) -> Sequence[str]:
+        """What speaks against the logs, a sentence each; of a model without a doubter, nothing."""
+        return self.doubter(logs) if self.doubter is not None else ()
 
     def _as_logged(self, measured: Trajectory) -> Trajectory:
         columns = {s.name: _filled(measured, s.name) for s in self.states}

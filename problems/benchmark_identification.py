@@ -23,28 +23,25 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from b32 import FREE, LOGGED, NOISE, START, VALVE, generate, reference
+from b32 import COARSE, FREE, LOGGED, NOISE, SAMPLE, VALVE, exact, generate, simulation_seconds
 from claims import Claim, arguments, finish, frame
-from random_plants import _loop
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import pneuopt as po
-from pneuopt.codegen import Rollout
+from pneuopt.finders import Log, Start
 from pneuopt.models.catalog import b32
 from pneuopt.nlp.full_space import FullSpace, solve_full_space
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.posing import Problem
-from pneuopt.system import Log, Start, discretise, names, vector
 from pneuopt.trajectories import Array
 
 if TYPE_CHECKING:
     import pandas as pd
 
 WANTED = (*FREE, *VALVE)
-SAMPLE, SETTLING, FINE, COARSE = 1e-3, 300, 50, 10
+FINE = 50  # RK4 steps a sample of a long record
 LENGTHS = (10, 100, 1000)  # [s] of log
-PERIOD = 10.0  # [s] after which a long log's reference begins again
 SHORT = 1000  # samples for the full-space IPOPT
 RIVAL_SECONDS, LONGEST = 200.0, 1000.0
 ONE_CORE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -114,20 +111,20 @@ def ours() -> dict[str, float]:
     log = generate(*b32()).select(LOGGED)
     fit, seconds, unit = po.identify(system, [log], blind), math.inf, math.inf
     for _ in range(5 if os.environ.get("PNEUOPT_CC") != "" else 1):
-        unit = min(unit, _unit(log))
+        unit = min(unit, simulation_seconds(log))
         began = time.process_time()
         fit = po.identify(system, [log], blind)
         seconds = min(seconds, time.process_time() - began)
     value, stderr = (fit.estimates.loc[list(WANTED), c].to_numpy(dtype=float) for c in ("value", "stderr"))
     sigmas = np.abs(value - [truth.value(n) for n in WANTED]) / stderr
-    exact = po.identify(system, [_record(10.0, noisy=False)], blind)
+    noiseless = po.identify(system, [_record(10.0, noisy=False)], blind)
     return {
         "unit": unit,
         "seconds": seconds,
         "iterations": fit.stats["iterations"],
         "error": _off(fit.parameters, truth),
         "sigmas": float(sigmas.max()),
-        "exact": _off(exact.parameters, truth),
+        "exact": _off(noiseless.parameters, truth),
     }
 
 
@@ -239,36 +236,11 @@ def _off(found: po.ParameterSet, truth: po.ParameterSet) -> float:
 
 
 def _record(seconds: float, *, noisy: bool = True) -> po.Experiment:
-    """B32's log of any length, in fine RK4 steps."""
-    truth, samples = b32()[1], round(seconds / SAMPLE)
-    loop, rollout = _loop("stribeck")
-    instants = np.arange(-SETTLING, samples) * SAMPLE
-    given = np.array([reference(float(t) % PERIOD if t > 0 else 0.0) for t in instants])[None, :, None]
-    start = np.array([[START.get(n, 0.0) for n in names(loop.states)]])
-    run = rollout.run(
-        start, given, vector(loop.parameters, truth), instants[None], np.full((1, len(instants)), SAMPLE), substeps=FINE
-    )
-    exact = dict(zip(names(loop.outputs), run.y[0, SETTLING:].T.copy(), strict=True))
-    rng, noise = np.random.default_rng(1), {n: sigma for n, sigma in NOISE.items() if n in LOGGED}
-    logged = {n: exact[n] + noisy * sigma * rng.standard_normal(samples) for n, sigma in noise.items()}
-    columns = {"valve_voltage": exact["valve_voltage"], **logged}
-    return po.Experiment(po.Trajectory(np.arange(samples) * SAMPLE, columns), noise, name="b32")
-
-
-def _unit(log: po.Experiment) -> float:
-    """CPU seconds of one scalar simulation of the record."""
-    system, truth = b32()[0].system(), b32()[1]
-    rollout = Rollout(discretise(system).pieces, threads=1, lanes=1 if os.environ.get("PNEUOPT_CC") != "" else 0)
-    data = log.trajectory
-    start = np.array([[data[n][0] if n in data else 0.0 for n in names(system.states)]])
-    t = data.t[None]
-    given = (start, data["valve_voltage"][None, :, None], vector(system.parameters, truth), t, np.full_like(t, SAMPLE))
-    best = math.inf
-    for _ in range(3):
-        began = time.process_time()
-        rollout.run(*given, substeps=COARSE)
-        best = min(best, time.process_time() - began)
-    return best
+    """B32's log of any length."""
+    true, noise = exact(b32()[1], seconds=seconds, substeps=FINE), {n: NOISE[n] for n in LOGGED if n in NOISE}
+    rng = np.random.default_rng(1)
+    logged = {n: true[n] + noisy * sigma * rng.standard_normal(len(true)) for n, sigma in noise.items()}
+    return po.Experiment(true.select(LOGGED).with_columns(logged), noise, name="b32")
 
 
 if __name__ == "__main__":

@@ -21,26 +21,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
-from b32 import FREE, LOGGED, NOISE, START, VALVE, reference
+from b32 import FREE, LOGGED, NOISE, SAMPLE, VALVE, exact, simulation_seconds
 from claims import Claim, arguments, finish, frame
 
 import pneuopt as po
-from pneuopt.codegen import Pieces, Rollout
 from pneuopt.errors import require
 from pneuopt.models.catalog import b32
-from pneuopt.parameters import Quantity
 from pneuopt.study import INTERRUPTED
-from pneuopt.system import Symbols, System, define, discretise, names, stacked, vector
 from pneuopt.trajectories import Array
 
 if TYPE_CHECKING:
     import pandas as pd
 
 COUNT, FIRST, KINDS = 15, 1000, ("stribeck", "lugre")
-SAMPLE, SAMPLES, SETTLING = 1e-3, 10_000, 300
-FINE, COARSE = 100, 10  # RK4 steps a sample: of the truth, and of the simulation that is the unit of cost
+SAMPLES = 10_000
 EXCESS = (1.1, 2.2)  # static friction over Coulomb's
 RANGES = {  # lower, upper; all but Coulomb friction and leak are uniform in the logarithm
     "friction.coulomb": (15.0, 80.0),
@@ -98,30 +93,24 @@ def drawn(kind: str, seed: int) -> dict[str, float]:
 def generate(
     kind: str, truth: po.ParameterSet, seed: int, encoder: float = 0.0, outliers: float = 0.0
 ) -> po.Experiment:
-    """The plant's log: b32's loop, in fine RK4 steps (`FINE`; a test holds them against b32's LSODA)."""
-    loop, rollout = _loop(kind)
-    instants = np.arange(-SETTLING, SAMPLES) * SAMPLE
-    given = np.array([reference(float(t)) for t in instants])[None, :, None]
-    start = np.array([[START.get(n, 0.0) for n in names(loop.states)]])
-    h = np.full((1, len(instants)), SAMPLE)
-    run = rollout.run(start, given, vector(loop.parameters, truth), instants[None], h, substeps=FINE)
-    exact = dict(zip(names(loop.outputs), run.y[0, SETTLING:].T, strict=True))
+    """The plant's log: b32's loop, in fine RK4 steps (a test holds them against b32's LSODA)."""
+    true = exact(truth, kind == "lugre", seconds=SAMPLES * SAMPLE)
     rng = np.random.default_rng((seed, 1))
     noise = {n: NOISE[n] for n in LOGGED if n in NOISE}
-    columns = {n: exact[n] + sigma * rng.standard_normal(SAMPLES) for n, sigma in noise.items()}
+    columns = {n: true[n] + sigma * rng.standard_normal(SAMPLES) for n, sigma in noise.items()}
     if encoder:
-        columns["position"] = encoder * np.round(exact["position"] / encoder)
+        columns["position"] = encoder * np.round(true["position"] / encoder)
         noise["position"] = encoder / math.sqrt(12)
     for n, sigma in noise.items():
         off = (rng.random(SAMPLES) < outliers) * rng.choice((-OUTLYING, OUTLYING), SAMPLES)
         columns[n] = columns[n] + off * sigma
-    log = po.Trajectory(np.arange(SAMPLES) * SAMPLE, {"valve_voltage": exact["valve_voltage"], **columns})
+    log = po.Trajectory(np.arange(SAMPLES) * SAMPLE, {"valve_voltage": true["valve_voltage"], **columns})
     return po.Experiment(log, noise, name=f"{kind} {seed}")
 
 
 def identified(kind: str, encoder: float, outliers: float, truth: po.ParameterSet) -> dict[str, Any]:
     """One plant's row."""
-    unit, free = _simulation_seconds(kind), _free(kind)
+    unit, free = _unit(kind), _free(kind)
     log = generate(kind, truth, round(truth.value("seed")), encoder, outliers)
     drive, given = b32(kind == "lugre")
     blind = given.with_values({n: drive.parameters.value(n) for n in free}).freed(*free)
@@ -180,45 +169,14 @@ def _free(kind: str) -> tuple[str, ...]:
 
 
 @functools.cache
-def _loop(kind: str) -> tuple[System, Rollout]:
-    """b32's drive with its command as a state, which the sampled loop sets at each instant."""
-    drive = b32(kind == "lugre")[0].system()
-    command, wanted = Quantity("valve_voltage", "V"), Quantity("position_reference", "m", nominal=0.1)
-
-    def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - a right-hand side's
-        inside = ca.vertcat(*(x[n] for n in names(drive.states)))
-        rates, y = drive.ode(t, inside, x["valve_voltage"], stacked(p))
-        found = dict(zip(names(drive.states), ca.vertsplit(rates), strict=True))
-        shown = dict(zip(names(drive.outputs), ca.vertsplit(y), strict=True))
-        return {**found, "valve_voltage": ca.SX(0)}, {**shown, "valve_voltage": x["valve_voltage"]}
-
-    states, outputs = (*drive.states, command), (*drive.outputs, command)
-    loop = define(states, (wanted,), outputs, drive.parameters, rhs)
-    t, x, u, p = (ca.SX.sym(n, loop.ode.size1_in(i)) for i, n in enumerate("txup"))
-    position, speed = (x[names(states).index(n)] for n in ("position", "speed"))
-    u_next = ca.fmax(-0.6, ca.fmin(0.6, 4 * (u - position) - 0.15 * speed))
-    update = ca.Function("update", [t, x, u, p], [ca.vertcat(x[:-1], u_next)])
-    return loop, Rollout(Pieces(discretise(loop).step, update))
-
-
-@functools.cache
-def _simulation_seconds(kind: str) -> float:
-    """CPU time of the record in compiled scalar code, the unit of cost; and loads what an identification runs."""
-    drive, truth = b32(kind == "lugre")
-    system, log = drive.system(), generate(kind, truth, 0)
-    free = _free(kind)
+def _unit(kind: str) -> float:
+    """The unit of cost [CPU s]; and loads what an identification runs."""
+    lugre = kind == "lugre"
+    drive, truth = b32(lugre)
+    log = generate(kind, truth, 0)
     short = replace(log, trajectory=log.trajectory.rows(0, 1000))
-    po.identify(system, [short], truth.freed(*free), throw=False)
-    rollout = Rollout(discretise(system).pieces, lanes=1)
-    start = np.array([[log.trajectory[n][0] if n in log.trajectory else 0.0 for n in names(system.states)]])
-    t = log.trajectory.t[None]
-    given = (start, log.trajectory["valve_voltage"][None, :, None], vector(system.parameters, truth), t, t * 0 + SAMPLE)
-    best = math.inf
-    for _ in range(5):
-        began = time.process_time()
-        rollout.run(*given, substeps=COARSE)
-        best = min(best, time.process_time() - began)
-    return best
+    po.identify(drive.system(), [short], truth.freed(*_free(kind)), throw=False)
+    return simulation_seconds(log, lugre)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pneuopt.checks import check_content
-from pneuopt.errors import InputError, LogError, ModelError, UnknownNameError
+from pneuopt.errors import InputError, LogError, ModelError, PhysicsWarning, UnknownNameError
 from pneuopt.experiments import Experiment
+from pneuopt.finders import Log
 from pneuopt.identify import identify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
@@ -143,3 +145,18 @@ def test_a_still_window_among_moving_ones_is_no_fault() -> None:
     check_content([log_with(), replace(still, name="b")])
     with pytest.raises(LogError, match="b: 'position' is constant"):
         check_content([replace(still, name="b")])
+
+
+def test_what_a_model_doubts_is_warned_of_and_stands_in_the_status() -> None:
+    """The doubter sees the parameters as they are in each log."""
+
+    def doubting(logs: Mapping[str, Log]) -> Sequence[str]:
+        return [f"{name}: {log.parameters.value('load.mass'):g} kg?" for name, log in logs.items()]
+
+    system = replace(RIG.system(), doubter=doubting)
+    t = np.arange(400) * 1e-3
+    motion = {"force": 100 * np.cos(20 * t), "position": 0.02 * np.sin(20 * t) + 1e-6 * np.sin(1e5 * t)}
+    log = Experiment(Trajectory(t, motion), name="run").with_conditions({"load.mass": 7.0})
+    with pytest.warns(PhysicsWarning, match=r"run: 7 kg\?"):
+        fit = identify(system, [log], RIG.parameters.freed("friction.viscous"), throw=False)
+    assert fit.status.message.endswith("; run: 7 kg?")

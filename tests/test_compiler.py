@@ -62,6 +62,8 @@ def script(folder: Path, text: str) -> str:
     [
         ("#!/bin/sh\necho 'model.c: no licence' >&2; exit 1\n", "no licence"),
         ("#!/bin/sh\nexit 0\n", "No such file"),
+        ("#!/bin/sh\nexit 3\n", "it ended with exit status 3"),
+        ("#!/bin/sh\nkill -9 $$\n", "it was killed by signal 9"),
         ("not a program", "Exec format error"),
         (
             '#!/bin/sh\nwhile [ "$1" != -o ]; do shift || exit 0; done; echo junk > "$2"\n',

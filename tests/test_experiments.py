@@ -102,6 +102,11 @@ def test_columns_in_place_of_the_sidecars(tmp_path: Path) -> None:
     assert run.trajectory["position"][2] == pytest.approx(1e-6)
 
 
+def test_a_drive_that_has_a_sidecars_name_is_told(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"is a drive, but has the name of the sidecar of run_01\.csv; rename one"):
+        read_log(written(tmp_path, HEADER + BODY, '[drive]\nkind = "force"\n'))
+
+
 def test_an_explicit_sidecar(tmp_path: Path) -> None:
     side = tmp_path / "rig.toml"
     side.write_text('[noise]\nposition = "20 um"\n')

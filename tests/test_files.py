@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pneuopt.errors import InputError, UnitError, UnknownNameError
 from pneuopt.files import read_drive, read_status, write_fit
+from pneuopt.identifiability import Verdict
 from pneuopt.models.chamber import Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive
@@ -50,6 +51,7 @@ class Fit:
     estimates: pd.DataFrame = field(default_factory=pd.DataFrame)
     status: Status = field(default_factory=lambda: Status(Code.CONVERGED, "gaps 1e-9"))
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    verdict: Verdict | None = None
 
 
 def written(folder: Path, text: str, name: str = "drive.toml") -> Path:

@@ -234,15 +234,20 @@ def doubled() -> System:
     return define(base.states, base.inputs, base.outputs, parameters, rhs, base.start_finder)
 
 
-def test_twins_never_get_an_interval() -> None:
-    system = doubled()
-    with pytest.raises(ConvergenceError, match=r"NOT converged.*do not determine friction\.viscous and twin") as caught:
-        identify(system, [pushed(Coulomb())], system.parameters.freed(*FREE, "twin"))
-    result = caught.value.solution
-    assert isinstance(result, IdentificationResult)
-    assert np.isnan(result.estimates["stderr"]).all()
-    total = result.estimates["value"]["friction.viscous"] + result.estimates["value"]["twin"]
-    assert total == pytest.approx(60, rel=0.01)
+def test_twins_never_get_an_interval_and_spoil_no_other() -> None:
+    """One of them stays where it was given, the other makes up their sum; neither is a number."""
+    system, log = doubled(), pushed(Coulomb())
+    result = identify(system, [log], system.parameters.freed(*FREE, "twin"))
+    alone = identify(system, [log], system.parameters.freed(*FREE))
+    twins, rows = ["friction.viscous", "twin"], result.estimates
+    assert rows["note"][rows["note"] == "not told"].index.tolist() == twins
+    assert np.isnan(rows.loc[twins, ["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
+    assert sum(result.parameters.value(n) for n in twins) == pytest.approx(60, rel=0.01)
+    assert result.parameters.value("twin") == 0.0
+    assert "the logs do not tell friction.viscous and twin" in result.status.message
+    assert "friction.viscous and twin only count together" in str(result.verdict)
+    others = alone.estimates.drop("friction.viscous")[["value", "stderr"]]
+    pd.testing.assert_frame_equal(rows.drop(twins)[["value", "stderr"]], others, rtol=1e-3)
 
 
 def test_a_parameter_that_the_log_does_not_reach_is_named() -> None:
@@ -322,7 +327,7 @@ def test_a_wrong_basin_is_not_the_answer_if_another_start_is_better() -> None:
     turn = ParameterSet({"turn": Parameter(2.0, "1", free=True)})
 
     def finder(logs: Mapping[str, object]) -> list[object]:
-        from pneuopt.system import Log, Start
+        from pneuopt.finders import Log, Start
 
         (start,) = base.starts({n: Log(e.measured, truth) for n, e in logs.items()})  # type: ignore[attr-defined]
         return [Start(start.states, {"turn": value}, f"{value}") for value in (-0.9, -1.1, 2.1)]

@@ -54,11 +54,16 @@ def test_fewer_channels_still_tell(log: po.Experiment, channels: tuple[str, ...]
     check(fit, numbers(truth), 0.05)
 
 
-def test_speed_alone_tells_friction_from_a_known_beginning(log: po.Experiment) -> None:
+@pytest.mark.parametrize("off", [0.0, -0.02])
+def test_speed_alone_tells_friction_and_where_it_began(log: po.Experiment, off: float) -> None:
+    """The air in both chambers tells the position, if the log begins elsewhere than it is said to."""
     drive, truth = b32()
-    begin = {"cylinder.start": float(log.trajectory["position"][0]) / truth.value("cylinder.stroke")}
+    true = float(log.trajectory["position"][0])
+    begin = {"cylinder.start": (true + off) / truth.value("cylinder.stroke")}
     speed = log.select(("valve_voltage", "speed")).with_conditions(begin)
-    check(po.identify(drive.system(), [speed], blind(drive, truth, *FREE)), numbers(truth), 0.15)
+    fit = po.identify(drive.system(), [speed], blind(drive, truth, *FREE))
+    check(fit, numbers(truth), 0.15)
+    assert fit.trajectories["b32"]["position"][0] == pytest.approx(true, abs=1e-3)
 
 
 def test_supply_and_load_are_known_of_each_log_or_found_for_each(log: po.Experiment) -> None:

@@ -61,6 +61,44 @@ def test_exchanged_pressures_are_seen_in_their_work() -> None:
     assert "exchange pressure_a and pressure_b" in told[0]
 
 
+def commanded(frequency: float, sign: float = 1.0) -> Experiment:
+    """A speed that follows a valve as a lag of first order, 50 ms, would."""
+    w = 2 * np.pi * frequency
+    size, late = 0.3 / np.hypot(1, 0.05 * w), np.arctan(0.05 * w)
+    columns = {"valve_voltage": sign * np.cos(w * T), "position": 0.1 + size / w * np.sin(w * T - late)}
+    return Experiment(Trajectory(T, columns))
+
+
+@pytest.mark.parametrize("frequency", [0.5, 1.0, 2.0, 5.0, 12.0])
+def test_a_piston_that_follows_its_valve_is_sound(frequency: float) -> None:
+    assert faults(commanded(frequency)) == []
+
+
+@pytest.mark.parametrize("frequency", [0.5, 1.0, 2.0])
+def test_a_wrong_sign_of_the_command_is_seen_in_slow_motion(frequency: float) -> None:
+    (told,) = faults(commanded(frequency, -1.0))
+    assert told.startswith("the piston runs against the valve's command (correlation -")
+    assert "change the sign of 'valve_voltage'" in told
+
+
+@pytest.mark.parametrize("path", sorted(DATA.glob("[ps]*_rig/*.csv")), ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_the_example_logs_with_a_wrong_sign_of_the_command(path: Path) -> None:
+    log = read_log(path).trajectory
+    turned = log.with_columns({"valve_voltage": -log["valve_voltage"]})
+    assert any("runs against the valve's command" in message for message in faults(Experiment(turned)))
+
+
+def test_a_constant_command_moves_a_piston_one_way_only() -> None:
+    still = np.full(T.size, 0.4)
+    (told,) = faults(swing(valve_voltage=still))
+    assert told.startswith("'valve_voltage' is constant while the piston goes to and fro")
+    rng = np.random.default_rng(5)
+    moved = {"position": 0.05 * np.minimum(T, 1.0) + 2e-5 * rng.standard_normal(T.size)}
+    moved |= {"speed": 0.05 * (T < 1.0) + 2e-3 * rng.standard_normal(T.size)}
+    for name, column in moved.items():
+        assert faults(Experiment(Trajectory(T, {"valve_voltage": still, name: column}))) == []
+
+
 def test_a_load_that_is_only_lowered_may_be_braked() -> None:
     down = {"position": 0.5 - 0.1 * T, "force": np.full(T.size, 50.0)}
     assert faults(Experiment(Trajectory(T, down))) == []

@@ -10,7 +10,7 @@ from pneuopt.models.friction import FrictionModel, friction_ladder
 from pneuopt.parameters import ParameterSet
 from pneuopt.selection import ModelSelection, select_model
 from pneuopt.system import System
-from pneuopt.trajectories import Trajectory
+from pneuopt.trajectories import Array, Trajectory
 
 FREE = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity", "friction.*_asymmetry")
 PAIR = ("friction.coulomb", "friction.viscous", "friction.*_asymmetry")
@@ -106,3 +106,30 @@ def test_none_converged_is_an_error_with_every_result() -> None:
     with pytest.raises(ConvergenceError, match="none of the candidates converged: coulomb: ") as caught:
         select_model(pair, [steady], ParameterSet(), free=PAIR[:2])
     assert set(caught.value.solution) == {"coulomb", "stribeck"}
+
+
+def test_a_candidate_with_untold_parameters_gives_way_to_a_simpler_one_that_fits_as_well() -> None:
+    """All speeds are far beyond the Stribeck velocity; the reason and the table name what is not told."""
+    pair = {n: MotionDrive(STATIC[n], chamber=False).system() for n in ("stribeck", "coulomb")}
+    run = moved(STATIC["coulomb"], 1, 300)
+    fast = Experiment(Trajectory(run.trajectory.t, fast_channels(run)), run.noise)
+    found = select_model(pair, [fast], ParameterSet(), free=FREE[:4])
+    assert found.recommended == "coulomb"
+    columns = found.table.to_dict()
+    assert columns["converged"]["stribeck"]
+    assert columns["untold"]["stribeck"] == "friction.static, friction.stribeck_velocity"
+    assert columns["untold"]["coulomb"] == columns["at_bound"]["coulomb"] == ""
+    assert found.reason.startswith("coulomb, of 2 converged candidates, has the lowest BIC")
+    assert "not tell" not in found.reason
+    only = select_model({"stribeck": pair["stribeck"], "also": pair["stribeck"]}, [fast], ParameterSet(), free=FREE[:4])
+    assert only.reason.endswith("; the logs do not tell its friction.static, friction.stribeck_velocity")
+
+
+def fast_channels(run: Experiment) -> dict[str, Array]:
+    """Speeds of 0.3 to 0.6 m/s, both ways, and the Coulomb drive's friction there."""
+    rng = np.random.default_rng(0)
+    v = np.sign(run.trajectory["speed"]) * rng.uniform(0.3, 0.9, len(run.trajectory.t))
+    drive = MotionDrive(STATIC["coulomb"], chamber=False)
+    p = [drive.parameters.value(name) for name in drive.system().parameters]
+    force = np.array([float(drive.system().ode(0, [], [speed], p)[1]) for speed in v])
+    return {"speed": v, "force": force + 0.5 * rng.standard_normal(v.size)}

@@ -10,6 +10,7 @@ from pneuopt import starting
 from pneuopt.checks import check_logs
 from pneuopt.codegen import Rollout
 from pneuopt.experiments import Experiment
+from pneuopt.finders import Start
 from pneuopt.identify import identify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
@@ -18,7 +19,7 @@ from pneuopt.nlp.status import Code
 from pneuopt.nlp.transcription import Transcription
 from pneuopt.parameters import ParameterSet
 from pneuopt.posing import Problem
-from pneuopt.system import Start, discretise, vector
+from pneuopt.system import discretise, vector
 from pneuopt.trajectories import Trajectory
 
 VELOCITY = "friction.stribeck_velocity"
@@ -89,3 +90,29 @@ def test_an_interruption_keeps_the_best_so_far(monkeypatch: pytest.MonkeyPatch) 
     )
     assert result.status.code is Code.INTERRUPTED
     assert "best of 1 starts" in result.status.message
+
+
+def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second start, far off, is interrupted with its gaps still loose: its cost is low, but says nothing."""
+    armed: list[bool] = []
+
+    def progress(line: str) -> None:
+        if armed:
+            raise KeyboardInterrupt
+
+    def two(problem: Problem, _confirms: Callable[[], bool]) -> Iterator[Start]:
+        good = problem.candidates()[0]
+        yield good
+        armed.append(True)
+        yield Start(good.states, {**good.parameters, "friction.coulomb": 3.0}, "far off")
+
+    module = sys.modules["pneuopt.identify"]
+    monkeypatch.setattr(module, "attempts", two)
+    monkeypatch.setattr(module, "_is_at_noise", lambda _: False)
+    problem, method = posed(Coulomb()), LeastSquares(progress=progress)
+    system = ForceDrive(Coulomb()).system()
+    result = identify(system, problem.experiments, problem.parameters, method=method, throw=False)
+    assert result.status.code is Code.INTERRUPTED
+    assert "the best of 2 starts so far" in result.status.message
+    assert result.provenance["start"] != "far off"
+    assert result.fit["nrmse"].max() < 0.01

@@ -7,8 +7,9 @@ from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
 from pneuopt.errors import ConvergenceError, InputError, ModelError, UnknownNameError
+from pneuopt.finders import Log
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import DiscreteSystem, Log, Symbols, System, define, discretise, vector
+from pneuopt.system import DiscreteSystem, Symbols, System, define, discretise, vector
 from pneuopt.trajectories import Array, Trajectory
 
 SPRING = ParameterSet(

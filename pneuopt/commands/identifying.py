@@ -146,7 +146,7 @@ def _ladder(path: Path, model: Drive) -> dict[str, System]:
 def _worded(verdict: Verdict | None) -> dict[str, Any]:
     if verdict is None:
         return {}
-    return {"sentences": verdict.sentences, "untold": verdict.untold, "table": records(verdict.table)}
+    return {**verdict.worded(), "table": records(verdict.table)}
 
 
 def _fit_figures(

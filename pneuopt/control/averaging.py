@@ -81,10 +81,9 @@ def averaged(
     >>> round(float(mean.linearise(np.zeros(1), {}, given).B[0, 0]), 2)
     0.67
     """
-    dithered = _dithered(model, parameters, actuated)
-    given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
-    swing = _first_harmonic(dithered, given, _point(model, dithered, given, at, reference), nodes)
-    return dithered.mean(swing / given.value(AMPLITUDE), nodes)
+    swing = ripple(model, parameters, at=at, reference=reference, actuated=actuated, nodes=nodes)
+    share = np.array([*swing.values()], dtype=np.complex128) / parameters.value(AMPLITUDE)
+    return _dithered(model, parameters, actuated).mean(share, nodes)
 
 
 def ripple(

@@ -18,8 +18,9 @@ from pneuopt.codegen import Rollout
 from pneuopt.control.loop import READING, ClosedLoop
 from pneuopt.control.rest import drifting
 from pneuopt.errors import LogError, ModelError, require
+from pneuopt.finders import Log, Start
 from pneuopt.parameters import ParameterSet, Quantity
-from pneuopt.system import DiscreteSystem, Log, Start, Symbols, define, names
+from pneuopt.system import DiscreteSystem, Symbols, define, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]

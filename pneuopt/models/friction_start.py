@@ -14,9 +14,9 @@ from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
 from pneuopt.errors import LogError, require
+from pneuopt.finders import Log, Start
 from pneuopt.models.load import GRAVITY
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.system import Log, Start
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]

@@ -5,6 +5,9 @@ from functools import partial
 from math import inf
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pneuopt.errors import HardwareError, require
 from pneuopt.guards import Guard
 from pneuopt.models.chamber import VACUUM
@@ -14,6 +17,7 @@ from pneuopt.units import write_value
 
 EMPTY = 0.5  # of the ambient pressure: lip seals let air in long before
 STRAY = 0.01  # of the stroke, by which a piston that presses into a stop may stand outside
+MISPLACED = 0.05  # of the stroke, by which a position sensor's zero may be off
 _SIDES = {"a": "rear", "b": "front"}
 
 
@@ -53,6 +57,29 @@ def check_start(p: ParameterSet, start: Mapping[str, float]) -> None:
     inside = -STRAY * stroke <= y <= (1 + STRAY) * stroke
     shown = write_value(y, "m"), write_value(stroke, "m")
     require(inside, f"a start at position = {shown[0]} lies outside the stroke, 0 to {shown[1]}")
+
+
+def stray(p: ParameterSet, position: NDArray[np.float64]) -> str:
+    """What speaks against a logged position: that it lies outside the stroke by more than a sensor's zero is off.
+
+    Parameters
+    ----------
+    p : ParameterSet
+    position : ndarray
+        [m]; NaN where it is missing.
+
+    Returns
+    -------
+    str
+        A sentence; empty if nothing does.
+    """
+    stroke = p.value("cylinder.stroke")
+    low, high = (float(np.nanpercentile(position, q)) for q in (1, 99))
+    if -MISPLACED * stroke <= low and high <= (1 + MISPLACED) * stroke:
+        return ""
+    where = f"position runs from {write_value(low, 'm')} to {write_value(high, 'm')}"
+    remedy = "check its sign, unit and zero, and cylinder.stroke"
+    return f"{where}, outside the stroke, 0 to {write_value(stroke, 'm')}: {remedy}"
 
 
 def guards(stops: bool) -> tuple[Guard, ...]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import optimize, signal
 
 from pneuopt.errors import LogError, require
+from pneuopt.finders import Log, Start
 from pneuopt.parameters import ParameterSet
-from pneuopt.system import Log, Start
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]

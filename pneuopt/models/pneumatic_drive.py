@@ -1,8 +1,8 @@
 """`PneumaticDrive`: supply, proportional valve, cylinder and load, wired by hand into one ODE."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import casadi as ca
@@ -10,19 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.errors import require
+from pneuopt.finders import Doubter, Log, Rest
 from pneuopt.models.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.drive import AMBIENT, POSITION, SPEED, gauge, part, renamed
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.gas import GAS_CONSTANT
-from pneuopt.models.hardware import check_hardware, check_start, guards
+from pneuopt.models.hardware import check_hardware, check_start, guards, stray
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic_rest import BALANCED, Glide, steady
 from pneuopt.models.pneumatic_start import PneumaticStarts
+from pneuopt.models.pressure_zero import PressureZeros
 from pneuopt.models.valve import Port, ProportionalValve
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import Rest, System, define, names, stacked, vector
+from pneuopt.system import System, define, names, stacked, vector
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -175,7 +177,8 @@ class PneumaticDrive:
         outputs = (POSITION, SPEED, *PRESSURES)
         starts = PneumaticStarts(self.system, _push)
         system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._rest_for_loop)
-        return replace(system, checker=self.check, guards=guards(self.cylinder.stops))
+        doubts = partial(_doubts, PressureZeros(starts.runs))
+        return replace(system, checker=self.check, guards=guards(self.cylinder.stops), doubter=doubts)
 
     def _rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG002 - no time in it
         y, v, a, b = (x[n] for n in ("position", "speed", "pressure_a", "pressure_b"))
@@ -240,6 +243,14 @@ _AIR = ParameterSet(
         "gas.constant": Parameter(GAS_CONSTANT, "J/(kg*K)", 250.0, 320.0, source="dry air"),
     }
 )
+
+
+def _doubts(zeros: Doubter, logs: Mapping[str, Log]) -> Sequence[str]:
+    """Positions that cannot be, and pressures; these say nothing where the chambers' volumes are wrong."""
+    moved = {name: log for name, log in logs.items() if "position" in log.measured}
+    found = {name: stray(log.parameters, log.measured["position"]) for name, log in moved.items()}
+    outside = [f"{name}: {sentence}" for name, sentence in found.items() if sentence]
+    return outside or zeros(logs)
 
 
 def _push(p: Mapping[str, Any], a: Any, b: Any) -> Any:

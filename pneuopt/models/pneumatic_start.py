@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.finders import Log, Start
 from pneuopt.models.following import PRESSURES, Follower
 from pneuopt.models.friction_start import Rows, candidates, filtered, load_columns, misfit, motion, named
 from pneuopt.models.gas import REFERENCE_DENSITY
 from pneuopt.parameters import ParameterSet
-from pneuopt.system import Log, Start, System
+from pneuopt.system import System
 
 Array = NDArray[np.float64]
 Values = Mapping[str, float]
@@ -38,8 +39,8 @@ ZOOMS = 5  # each halves the step
 class PneumaticStarts:
     """The start finder of a pneumatic drive.
 
-    A log without position takes it as the integral of the speed, from cylinder.start of the stroke: a log that begins
-    elsewhere needs that as its condition.
+    A log without position takes it as the integral of the speed, from cylinder.start of the stroke; the fit moves that
+    beginning to where the air in both chambers has it (from 20 mm off in 200 mm it did).
 
     Parameters
     ----------
@@ -54,8 +55,7 @@ class PneumaticStarts:
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates: one valve, friction for each of the Stribeck velocities tried."""
-        followers = functools.cache(functools.partial(Follower, self.system()))
-        runs = {name: _Run(log, followers, self.push) for name, log in logs.items()}
+        runs = self.runs(logs)
         valve = _valve(runs)
         starts = candidates({name: run.balance(valve) for name, run in runs.items()})
         own: dict[str, float] = {}
@@ -63,8 +63,13 @@ class PneumaticStarts:
             own |= named(name, value, {n: log.parameters for n, log in logs.items()})
         return [replace(start, parameters={**start.parameters, **own}) for start in starts]
 
+    def runs(self, logs: Mapping[str, Log]) -> dict[str, "Run"]:
+        """The logs as this drive's motion and air."""
+        followers = functools.cache(functools.partial(Follower, self.system()))
+        return {name: Run(log, followers, self.push) for name, log in logs.items()}
 
-class _Run:
+
+class Run:
     """One log: its filtered motion and pressures, and what follows from them with any valve."""
 
     def __init__(self, log: Log, followers: Callable[[tuple[str, ...]], Follower], push: Push) -> None:
@@ -98,15 +103,26 @@ class _Run:
             out.append(Rows(measured, self.parameters, states["speed"], force, columns, states))
         return out
 
-    def rates(self, valves: Sequence[Values]) -> Array:
-        """Rates of the logged pressures with each of several valves [Pa/s], shape (len(valves), n * len(logged))."""
+    def valve_columns(self, shape: Values) -> tuple[Array, Array]:
+        """The regression of the m logged pressures' rates on conductance, and conductance times leak.
+
+        Returns
+        -------
+        columns : ndarray, shape (n, m, 2)
+        rates : ndarray, shape (n, m)
+            As logged, less what they are behind a closed valve [Pa/s].
+        """
+        unit, leak = 1e-8, 0.01  # the rates are linear in both: any two values tell the columns
+        probes = [{**shape, CONDUCTANCE: c, LEAK: x} for c, x in ((1e-12, 0.0), (unit, 0.0), (unit, leak))]
+        closed, edges, leaking = self._rates(probes)
+        columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
+        return columns, np.column_stack([filtered(self.measured, n, 1) for n in self.logged]) - closed
+
+    def _rates(self, valves: Sequence[Values]) -> Array:
+        """Rates of the logged pressures with each of several valves [Pa/s], shape (len(valves), n, m)."""
         given = self._given.with_columns(self._as_given)
         rates = self._followers((*self.led, *self._as_given)).pressure_rates(given, self._with(valves))
-        return rates[:, :, [PRESSURES.index(n) for n in self.logged]].reshape(len(valves), -1)
-
-    def logged_rates(self) -> Array:
-        """The same, as logged."""
-        return np.column_stack([filtered(self.measured, n, 1) for n in self.logged]).ravel()
+        return rates[:, :, [PRESSURES.index(n) for n in self.logged]]
 
     def conductance_needed(self) -> float:
         """Of an open edge, choked, to feed the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
@@ -130,7 +146,7 @@ class _Run:
         ]
 
 
-def _valve(runs: Mapping[str, _Run]) -> dict[str, float]:
+def _valve(runs: Mapping[str, Run]) -> dict[str, float]:
     """What is free of conductance, leak, critical ratio and dead zone."""
     parameters = next(iter(runs.values())).parameters
     free = [n for n in (CONDUCTANCE, LEAK, *SHAPES) if any(n in run.parameters.free_names for run in runs.values())]
@@ -172,14 +188,12 @@ def _searched(
     return dict(zip(names, point.tolist(), strict=True))
 
 
-def _by_pressure(runs: Mapping[str, _Run], free: Sequence[str], shape: Values) -> tuple[dict[str, float], float]:
+def _by_pressure(runs: Mapping[str, Run], free: Sequence[str], shape: Values) -> tuple[dict[str, float], float]:
     """Conductance and leak, as far as free, by linear regression; and the squares that are left [Pa^2/s^2]."""
-    parameters, unit = next(iter(runs.values())).parameters, 1e-8
-    probes = [{**shape, CONDUCTANCE: c, LEAK: leak} for c, leak in ((1e-12, 0.0), (unit, 0.0), (unit, 0.01))]
-    logged = [run for run in runs.values() if run.logged]
-    closed, edges, leaking = np.concatenate([run.rates(probes) for run in logged], axis=1)
-    y = np.concatenate([run.logged_rates() for run in logged]) - closed
-    A = np.column_stack([edges - closed, (leaking - edges) / 0.01]) / unit  # of conductance, and of it times leak
+    parameters = next(iter(runs.values())).parameters
+    parts = [run.valve_columns(shape) for run in runs.values() if run.logged]
+    A = np.concatenate([columns.reshape(-1, 2) for columns, _ in parts])
+    y = np.concatenate([rates.ravel() for _, rates in parts])
     known, basis = _affine(parameters.value(CONDUCTANCE), parameters.value(LEAK), CONDUCTANCE in free, LEAK in free)
     known = known + basis @ np.linalg.lstsq(A @ basis, y - A @ known, rcond=None)[0]
     leak = float(known[1] / known[0]) if known[0] > 0 else 0.0
@@ -197,7 +211,7 @@ def _affine(conductance: float, leak: float, conductance_free: bool, leak_free: 
     return np.array([conductance, conductance * leak]), np.empty((2, 0))
 
 
-def _by_force(runs: Mapping[str, _Run], valves: Sequence[Values]) -> list[float]:
+def _by_force(runs: Mapping[str, Run], valves: Sequence[Values]) -> list[float]:
     """How badly the forces balance with each of several valves [N]."""
     balances = {name: run.balances(valves) for name, run in runs.items()}
     return [misfit({name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.errors import check_known, require
+from pneuopt.finders import Log, Rest, RestFinder, Start
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import Log, Rest, RestFinder, Start, Symbols, System, define, names, stacked, vector
+from pneuopt.system import Symbols, System, define, names, stacked, vector
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]

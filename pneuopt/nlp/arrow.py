@@ -14,6 +14,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, c
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+RANK = 1e-12  # of the eigenvalues of a matrix of unit diagonal
 ROUNDING = 1e-14  # relative errors of a Schur complement, from long chains of tight gaps: 1 to 5e-16 measured
 STATE_FLOOR = 1e-6  # on D's diagonal (scaled states): a state that no data reach stays put, the optimum does not move
 
@@ -156,7 +157,7 @@ def indistinct(schur: Array, corner: Array) -> Indices:
     Returns
     -------
     ndarray of int
-        Empty if each parameter counts.
+        Empty if each parameter counts; what takes the largest part, or has lost the most digits, comes last.
     """
     if not schur.size:
         return np.arange(0)
@@ -165,10 +166,12 @@ def indistinct(schur: Array, corner: Array) -> Indices:
     if lost.size or not np.isfinite(schur).all():
         return lost if lost.size else np.arange(len(schur))
     values, vectors = np.linalg.eigh(_unit_diagonal(schur)[0])
-    if values[0] > max(1e-12, ROUNDING / float(left.min())):
+    if values[0] > max(RANK, ROUNDING / float(left.min())):
         return np.arange(0)
     weakest = np.abs(vectors[:, 0])
-    return np.flatnonzero(weakest > 0.1 * weakest.max())
+    members = np.flatnonzero(weakest > 0.1 * weakest.max())
+    blame = weakest.round(6) if values[0] <= RANK else 1 / left
+    return members[np.argsort(blame[members], kind="stable")]
 
 
 def _unit_diagonal(matrix: Array) -> tuple[Array, Array]:

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
-from pneuopt.nlp.arrow import Arrow, Reduced, indistinct, scaled_inverse
+from pneuopt.nlp.arrow import ROUNDING, Arrow, Reduced, indistinct, scaled_inverse
 from pneuopt.nlp.segments import Correction, Segments
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+FAR = 1e3  # standard deviations of the data, were all else known
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +114,32 @@ class Equations:
         spread = bread if noisy_gaps else bread @ self._meat(reduced)[np.ix_(keep, keep)] @ bread
         out[np.ix_(keep, keep)] = spread
         return np.asarray(out * np.outer(self.slopes.chain, self.slopes.chain))
+
+    def borrowed(self, keep: Mask, held: Mask, prior: Array) -> Array | None:
+        """Covariance (own units) that the kept parameters take over from a prior of the held ones.
+
+        Parameters
+        ----------
+        keep, held : ndarray of bool, shape (k,)
+        prior : ndarray, shape (k,)
+            Standard deviation, as searched; infinite: a thousand times that of the data, were all else known.
+
+        Returns
+        -------
+        ndarray, shape (k, k), or None
+            None where the data do not determine the kept ones.
+        """
+        reduced = self.arrow.eliminate(0.0)
+        if reduced is None or self.undetermined(reduced, keep).size:
+            return None
+        out = np.zeros((len(keep), len(keep)))
+        left = np.maximum(np.diag(reduced.schur), ROUNDING * np.diag(self.arrow.corner))
+        alone = 1 / np.sqrt(np.maximum(left[held], 1e-300))
+        spread = np.where(np.isfinite(prior[held]), prior[held], FAR * alone)
+        bread = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
+        moved = self.slopes.chain[keep, None] * (bread @ reduced.schur[np.ix_(keep, held)]) * spread
+        out[np.ix_(keep, keep)] = moved @ moved.T
+        return out
 
     def _meat(self, reduced: Reduced) -> Array:
         """The data's own Gram matrix of the parameters, with the nodes following them. Shape (k, k)."""

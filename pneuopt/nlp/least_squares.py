@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.codegen import Run
-from pneuopt.nlp.arrow import Reduced, Step, scaled_inverse
-from pneuopt.nlp.equations import Equations, normal_equations, reconnected, unexplained, weighed
+from pneuopt.nlp.arrow import Reduced, Step
+from pneuopt.nlp.equations import Equations, normal_equations, reconnected, weighed
+from pneuopt.nlp.judge import MOST_GAP_SHARE, NOISE_LEVEL, Judgement, judged
 from pneuopt.nlp.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
 from pneuopt.nlp.space import Space
 from pneuopt.nlp.status import Code, Solution, Status
@@ -31,11 +32,11 @@ STILL = 5e-7  # likewise the last, in noise variances: half of (0.1 % of a stand
 LEAST_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
 REFINEMENTS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
 STABLE = 2.0  # h |lambda| of a search's steps; RK4 is stable below 2.78
+CRAWLING = 2e-3  # of the cost an iteration, below which a search that goes on gets nowhere
+TORN = Status(Code.NOT_CONVERGED, "the gaps between segments take up what the model cannot")
 MOVED = 0.03  # a parameter's relative change that has the stiffness judged anew
 STIFFEST = 200  # integration steps a sample beyond which a search would take hours
 MOST_REFINED = 8  # how far a stage may refine the start's integration steps
-MOST_GAP_SHARE = 0.05  # of the cost: the gaps' residuals above it mean that they take up what the model cannot
-NOISE_LEVEL = 1.2  # squared residuals a sample, in noise variances, up to which a fit is as good as the noise allows
 
 
 @dataclass(frozen=True)
@@ -107,8 +108,13 @@ class Fit:
     count : int
         Number of data residuals.
     at_bound : ndarray of bool, shape (k,)
+        Without those that were held, by equal bounds.
     jumps : ndarray, shape (m, n_states), or None
         Where the gaps had to stand for noise of the states: the gap behind each linked segment, in nominal sizes.
+    silent : tuple of str
+        The parameters that the data do not tell here; hold them, and ask again.
+    borrowed : ndarray, shape (k, k), or None
+        What a weak prior of those held adds to the covariance (`Equations.borrowed`); None where nothing is held.
     """
 
     solution: Solution
@@ -117,6 +123,8 @@ class Fit:
     count: int
     at_bound: Mask
     jumps: Array | None = None
+    silent: tuple[str, ...] = ()
+    borrowed: Array | None = None
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
@@ -166,7 +174,7 @@ class _Search:
         self.tightness = tightness(segments, method.kinematic)
         self.iterations, self.stage = 0, method.stages[0]
         self.correction: Correction | None
-        self.is_loose, self.ends = False, list[_End]()
+        self.is_loose, self.is_resting, self.ends = False, False, list[_End]()
         nodes = start_nodes(segments)
         self.judged = self.space.values(self.space.start)
         self.needed = method.substeps or substeps_for(segments, nodes, self.judged, STABLE)
@@ -187,21 +195,31 @@ class _Search:
             told = f"the model is so stiff that a sample takes {self.needed} integration steps; smooth its "
             remedy = "sharpest term (friction.smoothing to 1e-4 m/s), or give LeastSquares(substeps=)"
             return Status(Code.NOT_CONVERGED, told + remedy)
+        last, allowed = self.method.stages[-1], None
         for stage in self.method.stages:
+            if stage is last and self._is_stuck():
+                allowed = self._loosened()
+                if allowed.converged:
+                    return self._refine(allowed)
             self._enter(stage, self.current.nodes, self.current.z)
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, "the model is not finite at the start; check values and units")
-            self._run_stage()
+            self.is_resting = self._run_stage()
             self.ends.append(_End(self.current.nodes, self.current.z, self.current.cost))
         status = self._judge(self.current)
         # gaps that take up what the model cannot: the answer hangs on their weight
-        is_torn = self.current.equations.gap_share > MOST_GAP_SHARE
+        is_torn = self.current.equations.gap_share > MOST_GAP_SHARE and allowed is None
         return self._refine(self._loosened(status) if is_torn else status)
 
-    def _loosened(self, status: Status) -> Status:
+    def _is_stuck(self) -> bool:
+        """Whether the gaps take up what the model cannot, in an optimum beyond the noise: tighter ones cost more."""
+        torn, equations = self.current.equations.gap_share > MOST_GAP_SHARE, self.current.equations
+        return self.is_resting and torn and 2 * self.current.cost > NOISE_LEVEL * equations.count
+
+    def _loosened(self, status: Status = TORN) -> Status:
         """Allow what a wrong model leaves as noise of its states: the tightest gaps with which all residuals agree."""
         last = self.method.stages[-1]
-        for stage, end in zip(self.method.stages[-2::-1], self.ends[-2::-1], strict=True):
+        for stage, end in reversed(list(zip(self.method.stages[:-1], self.ends, strict=False))):
             if 2 * end.cost <= NOISE_LEVEL * self.current.equations.count:
                 tight = self.stage, self.current, self.correction, self.substeps, self.finest
                 self.is_loose = True
@@ -262,20 +280,24 @@ class _Search:
                 break
             if self._judge(self.current).converged:
                 self.change = math.nan if self.method.substeps else change
+                if self.is_loose:
+                    self._run_stage()  # the finer steps have moved its optimum a little
                 break
             self._run_stage()
             status = self._judge(self.current)
         return status
 
-    def _run_stage(self) -> None:
-        damping = min(FIRST_DAMPING, 10 * self.stage.gap**2)  # as the diagonal grows
+    def _run_stage(self) -> bool:
+        """Whether it came to rest, or was only crawling when its iterations were used up."""
+        damping, before = min(FIRST_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         for _ in range(self.stage.iterations):
             trial, damping = self._step(self.current, damping)
             if trial is None:
-                break
+                return True
             self.iterations += 1
-            self.current = trial
+            before, self.current = self.current.cost, trial
             self._report()
+        return before - self.current.cost < CRAWLING * before
 
     def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
         """Shorten the step until the cost falls; None where ten tries do not help, or it would hardly fall."""
@@ -322,36 +344,11 @@ class _Search:
         return _Iterate(nodes, z, equations)
 
     def _judge(self, current: _Iterate) -> Status:
-        """Converged means that a full undamped step would move nothing that the data can tell apart."""
-        names = np.array(self.segments.transcription.parameters.free_names, dtype=object)
-        equations = current.equations
-        nothing = np.diag(equations.arrow.corner) == 0  # even at a bound
-        idle = ~self.space.felt(equations) & (nothing | ~self.space.at_bound(current.z))
-        if idle.any():
-            told = f"the data do not feel {' and '.join(names[idle])}; fix it, or log a run that does"
-            return Status(Code.NOT_CONVERGED, told)
-        reduced = equations.arrow.eliminate(0.0)
-        if reduced is None:
-            return Status(Code.NOT_CONVERGED, "the data do not determine the states; log another output")
-        keep = self.space.movable(current.z, equations, reduced)
-        alike, solved = names[keep][equations.undetermined(reduced, keep)], reduced.step(keep)
-        if alike.size or solved is None:
-            told = f"the data do not determine {' and '.join(alike)}; fix one, or log a run that tells them apart"
-            return Status(Code.NOT_CONVERGED, told)
-        inverse = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
-        step = np.abs(solved.parameters[keep]) / np.sqrt(np.diag(inverse))
-        noise = max(1.0, math.sqrt(equations.chi_square / max(1, equations.count)))
-        if np.max(step, initial=0.0) > self.method.tolerance * noise:
-            worst = int(np.argmax(step))
-            told = f"{names[keep][worst]} would still move by {step[worst] / noise:.2g} standard deviations; "
-            return Status(Code.NOT_CONVERGED, told + "try more iterations, other start values, or fix a parameter")
-        gap, misfit = equations.largest_gap, 2 * equations.cost / max(1, equations.count)
-        if equations.gap_share > MOST_GAP_SHARE and not (self.is_loose and misfit <= NOISE_LEVEL):
-            told = f"the gaps between segments carry {equations.gap_share:.0%} of the cost, the largest is {gap:.1g} "
-            remedy = "of a state's nominal size: the model cannot follow the log; check its terms, inputs and units"
-            return Status(Code.NOT_CONVERGED, told + remedy)
-        told = f"{self.iterations} iterations, largest gap {gap:.1g} of a state's nominal size"
-        return Status(Code.CONVERGED, told + unexplained(equations, NOISE_LEVEL, jumps=self.is_loose))
+        return self._judgement(current).status
+
+    def _judgement(self, current: _Iterate) -> Judgement:
+        told, tolerance = f"{self.iterations} iterations", self.method.tolerance
+        return judged(current.equations, self.space, current.z, tolerance, told, is_loose=self.is_loose)
 
     def _fit(self, status: Status, seconds: float) -> Fit:
         transcription, current, equations = self.segments.transcription, self.current, self.current.equations
@@ -370,14 +367,17 @@ class _Search:
             "gap_deviation": self.stage.gap,
             "integration_error": self._integration_error(run),
         }
-        at_bound = self.space.at_bound(current.z)
-        keep = self.space.felt(equations) & ~at_bound
-        covariance = equations.covariance(keep, noisy_gaps=self.is_loose) if math.isfinite(equations.cost) else None
-        solution = Solution(
-            self.segments.trajectories(run), transcription.parameters.with_values(values), status, stats
-        )
+        at_bound, held = self.space.at_bound(current.z) & ~self.space.held, self.space.held
+        keep = self.space.felt(equations) & ~at_bound & ~held
+        covariance, borrowed, silent = None, None, tuple[str, ...]()
+        if math.isfinite(equations.cost):
+            covariance = equations.covariance(keep, noisy_gaps=self.is_loose)
+            borrowed = equations.borrowed(keep, held, self.space.weak_prior(current.z)) if held.any() else None
+            silent = tuple(free[i] for i in self._judgement(current).silent)
+        found = transcription.parameters.with_values(values)
+        solution = Solution(self.segments.trajectories(run), found, status, stats)
         jumps = equations.gaps[self.segments.linked] if self.is_loose else None
-        return Fit(solution, covariance, equations.chi_square, equations.count, at_bound, jumps)
+        return Fit(solution, covariance, equations.chi_square, equations.count, at_bound, jumps, silent, borrowed)
 
     def _integration_error(self, run: Run) -> float:
         """Largest change of an output when the steps are halved [noise standard deviations]."""

@@ -1,5 +1,7 @@
 """The free parameters as a search moves them: logarithms where that is asked for, and within their bounds."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from pneuopt.nlp.transcription import Transcription
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+DECADE = math.log(10)  # standard deviation of a weak prior, in e-folds
 UNFELT = 1e-6  # squared residuals that an e-fold change of a log parameter has to move, or it stays where it is
 
 
@@ -20,6 +23,8 @@ class Space:
     log : ndarray of bool, shape (k,)
     lower, upper : ndarray, shape (k,)
         As searched.
+    held : ndarray of bool, shape (k,)
+        Bounds that leave no room.
     start : ndarray, shape (k,)
         The given values, within the bounds.
     """
@@ -32,6 +37,7 @@ class Space:
         self.lower, self.upper = (
             self._searched(np.array([getattr(p, b) for p in self._free])) for b in ("lower", "upper")
         )
+        self.held = np.array([p.lower == p.upper for p in self._free], dtype=bool)
         self.start = self.within(self._searched(self._given[self._positions]))
 
     def within(self, z: Array) -> Array:
@@ -55,6 +61,11 @@ class Space:
     def at_bound(self, z: Array) -> Mask:
         """Which lie on a bound."""
         return np.asarray((z <= self.lower) | (z >= self.upper))
+
+    def weak_prior(self, z: Array) -> Array:
+        """Standard deviation of a prior that hardly says anything: a factor, or for linear ones a multiple, of ten."""
+        size = np.abs(np.where(self.log, 0.0, z))
+        return np.where(self.log, DECADE, np.where(size > 0, 10 * size, np.inf))
 
     def felt(self, equations: Equations) -> Mask:
         """Which have an effect on the residuals here."""

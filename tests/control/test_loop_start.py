@@ -12,12 +12,12 @@ from pneuopt.control.pid import PID
 from pneuopt.control.sensor import SensorLag
 from pneuopt.errors import LogError, ModelError
 from pneuopt.experiments import Experiment
+from pneuopt.finders import Log
 from pneuopt.identify import identify, predict, validate
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.parameters import ParameterSet
 from pneuopt.simulate import simulate
-from pneuopt.system import Log
 from pneuopt.trajectories import Trajectory
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}

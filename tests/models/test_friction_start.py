@@ -5,12 +5,13 @@ import pytest
 
 from pneuopt.codegen import Pieces, Rollout
 from pneuopt.errors import LogError
+from pneuopt.finders import Log, Start
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.friction_start import Rows, load_columns, misfit, motion
 from pneuopt.models.load import Load
 from pneuopt.parameters import ParameterSet
-from pneuopt.system import DiscreteSystem, Log, Start, discretise, names, vector
+from pneuopt.system import DiscreteSystem, discretise, names, vector
 from pneuopt.trajectories import Array, Trajectory
 
 TRUTH = {

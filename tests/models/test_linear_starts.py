@@ -3,10 +3,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pneuopt.errors import LogError
+from pneuopt.finders import Log
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder
 from pneuopt.simulate import simulate
-from pneuopt.system import Log, System, names
+from pneuopt.system import System, names
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import pneuopt as po
+from pneuopt.finders import Log
 from pneuopt.models.catalog import b32
 from pneuopt.models.chamber import Thermal
 from pneuopt.models.load import Load
-from pneuopt.system import Log
 
 ALL = ("valve_voltage", "position", "pressure_a", "pressure_b")
 

@@ -321,3 +321,49 @@ def test_explicit_substeps_are_kept_and_their_error_is_told() -> None:
     assert (coarse.solution.stats["substeps"], fine.solution.stats["substeps"]) == (1, 8)
     errors = [f.solution.stats["integration_error"] for f in (coarse, fine)]
     assert errors[0] == pytest.approx(4096 * errors[1], rel=0.2)  # of order four
+
+
+def held(problem: Transcription, name: str, value: float) -> Fit:
+    """A fit with a free parameter held by equal bounds."""
+    there = replace(problem.parameters[name], value=value, lower=value, upper=value, free=True)
+    return solve_least_squares(replace(problem, parameters=problem.parameters | ParameterSet({name: there})))
+
+
+def position(fit: Fit, name: str) -> int:
+    return list(fit.solution.parameters.free_names).index(name)
+
+
+def test_a_good_fit_is_silent_about_nothing() -> None:
+    fit = solve_least_squares(two_logs())
+    assert fit.solution.status.converged
+    assert fit.silent == ()
+    assert fit.borrowed is None
+
+
+def test_what_is_not_felt_is_silent_and_held_it_adds_nothing() -> None:
+    problem = two_logs(extra=True)
+    problem = replace(problem, parameters=problem.parameters.fixed("factor").freed("idle"))
+    assert solve_least_squares(problem).silent == ("idle",)
+    fit = held(problem, "idle", 1.0)
+    assert fit.solution.status.converged
+    assert fit.silent == ()
+    assert not fit.at_bound.any()
+    assert fit.borrowed is not None
+    assert_allclose(fit.borrowed, 0.0, atol=1e-20)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_of_two_that_only_count_together_one_is_silent_and_the_other_borrows_all(factor: float) -> None:
+    problem = two_logs(extra=True)
+    assert set(solve_least_squares(problem).silent) < {"damping", "factor"}
+    fit = held(problem, "factor", factor)
+    assert fit.solution.status.converged
+    assert fit.solution.parameters.value("damping") * factor == pytest.approx(TRUTH["damping"], rel=0.05)
+    assert fit.borrowed is not None
+    assert fit.covariance is not None
+    borrowed, own = np.diag(fit.borrowed), np.diag(fit.covariance)
+    at = position(fit, "damping")
+    # damping times factor is known: ten times the factor, as many times less damping
+    assert np.sqrt(borrowed[at]) == pytest.approx(10 * fit.solution.parameters.value("damping"), rel=1e-3)
+    others = [position(fit, n) for n in ("stiffness", "bias[a]", "bias[b]")]
+    assert (borrowed[others] < 1e-6 * own[others]).all()

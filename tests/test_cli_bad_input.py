@@ -1,0 +1,132 @@
+"""A user's mistakes at the command line: one message each, exit status 2, and no file written."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from pneuopt.cli import app
+
+
+def run(line: str) -> Result:
+    return CliRunner().invoke(app, line.split(), catch_exceptions=False)
+
+
+def rewrite(folder: Path, name: str, text: str) -> None:
+    (folder / name).write_text(text, encoding="utf-8")
+
+
+def edit(name: str, old: str, new: str, count: int = 1) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        text = (folder / name).read_text(encoding="utf-8")
+        assert old in text
+        rewrite(folder, name, text.replace(old, new, count))
+
+    return apply
+
+
+def cut(folder: Path) -> None:
+    rows = (folder / "run_01.csv").read_text(encoding="utf-8").splitlines()
+    rewrite(folder, "run_01.csv", "\n".join(rows[:8]) + "\n")
+
+
+IDENTIFY = "identify drive.toml run_01.csv -o fit.toml --json fit.json --plot fit.png"
+TUNE = "tune drive.toml tuning.toml -o tuned.toml --json tuned.json --plot tuned.png"
+SMOOTHING = 'smoothing = "5 mm/s"\n'
+PRESSURE = 'pressure_dependent = true\n[ambient]\npressure = "1 bar"\n'
+BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
+    "unit missing": (
+        IDENTIFY,
+        edit("drive.toml", '"40 N"', '"40"'),
+        "drive.toml:8: [friction] coulomb: '40' has no unit",
+    ),
+    "unit wrong": (
+        TUNE,
+        edit("tuning.toml", '"4000 N/m"', '"4000 N*s/m"'),
+        "tuning.toml: [pid] Ki: unit 'N*s/m' does not",
+    ),
+    "bare bar": (
+        IDENTIFY,
+        edit("drive.toml", SMOOTHING, SMOOTHING + PRESSURE),
+        "drive.toml:13: [ambient] pressure: a pressure level in 'bar' may be absolute or gauge; write \"bar(a)\" or",
+    ),
+    "unknown key": (
+        TUNE,
+        edit("tuning.toml", "horizon", "horison"),
+        "[[reference]] 1: unknown key 'horison'; did you mean 'horizon'?",
+    ),
+    "unknown channel": (
+        IDENTIFY,
+        edit("run_01.csv", "position [mm]", "positoin [mm]"),
+        "run_01.csv: column 'positoin [mm]' looks like the channel 'position'",
+    ),
+    "not a number": (
+        IDENTIFY,
+        edit("run_01.csv", "\n0.0020,", "\n0.0020,NaN"),
+        "run_01.csv: row 3, column 'force [N]': 'NaN",
+    ),
+    "time backwards": (IDENTIFY, edit("run_01.csv", "\n0.0080", "\n0.0030"), "run_01.csv: row 6: time runs backwards"),
+    "useless channel": (
+        IDENTIFY,
+        edit("run_01.csv", "position [mm]", "pressure_a [bar(a)]"),
+        "run_01: the model cannot use channel 'pressure_a', it reads force, position, speed",
+    ),
+    "start out of bounds": (
+        IDENTIFY,
+        edit("drive.toml", '"5 kg"', '"50 kg"'),
+        "drive.toml:5: [load] mass: value 50 kg lies outside its bounds [1, 20]; move the value or the bounds",
+    ),
+    "too short": (IDENTIFY, cut, "run_01.csv: 7 samples are too few; at least 10 are needed"),
+    "missing file": (
+        IDENTIFY.replace("run_01", "run_99"),
+        None,
+        "run_99.csv: cannot be read (No such file or directory)",
+    ),
+    "no match": (IDENTIFY.replace("run_01", "x*"), None, "x*.csv: no file matches"),
+    "output is input": (IDENTIFY.replace("fit.toml", "drive.toml"), None, "drive.toml: is an input of this command"),
+    "output is the sidecar": (IDENTIFY.replace("fit.toml", "run_01.toml"), None, "run_01.toml: is an input"),
+    "folder missing": (TUNE.replace("tuned.json", "out/tuned.json"), None, "out/tuned.json: the folder does not exist"),
+    "figure's format": (
+        TUNE.replace("tuned.png", "tuned.gif"),
+        None,
+        "tuned.gif: a figure is written as .png, .pdf, .svg",
+    ),
+    "nothing free": (
+        IDENTIFY,
+        edit("drive.toml", ", free = true", "", count=-1),
+        "drive.toml: no parameter is free; mark what to identify",
+    ),
+    "nothing to tune": (TUNE, edit("tuning.toml", ", free = true", ""), "tuning.toml: no gain is free"),
+    "nothing to minimise": (
+        TUNE,
+        edit("tuning.toml", '[minimise]\nsettling_time = { band = "5 %" }\n', ""),
+        "tuning.toml: says nothing to minimise",
+    ),
+    "window": (IDENTIFY + " --window 0.001", None, "windows of 0.001 s hold 0 samples of run_01"),
+    "what to simulate": ("simulate drive.toml -o x.csv", None, "give either a tuning file or --log"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gets_one_message_and_writes_nothing(folder: Path, case: str) -> None:
+    line, spoil, said = BAD[case]
+    if spoil is not None:
+        spoil(folder)
+    before = {p: p.read_bytes() for p in folder.iterdir()}
+    result = run(line)
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert result.stderr.startswith("error: ")
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stdout == ""
+    assert {p: p.read_bytes() for p in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "line", ["identfy", "identify drive.toml", "tune --jsn x", "identify drive.toml x.csv --window two"]
+)
+def test_wrong_usage_is_bad_input(line: str) -> None:
+    result = run(line)
+    assert result.exit_code == 2
+    assert "Error" in result.stderr
