@@ -54,13 +54,14 @@ from pneuopt.profiles import Profile, profile
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
 from pneuopt.reweighting import Huber, SoftL1
 from pneuopt.rig import Rig, record
-from pneuopt.scenarios import corners, draws, samples
+from pneuopt.scenarios import corners, draws, samples, tolerances
 from pneuopt.selection import ModelSelection, select_model
 from pneuopt.simulate import contacts, simulate, simulate_stick_slip
 from pneuopt.study import grid, sweep
 from pneuopt.system import DiscreteSystem, System, define, discretise
 from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult, tune
+from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuningfile import read_tuning, write_tuned
@@ -71,6 +72,7 @@ __all__ = [
     "Actuator",
     "Asymmetric",
     "ClosedLoop",
+    "Condensed",
     "ConvergenceError",
     "Coulomb",
     "Cylinder",
@@ -168,6 +170,7 @@ __all__ = [
     "split",
     "step_metrics",
     "sweep",
+    "tolerances",
     "tune",
     "validate",
     "with_sensors",

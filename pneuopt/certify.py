@@ -8,12 +8,14 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import margins
 from pneuopt.control.reference import Step
-from pneuopt.errors import ModelError, require
+from pneuopt.errors import ModelError
 from pneuopt.parameters import ParameterSet
 from pneuopt.rig import Rig, record
+from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.simulate import simulate
 from pneuopt.trajectories import Trajectory
 from pneuopt.tuning.candidates import cut, inputs, measure, spacing
+from pneuopt.tuning.cases import Case, cases
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,7 +24,12 @@ FINE = 4  # points of the record a sample of the search's
 
 
 def evaluate(
-    loop: ClosedLoop | Rig, references: Step | Sequence[Step], parameters: ParameterSet, *, band: float = 0.02
+    loop: ClosedLoop | Rig,
+    references: Step | Sequence[Step],
+    parameters: ParameterSet,
+    *,
+    scenarios: Scenarios = NOMINAL,
+    band: float = 0.02,
 ) -> "pd.DataFrame":
     """Certified metrics: by the tight independent simulation, at the given parameters.
 
@@ -35,17 +42,22 @@ def evaluate(
     references : Step or sequence of Step
         Each from rest, or from steady motion.
     parameters : ParameterSet
+    scenarios : mapping of str to mapping, optional
+        Further plants, or tolerances: of `corners`, `samples`, `draws`, `tolerances`.
     band : float
         Half width of the settling band around the reference, a fraction of the step.
 
     Returns
     -------
     DataFrame
-        A row a metric, a column a reference ("0 to 0.25"): those of `step_metrics`, then, not for a rig,
+        A row a metric, a column a reference ("0 to 0.25"), then one a reference and scenario
+        ("0 to 0.25 [load.mass high]"): those of `step_metrics`, then, not for a rig,
         MaxSensitivity, GainMargin and PhaseMargin [deg] about the state in which the response ends.
 
     Raises
     ------
+    InputError
+        If two references have one label, or a scenario names an unknown parameter.
     ConvergenceError
         If the simulation stops.
 
@@ -72,8 +84,9 @@ def evaluate(
     import pandas as pd
 
     steps = [references] if isinstance(references, Step) else list(references)
-    check_labels(steps)
-    return pd.DataFrame({r.label: _certified(loop, r, respond(loop, r, parameters), parameters, band) for r in steps})
+    full = _inner(loop).parameters | parameters
+    every = cases(steps, scenarios, full)
+    return pd.DataFrame({case.label: _certified(loop, case, full, band) for case in every})
 
 
 def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
@@ -90,9 +103,7 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     Trajectory
         Of a loop states and outputs, simulated tightly, on a grid finer than the search's; of a rig the truth.
     """
-    inner = loop.model if isinstance(loop, Rig) else loop
-    if not isinstance(inner, ClosedLoop):
-        raise ModelError("this rig is a plant alone, which follows no reference; give it a ClosedLoop")
+    inner = _inner(loop)
     run = inputs(inner, reference, spacing(inner, reference))
     start = inner.initial(parameters, reference=reference.initial, start=reference.start)
     if isinstance(loop, Rig):
@@ -101,19 +112,10 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     return simulate(inner, run, parameters, initial=start, t_out=fine)
 
 
-def check_labels(references: Sequence[Step]) -> None:
-    """Refuse references that tables could not tell apart."""
-    labels = [r.label for r in references]
-    twice = next((n for n in labels if labels.count(n) > 1), "")
-    require(not twice, f"two references are {twice!r}, and tables tell them by that; leave one out")
-
-
-def _certified(
-    loop: ClosedLoop | Rig, reference: Step, response: Trajectory, parameters: ParameterSet, band: float
-) -> dict[str, float]:
-    inner = loop.model if isinstance(loop, Rig) else loop
-    assert isinstance(inner, ClosedLoop)
-    metrics = measure(inner, parameters, reference, response, band)
+def _certified(loop: ClosedLoop | Rig, case: Case, parameters: ParameterSet, band: float) -> dict[str, float]:
+    inner, parameters = _inner(loop), case.filled(parameters)
+    response = respond(loop, case.reference, parameters)
+    metrics = measure(inner, parameters, case.reference, response, band)
     if isinstance(loop, Rig):
         return metrics
     x = np.array([response[q.name][-1] for q in inner.plant.states])
@@ -123,3 +125,10 @@ def _certified(
         "GainMargin": robust.gain_margin,
         "PhaseMargin": robust.phase_margin,
     }
+
+
+def _inner(loop: ClosedLoop | Rig) -> ClosedLoop:
+    inner = loop.model if isinstance(loop, Rig) else loop
+    if not isinstance(inner, ClosedLoop):
+        raise ModelError("this rig is a plant alone, which follows no reference; give it a ClosedLoop")
+    return inner

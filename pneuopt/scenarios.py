@@ -1,10 +1,14 @@
 """Scenarios: the plants that a design has to live with: corners, samples of a box, samples of a fit's covariance.
 
-Each is a mapping from a name to the values that differ, as `sweep` takes it.
+Each is a mapping from a name to the values that differ, as `sweep` and `tune` take it. `tolerances` spreads gains that
+are still to be found, by factors.
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +27,26 @@ Spreads = Mapping[str, Spread] | Mapping[Names, Spread]
 Cases = dict[str, dict[str, float]]
 MOST_CORNERS = 4096
 MOST_DRAWS = 1000  # for each sample that has to lie within the bounds
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A value relative to the one that a candidate has: a tolerance of what is still to be tuned.
+
+    Parameters
+    ----------
+    share : float
+        1.01: one per cent more.
+    """
+
+    share: float
+
+    def __post_init__(self) -> None:
+        require(0 < self.share < math.inf, f"Factor: share must be positive and finite, got {self.share}")
+
+
+Scenarios = Mapping[str, Mapping[str, float | Factor]]
+NOMINAL: Scenarios = MappingProxyType({})  # no scenario: the nominal plant alone
 
 
 def corners(parameters: ParameterSet, spreads: Spreads) -> Cases:
@@ -60,6 +84,51 @@ def corners(parameters: ParameterSet, spreads: Spreads) -> Cases:
         ", ".join(label for label, _ in corner): _joined(values for _, values in corner)
         for corner in itertools.product(*sides.values())
     }
+
+
+def tolerances(parameters: ParameterSet, shares: Mapping[str, float] | Mapping[Names, float]) -> Scenarios:
+    """Every combination of least and greatest factor on parameters that are tuned, or on any other.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+    shares : mapping of str, or tuple of str, to float
+        An axis each: parameters, or patterns, that move together, and by what fraction of a candidate's value.
+
+    Returns
+    -------
+    mapping of str to mapping of str to Factor
+
+    Raises
+    ------
+    InputError
+        As for `corners`; a share lies between 0 and 1.
+
+    Examples
+    --------
+    >>> from pneuopt.parameters import Parameter
+    >>> gains = ParameterSet({"pid.Kp": Parameter(2.0, "V*s/m", free=True), "pid.Ki": Parameter(5.0, "V/m")})
+    >>> tolerances(gains, {"pid.*": 0.01})["pid.* low"]
+    {'pid.Kp': Factor(share=0.99), 'pid.Ki': Factor(share=0.99)}
+    """
+    for axis, share in shares.items():
+        require(0 < share < 1, f"{axis}: a tolerance is a fraction between 0 and 1, got {share:g}; 0.01 is +-1 %")
+    units = ParameterSet({n: replace(p, value=1.0, lower=0.0, upper=2.0, log=False) for n, p in parameters.items()})
+    return {name: {n: Factor(v) for n, v in values.items()} for name, values in corners(units, shares).items()}
+
+
+def applied(parameters: ParameterSet, values: Mapping[str, float | Factor]) -> ParameterSet:
+    """The parameters of one scenario; a factor may leave the bounds, which are a candidate's own.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+    values : mapping of str to float or Factor
+    """
+    spread = {n: parameters.value(n) * v.share for n, v in values.items() if isinstance(v, Factor)}
+    room = {n: (min(parameters[n].lower, v), max(parameters[n].upper, v)) for n, v in spread.items()}
+    plain = {n: v for n, v in values.items() if not isinstance(v, Factor)}
+    return parameters.with_bounds(room).with_values(spread | plain)
 
 
 def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int = 0) -> Cases:

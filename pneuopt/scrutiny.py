@@ -29,6 +29,7 @@ OUTSIDE = 3.0  # standard deviations that another parameter moves along a profil
 BLOCK = 50  # samples over which residuals are compared
 SUBSTEPS = 20  # of a sample, at which gaps are shown
 NO_GAP = 1e-4  # of a nominal size
+WIDTH, NARROW, NARROWER = "friction.smoothing", 1e-4, 0.1  # [m/s], narrower takes ever finer steps
 AT_BOUND, NOT_TOLD = "at its bound", "not told"
 
 
@@ -156,7 +157,15 @@ def _located(problem: Problem, start: Start, status: Status, verdict: Verdict) -
     parts = [status.message, _worst_residual(problem, start), _worst_gap(problem, start)]
     if verdict.untold:
         parts.append(f"the logs do not tell {listed(verdict.untold)}: fix what is not told, or log a run that tells it")
+    parts.append(_narrower(problem))
     return Status(status.code, "; ".join(part for part in parts if part))
+
+
+def _narrower(problem: Problem) -> str:
+    """A remedy for logs that stick: smoothed friction creeps meanwhile, at a speed of its width's order."""
+    width = problem.parameters[WIDTH].value if WIDTH in problem.parameters else NARROW
+    told = f"if the logs stick, try {WIDTH} = {max(NARROW, NARROWER * width):g} m/s in place of {width:g} m/s"
+    return f"{told}: above it the model creeps where the drive stands still" if width > NARROW else ""
 
 
 def _worst_residual(problem: Problem, start: Start) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -25,6 +26,8 @@ from pneuopt.requirements import (
     SteadyStateError,
     specify,
 )
+from pneuopt.scenariofile import read_scenarios
+from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.system import System
 from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.units import read_value, write_value
@@ -38,7 +41,7 @@ T = TypeVar("T")
 RESULTS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
-_SECTIONS = ("loop", "sensor", "pid", "dither", "reference", "minimise", "limits")
+_SECTIONS = ("loop", "sensor", "pid", "dither", "reference", "minimise", "limits", "scenarios")
 _STRUCTURE: Mapping[str, tuple[str, ...]] = {
     "loop": ("measured", "actuated"),
     "pid": ("form", "sample_time", "limits"),
@@ -70,6 +73,8 @@ class Tuning:
     minimise : mapping of Requirement to float
         Weights; empty where the file only describes a loop.
     subject_to : tuple of Requirement
+    scenarios : callable
+        Of the nominal parameters: the plants and tolerances beside them.
     """
 
     loop: ClosedLoop
@@ -77,6 +82,7 @@ class Tuning:
     parameters: ParameterSet
     minimise: Mapping[Requirement, float]
     subject_to: tuple[Requirement, ...]
+    scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NOMINAL
 
 
 class Tuned(Protocol):
@@ -123,7 +129,7 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     """
     said = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in RESULTS}
     check_known("section", said, _SECTIONS, str(path))
-    for name in ("loop", "sensor", "pid", "dither", "minimise", "limits"):
+    for name in ("loop", "sensor", "pid", "dither", "minimise", "limits", "scenarios"):
         require(isinstance(said.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
     require("pid" in said, f"{path}: no controller; add a section [pid]")
     loop = _loop(said, plant, path)
@@ -131,7 +137,8 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     if minimise:
         _checked(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
     parameters = _parameters(said, loop, path)
-    return Tuning(loop, _references(said, loop, path), parameters, minimise, subject_to)
+    scenarios = partial(read_scenarios, said.get("scenarios", {}), str(path))
+    return Tuning(loop, _references(said, loop, path), parameters, minimise, subject_to, scenarios)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: Tuned) -> None:

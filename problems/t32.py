@@ -13,7 +13,7 @@ the speed as it is.
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import inf, pi
 from typing import TYPE_CHECKING, Any
@@ -67,6 +67,11 @@ class Counter:
     trace: list[tuple[int, float]] = field(default_factory=list)
     kept: list[tuple[Array, float, int, float, float]] = field(default_factory=list)
     begun: tuple[float, float] = field(default_factory=lambda: (time.perf_counter(), time.process_time()))
+
+    @property
+    def cases(self) -> Sequence[object]:
+        """As `Simulator.cases`."""
+        return self.simulator.cases
 
     def respond(self, points: Array, band: float) -> Responses:
         """As `Simulator.respond`; the merit that is kept is always that of the narrow band."""

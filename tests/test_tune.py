@@ -28,7 +28,7 @@ from pneuopt.requirements import (
 )
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import span
-from pneuopt.tuning.screening import Screening, _Judge, screen
+from pneuopt.tuning.screening import Judge, Screening, screen
 from pneuopt.tuning.simulator import Responses, Simulator
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
 
@@ -293,13 +293,12 @@ def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
     assert found.count == 12 * 4 * 4
     assert sum(judged) < 0.7 * found.count
 
-    def plainly(judge: _Judge, unit: np.ndarray, _: np.ndarray) -> np.ndarray:
-        return judge(unit)
+    def plainly(judge: Judge, unit: np.ndarray, _: np.ndarray, first: np.ndarray | None) -> tuple[np.ndarray, ...]:
+        return race(judge, unit, np.full(len(unit), np.inf), first)
 
     with pytest.MonkeyPatch.context() as patch:
-        race = _Judge.race
-        patch.setattr(_Judge, "__call__", lambda judge, unit: race(judge, unit, np.full(len(unit), np.inf)))
-        patch.setattr(_Judge, "race", plainly)
+        race = Judge.race
+        patch.setattr(Judge, "race", plainly)
         plain = screen(simulator, references, space, spec, method, space.start, lambda _: None)
     assert np.array_equal(found.point, plain.point)
 
@@ -324,9 +323,9 @@ def test_the_search_reads_what_the_certificate_reads() -> None:
     found = Simulator(loop, steps, space).respond(points, 0.02)
     for k, point in enumerate(points):
         proof = evaluate(loop, steps, space.filled(point))
-        for step, measured in zip(steps, found.references, strict=True):
+        for column, step in enumerate(steps):
             for name in ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl"):
-                ours, theirs = measured.metrics[name][k], proof[step.label][name]
+                ours, theirs = found.table(name)[k, column], proof[step.label][name]
                 assert ours == pytest.approx(theirs, rel=2e-2, abs=2e-3, nan_ok=True), (name, step)
 
 

@@ -150,7 +150,7 @@ def test_a_reference_may_start_elsewhere(tmp_path: Path) -> None:
     ("old", "new", "said"),
     [
         ("[pid]", "[pd]", ": unknown section 'pd'; did you mean 'pid'?"),
-        ("[minimise]", "[scenarios]", ": unknown section 'scenarios'"),
+        ("[minimise]", "[wishes]", ": unknown section 'wishes'"),
         ('"parallel"', '"paralel"', "[pid]: unknown form 'paralel'; did you mean 'parallel'?"),
         ("Tf = ", "Tff = ", "[pid]: unknown key 'Tff'; did you mean 'Tf'?"),
         ("Tf = ", "Td = ", "[pid] Td does not belong to the parallel form, which has Kp, Ki, Kd, Tf, b, c, Tt"),

@@ -53,6 +53,7 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
             parameters,
             minimise=asked.minimise,
             subject_to=asked.subject_to,
+            scenarios=asked.scenarios(parameters),
             throw=False,
             progress=tell,
         )
@@ -82,7 +83,8 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     """Simulate the closed loop of a tuning's file; returns the exit status."""
     outputs.check([fit, tuning], "bode")
     asked, parameters = read_loop(fit, tuning)
-    metrics = evaluate(asked.loop, asked.references, parameters, band=band_of(asked))
+    scenarios = asked.scenarios(parameters)
+    metrics = evaluate(asked.loop, asked.references, parameters, scenarios=scenarios, band=band_of(asked))
     show_metrics(screen(), metrics, asked.loop, limits=asked.subject_to)
     writers: Writers = {}
     if outputs.output is not None:
@@ -100,7 +102,9 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
 def _before(asked: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
     """The metrics with the gains as given; None where that loop cannot be simulated."""
     try:
-        return evaluate(asked.loop, asked.references, parameters, band=band_of(asked))
+        return evaluate(
+            asked.loop, asked.references, parameters, scenarios=asked.scenarios(parameters), band=band_of(asked)
+        )
     except (ConvergenceError, InputError):
         return None
 

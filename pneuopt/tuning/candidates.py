@@ -73,6 +73,13 @@ class Space:
         )
         return share
 
+    def rates(self, points: Array) -> Array:
+        """The derivative of `draw` at points, shape (..., n)."""
+        low, up = self.bounds.T
+        log = np.array([self.parameters[n].log for n in self.names], dtype=bool)
+        ratio = np.where(log, up, 1.0) / np.where(log, low, 1.0)
+        return np.asarray(np.where(log, points * np.log(ratio), up - low))
+
     def corners(self) -> Array:
         """Every corner of the box and the start, shape (2**n + 1, n)."""
         return np.array([*itertools.product(*self.bounds), self.start])
@@ -198,17 +205,17 @@ def spacing(loop: ClosedLoop, reference: Step) -> float:
     return float(whole / math.ceil(whole / longest - 1e-9))
 
 
-def fastest(loop: ClosedLoop, space: Space, states: Sequence[Array]) -> float:
-    """The largest eigenvalue's size [1/s] of the loop, over the box's corners and the given states."""
+def fastest(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> Array:
+    """The largest eigenvalue's size [1/s] of the loop over the given states, for each row of parameters, shape (m,)."""
     system = loop.system() if loop.pid.sample_time is None else loop.held()
-    x, p = ca.SX.sym("x", len(system.states)), ca.SX.sym("p", len(system.parameters))
-    rates = system.ode(0, x, np.zeros(len(system.inputs)), p)[0]
-    slope = ca.Function("slope", [x, p], [ca.densify(ca.jacobian(rates, x))])
-    corners = space.vectors(space.corners())
-    rows, n = len(states) * len(corners), x.numel()
-    found = slope.map(rows)(np.tile(np.array(states), (len(corners), 1)).T, np.repeat(corners, len(states), axis=0).T)
+    x, q = ca.SX.sym("x", len(system.states)), ca.SX.sym("p", len(system.parameters))
+    rates = system.ode(0, x, np.zeros(len(system.inputs)), q)[0]
+    slope = ca.Function("slope", [x, q], [ca.densify(ca.jacobian(rates, x))])
+    rows, n = len(states) * len(p), x.numel()
+    found = slope.map(rows)(np.tile(np.array(states), (len(p), 1)).T, np.repeat(p, len(states), axis=0).T)
     A = found.full().reshape(n, rows, n).transpose(1, 0, 2)
-    return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
+    sizes = np.abs(np.linalg.eigvals(A)).max(axis=1, initial=0.0)
+    return np.asarray(sizes.reshape(len(p), len(states)).max(axis=1))
 
 
 def substeps(rate: float, h: float) -> int:

@@ -16,7 +16,7 @@ from pneuopt.control.reference import Step
 from pneuopt.errors import require
 from pneuopt.requirements import MaxSensitivity, Specification, name
 from pneuopt.tuning.candidates import Space, Tell
-from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.simulator import Index, Mask, Responses, Simulator
 
 Array = NDArray[np.float64]
 PENALTY = 20.0  # weight of a limit's relative violation, in units of the objective's scale
@@ -100,7 +100,7 @@ def screen(
     tell : callable
         Hears of each generation.
     """
-    judge = _Judge(simulator, space, spec, min(r.horizon - r.at for r in references), space.unit(start))
+    judge = Judge(simulator, space, spec, min(r.horizon - r.at for r in references), space.unit(start))
     try:
         _search(judge, spec, method, tell)
     except KeyboardInterrupt:
@@ -108,21 +108,28 @@ def screen(
     return Screened(space.draw(judge.best), judge.count, is_complete=True)
 
 
-def _search(judge: "_Judge", spec: Specification, method: Screening, tell: Tell) -> None:
+def _search(judge: "Judge", spec: Specification, method: Screening, tell: Tell) -> None:
     rng = np.random.default_rng(method.seed)
-    population = _first_population(method.members, judge.best, rng)
+    population = first_population(method.members, judge.best, rng)
     for band in [*(b for b in method.bands if b > spec.band), spec.band, spec.band]:
         judge.ask(spec.with_band(band))
-        merits = judge(population)
+        merits, worst = judge.race(population, np.full(len(population), np.inf), None)
         for number in range(method.generations):
-            population, merits = _generation(population, merits, judge, rng)
+            population, merits, worst = generation(population, merits, worst, judge, rng)
             tell(f"band {band:.3g}, generation {number + 1} of {method.generations}: best {merits.min():.4g}")
     if method.refinements:
         _refine(judge.best, judge, method.refinements)
 
 
-class _Judge:
-    """Merit of points of the unit cube, one a row; counts them, and keeps the best under what was asked last."""
+class Judge:
+    """Merit of points of the unit cube, one a row; counts them, and keeps the best under what was asked last.
+
+    Attributes
+    ----------
+    best : ndarray, shape (n,)
+    count : int
+        Candidates simulated, on one case or more.
+    """
 
     def __init__(self, simulator: Simulator, space: Space, spec: Specification, scale: float, start: Array) -> None:
         self._simulator, self._space, self._spec, self._scale = simulator, space, spec, scale
@@ -133,28 +140,78 @@ class _Judge:
         self._spec, self._least = spec, np.inf
 
     def __call__(self, unit: Array) -> Array:
-        return self.race(unit, np.full(len(unit), np.inf))
+        """The merit of each point, on every case."""
+        return self.race(unit, np.full(len(unit), np.inf), None)[0]
 
-    def race(self, unit: Array, rivals: Array) -> Array:
+    def race(self, unit: Array, rivals: Array, first: Index | None) -> tuple[Array, Index]:
         """The merit of each point that may beat its rival, and of the others a lower bound that does not.
 
-        The sensitivity, a frequency response a point, costs as much as a simulation; as a limit it only adds.
+        Parameters
+        ----------
+        unit : ndarray, shape (m, n)
+        rivals : ndarray, shape (m,)
+        first : ndarray of int, shape (m,), or None
+            The case that each point faces first, its rival's worst: most losers need no other.
+
+        Returns
+        -------
+        merits : ndarray, shape (m,)
+        worst : ndarray of int, shape (m,)
+            Each point's worst case.
         """
         self.count += len(unit)
-        responses = self._simulator.respond(self._space.draw(np.clip(unit, 0.0, 1.0)), self._spec.band)
-        merits = np.full(len(unit), -np.inf)
-        if not self._spec.weight(MaxSensitivity):
-            merits = merit(responses.values, self._spec.without(MaxSensitivity), self._scale)
-        if self._spec.concerns(MaxSensitivity):
-            ahead = merits <= rivals
-            merits[ahead] = merit(responses.robust(ahead), self._spec, self._scale)
+        points, C = self._space.draw(np.clip(unit, 0.0, 1.0)), len(self._simulator.cases)
+        if first is None or C == 1:
+            merits, worst, _ = self._look(points, None, rivals, {})
+        else:
+            opening = np.arange(C) == first[:, None]
+            merits, worst, seen = self._look(points, opening, rivals, {})
+            on = merits <= rivals
+            if on.any():
+                seen = {n: value[on] for n, value in seen.items()}
+                merits[on], worst[on], _ = self._look(points[on], ~opening[on], rivals[on], seen)
         k = int(np.argmin(merits))
         if merits[k] < self._least:
             self.best, self._least = unit[k], float(merits[k])
-        return merits
+        return merits, worst
+
+    def _look(
+        self, points: Array, lanes: Mask | None, rivals: Array, seen: Mapping[str, Array]
+    ) -> tuple[Array, Index, dict[str, Array]]:
+        """Merits, worst cases and values over the cases of `lanes` and what was `seen` before.
+
+        The sensitivity, a frequency response each, costs as much as a simulation; as a limit it only adds.
+        """
+        given = () if lanes is None else (lanes,)
+        responses = self._simulator.respond(points, self._spec.band, *given)
+        plain = self._spec.without(MaxSensitivity)
+        values = _larger(responses.values, seen)
+        merits = np.full(len(points), -np.inf)
+        if not self._spec.weight(MaxSensitivity):
+            merits = merit(values, plain, self._scale)
+        if self._spec.concerns(MaxSensitivity):
+            ahead = merits <= rivals
+            peaks = np.full(len(points), -np.inf)
+            peaks[ahead] = responses.robust(ahead)["MaxSensitivity"]
+            values = _larger({**values, "MaxSensitivity": peaks}, seen)
+            merits[ahead] = merit({n: value[ahead] for n, value in values.items()}, self._spec, self._scale)
+        return merits, self._worst(responses, plain), values
+
+    def _worst(self, responses: Responses, plain: Specification) -> Index:
+        """The case with the largest merit, the sensitivity left out."""
+        if len(self._simulator.cases) == 1 or self._spec.weight(MaxSensitivity):
+            return np.zeros(len(responses.values["Excess"]), dtype=np.intp)
+        table = responses.spread(merit(responses.by_case(), plain, self._scale))
+        return np.asarray(np.argmax(table, axis=1))
 
 
-def _generation(population: Array, merits: Array, judge: _Judge, rng: np.random.Generator) -> tuple[Array, Array]:
+def _larger(values: Mapping[str, Array], seen: Mapping[str, Array]) -> dict[str, Array]:
+    return {n: np.maximum(value, seen[n]) if n in seen else value for n, value in values.items()}
+
+
+def generation(
+    population: Array, merits: Array, worst: Index, judge: Judge, rng: np.random.Generator
+) -> tuple[Array, Array, Index]:
     """One generation of differential evolution: half of the members search about themselves and the best."""
     m, n = population.shape
     a, b, c = (rng.permutation(m) for _ in range(3))
@@ -167,12 +224,13 @@ def _generation(population: Array, merits: Array, judge: _Judge, rng: np.random.
     kept = rng.random((m, n)) < 0.1
     kept[np.arange(m), rng.integers(n, size=m)] = False
     trial = np.where(kept, population, mutant)
-    found = judge.race(trial, merits)
+    found, cases = judge.race(trial, merits, worst)
     better = found <= merits
-    return np.where(better[:, None], trial, population), np.where(better, found, merits)
+    population = np.where(better[:, None], trial, population)
+    return population, np.where(better, found, merits), np.where(better, cases, worst)
 
 
-def _refine(best: Array, judge: _Judge, most: int) -> None:
+def _refine(best: Array, judge: Judge, most: int) -> None:
     """Nelder-Mead from a small simplex; the judge keeps the best."""
     steps = np.where(best < 0.5, 0.03, -0.03) * np.eye(len(best))
     options = {"maxfev": most, "initial_simplex": np.vstack([best, best + steps]), "xatol": 1e-5, "fatol": 1e-7}
@@ -205,7 +263,7 @@ def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Arr
     return np.minimum(total, LOST)
 
 
-def _first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
+def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
     """A Latin hypercube with the start in it."""
     cells = np.array([rng.permutation(members) for _ in start]).T
     found: Array = (cells + rng.random(cells.shape)) / members

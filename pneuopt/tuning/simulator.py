@@ -1,30 +1,37 @@
 """`Simulator`: how many candidates respond to the references, at once and compiled, and what is read off them."""
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Rollout
-from pneuopt.codegen import Run as Rolled
+from pneuopt.codegen import Pieces, Rollout
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import sensitivities
 from pneuopt.control.metrics import About, batch_metrics
 from pneuopt.control.reference import Step
 from pneuopt.requirements import MaxSensitivity, Specification, read
+from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.system import names
 from pneuopt.tuning.candidates import MOST_SUBSTEPS, Space, fastest, inputs, spacing, substeps
+from pneuopt.tuning.cases import Case, cases
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Index = NDArray[np.intp]
 RUNAWAY = 1e12
 READ = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "Ripple", "Excess")
-FEW = 4  # candidates: their references then share the lanes of a processor, the shorter ones padded
+FEW = 32  # lanes: different references then share the lanes of a processor, the shorter ones padded
+CHUNK = 128  # lanes that are run, and read, at a time: what a processor's cache holds
+STIFFEST = 8  # corners of the gains' box whose rates are looked at on the scenarios' plants too
+SIGNAL, CONTROL = 0, 1  # outputs that are run
 
 
 class Simulator:
-    """Compiled responses of many candidates to the references, and what the requirements read off them.
+    """Compiled responses of many candidates to the references, on every scenario's plant, and what is read off them.
 
     What is measured is the plant's true signal, whatever the controller sees of it.
 
@@ -33,21 +40,51 @@ class Simulator:
     loop : ClosedLoop
     references : sequence of Step
     space : Space
+    scenarios : mapping of str to mapping, optional
+        The plants beside the nominal one.
+
+    Attributes
+    ----------
+    cases : tuple of Case
     """
 
-    def __init__(self, loop: ClosedLoop, references: Sequence[Step], space: Space) -> None:
-        self._loop, self._references, self._space = loop, tuple(references), space
-        self._rest = [_rest(loop, space, r) for r in references]
-        self._rollout = Rollout(loop.discrete().pieces)
-        self._spacing = [spacing(loop, r) for r in references]
-        self._inputs = [inputs(loop, r, h) for r, h in zip(references, self._spacing, strict=True)]
-        rate = fastest(loop, space, [x for k in range(len(self._references)) for x in self._visited(k)])
-        self._substeps = [substeps(rate, h) for h in self._spacing]
+    def __init__(
+        self, loop: ClosedLoop, references: Sequence[Step], space: Space, scenarios: Scenarios = NOMINAL
+    ) -> None:
+        self.cases = cases(references, scenarios, space.parameters, space.names)
+        self.loop, self.space = loop, space
+        self._rest = [_rest(loop, space, case) for case in self.cases]
+        self._rollout = Rollout(watched(loop))
+        self.grids = _grids(loop, references)
+        self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
+        rate = self._fastest(references)
+        self.substeps = [substeps(rate, grid.spacing) for grid in self.grids]
         slowest = 1 / max(r.horizon for r in references)
         omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
         self._sensitivities = sensitivities(loop, omega)
 
-    def respond(self, points: Array, band: float) -> "Responses":
+    def only(self, chosen: Sequence[int]) -> "Simulator":
+        """The same with some of the cases, by copy."""
+        part = copy.copy(self)
+        part.cases, part._rest = tuple(self.cases[k] for k in chosen), [self._rest[k] for k in chosen]
+        part._grid_of = self._grid_of[list(chosen)]
+        return part
+
+    def by_grid(self) -> list[Mask]:
+        """The cases of each grid, a reference's."""
+        return [self._grid_of == g for g in range(len(self.grids))]
+
+    def averaged_over(self) -> list[float]:
+        """The time over which the dither is averaged, a case each [s]; 0: no dither, at any amplitude."""
+        order, dither = list(self.space.parameters), self.loop.dither
+        amplitude = self.space.parameters["dither.amplitude"] if dither else None
+        if dither is None or amplitude is None or not (amplitude.free or amplitude.value):
+            return [0.0] * len(self.cases)
+        given = self.space.vectors(self.space.start[None])
+        rates = [float(case.rows(given, order)[0, order.index("dither.frequency")]) for case in self.cases]
+        return [dither.period(rate, self.loop.pid.sample_time) for rate in rates]
+
+    def respond(self, points: Array, band: float, lanes: Mask | None = None) -> "Responses":
         """Simulate candidates.
 
         Parameters
@@ -55,14 +92,19 @@ class Simulator:
         points : ndarray, shape (m, n)
         band : float
             Half width of the settling band, a fraction of the step.
+        lanes : ndarray of bool, shape (m, n_cases), optional
+            Which cases of which candidate; by default all.
         """
-        p, found = self._space.vectors(points), dict[int, Rolled]()
-        for group in self._groups(len(points)):
-            found |= self._run(group, points, p)
-        return Responses(self, p, [self._measured(k, p, found[k], band) for k in range(len(self._references))])
+        wanted = np.ones((len(points), len(self.cases)), dtype=bool) if lanes is None else lanes
+        rows, case = np.nonzero(wanted)
+        p, starts = self.lanes(points, rows, case)
+        measured = Measured.empty(len(rows), len(self.loop.states))
+        for chunk in self._chunks(case):
+            self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
+        return Responses(self, wanted, p, measured)
 
     def values(self, points: Array, spec: Specification) -> dict[str, Array]:
-        """What the requirements read, the worst over the references, shape (m,) each.
+        """What the requirements read, the worst over the cases, shape (m,) each.
 
         Parameters
         ----------
@@ -75,104 +117,141 @@ class Simulator:
         return responses.robust(every) if spec.concerns(MaxSensitivity) else responses.values
 
     def table(self, point: Array, spec: Specification) -> list[dict[str, float]]:
-        """The metrics of one candidate, a row a reference."""
+        """The metrics of one candidate, a row a case."""
         responses = self.respond(point[None], spec.band)
-        peaks = responses.sensitivities(np.ones(1, dtype=bool))
-        return [
-            each(r.metrics | {"MaxSensitivity": peak})[0] for r, peak in zip(responses.references, peaks, strict=True)
-        ]
+        peaks = responses.sensitivities(np.ones(1, dtype=bool))[0]
+        return each({n: responses.table(n)[0] for n in READ} | {"MaxSensitivity": peaks})
 
     def sensitivities(self, p: Array, x_end: Array, commands: Array) -> Array:
         """Ms on a grid, about the states in which the responses end; an absent filter counts as in `cut`."""
-        p, filtered = p.copy(), list(self._loop.parameters).index("pid.Tf")
-        p[:, filtered] = np.where(p[:, filtered] == 0, 0.5 * (self._loop.pid.sample_time or 0.0), p[:, filtered])
-        return self._sensitivities(p, x_end[:, : len(self._loop.plant.states)], commands)
+        p, filtered = p.copy(), list(self.loop.parameters).index("pid.Tf")
+        p[:, filtered] = np.where(p[:, filtered] == 0, 0.5 * (self.loop.pid.sample_time or 0.0), p[:, filtered])
+        return self._sensitivities(p, x_end[:, : len(self.loop.plant.states)], commands)
 
-    def _groups(self, m: int) -> list[list[int]]:
-        """The references that run together: few candidates fill the lanes with all of them, many with those alike."""
-        alike: dict[tuple[int, int], list[int]] = {}
-        for k, (run, steps) in enumerate(zip(self._inputs, self._substeps, strict=True)):
-            alike.setdefault((0, 0) if m < FEW else (len(run), steps), []).append(k)
-        return list(alike.values())
+    def lanes(self, points: Array, rows: Index, case: Index) -> tuple[Array, Array]:
+        """Parameters and start states of lanes, each a candidate's row and a case."""
+        base, order = self.space.vectors(points)[rows], list(self.space.parameters)
+        p, starts = np.empty_like(base), np.empty((len(rows), len(self.loop.states)))
+        for k in np.unique(case).tolist():
+            own = case == k
+            p[own] = self.cases[k].rows(base[own], order)
+            starts[own] = self.starts(k, points[rows[own]])
+        return p, starts
 
-    def _run(self, group: Sequence[int], points: Array, p: Array) -> dict[int, Rolled]:
-        m, n = len(points), max(len(self._inputs[k]) for k in group)
-        padded = [np.minimum(np.arange(n), len(self._inputs[k]) - 1) for k in group]
-        steps = [np.where(np.arange(n) < len(self._inputs[k]), self._spacing[k], 0.0) for k in group]
-        us = [self._inputs[k].matrix(names(self._loop.inputs))[rows] for k, rows in zip(group, padded, strict=True)]
-        ts = [self._inputs[k].t[rows] for k, rows in zip(group, padded, strict=True)]
-        u, t, h = (np.repeat(np.array(each), m, axis=0) for each in (us, ts, steps))
-        starts, rows = np.concatenate([self._starts(k, points) for k in group]), np.tile(p, (len(group), 1))
-        with np.errstate(all="ignore"):
-            found = self._rollout.run(starts, u, rows, t, h, substeps=max(self._substeps[k] for k in group))
-        parts = zip(group, np.split(found.y, len(group)), np.split(found.x_end, len(group)), strict=True)
-        return {k: Rolled(y[:, : len(self._inputs[k])], x_end) for k, y, x_end in parts}
-
-    def _measured(self, k: int, p: Array, found: Rolled, band: float) -> "Measured":
-        """The figures of one reference; infinite where a response runs away."""
-        reference, t, outputs = self._references[k], self._inputs[k].t, names(self._loop.outputs)
-        with np.errstate(all="ignore"):
-            tame: Mask = np.all(np.abs(found.y) < RUNAWAY, axis=(1, 2))
-            sound: Mask = tame & np.isfinite(found.x_end).all(axis=1)
-        signal, control = (found.y[:, :, outputs.index(n)] for n in (self._loop.feedback.name, "control"))
-        metrics = {n: np.full(len(p), np.inf) for n in READ}
-        late = t >= 0.8 * reference.horizon + 0.2 * reference.at
-        for period, rows in self._periods(p, sound):
-            measured = batch_metrics(
-                t,
-                signal[rows],
-                reference.final,
-                reference.initial,
-                start=reference.at,
-                band=band,
-                about=About.REFERENCE,
-                dither_period=period,
-                control=control[rows],
-            )
-            error = np.abs(signal[rows][:, late] - reference.final).mean(axis=1)
-            measured["Excess"] = error / abs(reference.size)
-            for n in READ:
-                metrics[n][rows] = measured[n]
-        return Measured(metrics, sound, found.x_end, control[:, -1])
-
-    def _periods(self, p: Array, sound: Mask) -> list[tuple[float | None, Mask]]:
-        """Which of the sound candidates are averaged over which time."""
-        if self._loop.dither is None:
-            return [(None, sound)] if sound.any() else []
-        order = list(self._loop.parameters)
-        amplitude, frequency = (p[:, order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
-        rates = np.where(amplitude == 0, 0.0, frequency)
-        h = self._loop.pid.sample_time
-        return [
-            (self._loop.dither.period(rate, h) if rate else None, sound & (rates == rate))
-            for rate in np.unique(rates[sound]).tolist()
-        ]
-
-    def _starts(self, k: int, points: Array) -> Array:
-        rest, reference = self._rest[k], self._references[k]
+    def starts(self, case: int, points: Array) -> Array:
+        """Where the loop waits for the step, shape (m, n_states)."""
+        rest = self._rest[case]
         if rest is not None:
             return np.tile(rest, (len(points), 1))
-        return np.array([_initial(self._loop, self._space, point, reference) for point in points])
+        return np.array([self.cases[case].initial(self.loop, self.space.filled(point)) for point in points])
+
+    def starts_vary(self, case: int) -> bool:
+        """Whether the rest of a case depends on the gains."""
+        return self._rest[case] is None
+
+    def periods(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
+        """Which of the sound lanes are averaged over which time."""
+        rates = self._dither_rates(p)
+        for rate in np.unique(rates[sound]).tolist():
+            period = self.loop.dither.period(rate, self.loop.pid.sample_time) if rate and self.loop.dither else None
+            yield period, sound & (rates == rate)
+
+    def padded(self, case: Index) -> tuple[Array, Array, Array, int]:
+        """Inputs, instants and steps of lanes, shapes (m, n, n_inputs), (m, n), (m, n); substeps."""
+        own = self._grid_of[case]
+        n = max(len(self.grids[g].t) for g in np.unique(own))
+        full = {g: self.grids[g].padded(n) for g in np.unique(own).tolist()}
+        u, t, h = (np.array([full[g][k] for g in own.tolist()]) for k in range(3))
+        return u, t, h, max(self.substeps[g] for g in np.unique(own))
+
+    def _chunks(self, case: Index) -> Iterator[Index]:
+        """Lanes that run together: few of them all at once, many with those on the same grid."""
+        if len(case) <= FEW:
+            yield np.arange(len(case))
+            return
+        for g in range(len(self.grids)):
+            own = np.flatnonzero(self._grid_of[case] == g)
+            yield from np.split(own, np.arange(CHUNK, len(own), CHUNK))
+
+    def _measure(self, out: "Measured", chunk: Index, case: Index, starts: Array, p: Array, band: float) -> None:
+        if not len(chunk):
+            return
+        u, t, h, steps = self.padded(case)
+        with np.errstate(all="ignore"):
+            found = self._rollout.run(starts, u, p, t, h, substeps=steps)
+        out.x_end[chunk] = found.x_end
+        for g in np.unique(self._grid_of[case]).tolist():
+            own, grid = self._grid_of[case] == g, self.grids[g]
+            y = found.y[own, : len(grid.t)]
+            sound = is_sound(y, found.x_end[own])
+            out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL]
+            for period, rows in self.periods(p[own], sound):
+                for n, value in _metrics(grid, y[rows], band, period).items():
+                    out.metrics[n][chunk[own][rows]] = value
+
+    def _dither_rates(self, p: Array) -> Array:
+        if self.loop.dither is None:
+            return np.zeros(len(p))
+        order = list(self.loop.parameters)
+        amplitude, frequency = (p[:, order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
+        return np.where(amplitude == 0, 0.0, frequency)
+
+    def _fastest(self, references: Sequence[Step]) -> float:
+        """The fastest mode over the gains' box; on the scenarios' plants at the corners that are fastest nominally."""
+        states = [x for k in range(len(references)) for x in self._visited(k)]
+        corners, order = self.space.vectors(self.space.corners()), list(self.space.parameters)
+        rates = fastest(self.loop, corners, states)
+        worst = corners[np.argsort(rates)[-STIFFEST:]]
+        others = [case.rows(worst, order) for case in self.cases[len(references) :: len(references)]]
+        return float(max([rates.max(), *(fastest(self.loop, p, states).max() for p in others)]))
 
     def _visited(self, k: int) -> list[Array]:
         """Some states along the response of the given gains, and the rest."""
-        run, start = self._inputs[k], self._starts(k, self._space.start[None])
-        h, u = np.full((1, len(run)), self._spacing[k]), run.matrix(names(self._loop.inputs))[None]
-        p = self._space.vectors(self._space.start[None])
-        found = self._rollout.run(start, u, p, run.t[None], h, substeps=MOST_SUBSTEPS, states=True).x
+        grid, start, p = (
+            self.grids[k],
+            self.starts(k, self.space.start[None]),
+            self.space.vectors(self.space.start[None]),
+        )
+        u, t, h = (a[None] for a in grid.padded(len(grid.t)))
+        found = self._rollout.run(start, u, p, t, h, substeps=MOST_SUBSTEPS, states=True).x
         assert found is not None
-        along = found[0][:: max(1, len(run) // 10)]
+        along = found[0][:: max(1, len(grid.t) // 10)]
         return [start[0], *along[np.isfinite(along).all(axis=1)]]
 
 
 @dataclass(frozen=True, eq=False)
+class Grid:
+    """The samples of one reference.
+
+    Attributes
+    ----------
+    reference : Step
+    t : ndarray, shape (n,)
+    u : ndarray, shape (n, n_inputs)
+    spacing : float
+        [s]
+    """
+
+    reference: Step
+    t: Array
+    u: Array
+    spacing: float
+
+    def padded(self, n: int) -> tuple[Array, Array, Array]:
+        """Inputs, instants and steps, the last sample repeated with steps of 0 to n samples."""
+        k = np.minimum(np.arange(n), len(self.t) - 1)
+        return self.u[k], self.t[k], np.where(np.arange(n) < len(self.t), self.spacing, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
 class Measured:
-    """What one reference showed of m candidates.
+    """What m lanes showed.
 
     Attributes
     ----------
     metrics : dict of str to ndarray, shape (m,)
-        Of `step_metrics`, and "Excess", the mean error near the end, for what never settles.
+        Of `step_metrics`, and "Excess", the mean error near the end, for what never settles; infinite where the
+        response runs away.
     sound : ndarray of bool, shape (m,)
         False where the response runs away.
     x_end : ndarray, shape (m, n_states)
@@ -185,36 +264,57 @@ class Measured:
     x_end: Array
     command: Array
 
+    @staticmethod
+    def empty(m: int, n_states: int) -> "Measured":
+        """For m lanes, to be filled."""
+        return Measured(
+            {n: np.full(m, np.inf) for n in READ}, np.zeros(m, dtype=bool), np.empty((m, n_states)), np.empty(m)
+        )
+
 
 class Responses:
     """Simulated candidates; their sensitivities, a frequency response each, are computed only where asked for.
 
     Attributes
     ----------
-    references : sequence of Measured
     values : dict of str to ndarray, shape (m,)
-        What the requirements read but for the sensitivity, the worst over the references.
+        What the requirements read but for the sensitivity, the worst over the cases that were run.
     """
 
-    def __init__(self, simulator: Simulator, p: Array, references: Sequence[Measured]) -> None:
-        self._simulator, self._p, self.references = simulator, p, references
-        metrics = {n: np.max([r.metrics[n] for r in references], axis=0) for n in READ}
+    def __init__(self, simulator: Simulator, lanes: Mask, p: Array, measured: Measured) -> None:
+        self._simulator, self._lanes, self._p, self._measured = simulator, lanes, p, measured
+        metrics = {n: self.table(n).max(axis=1) for n in READ}
         self.values = {**read(metrics), "Excess": metrics["Excess"]}
+
+    def table(self, metric: str) -> Array:
+        """One metric, shape (m, n_cases); minus infinity where a case was not run."""
+        return self.spread(self._measured.metrics[metric])
+
+    def by_case(self) -> dict[str, Array]:
+        """The values of each case that was run, shape (n_lanes,), as `lanes` lists them row by row."""
+        metrics = self._measured.metrics
+        return {**read(metrics), "Excess": metrics["Excess"]}
 
     def robust(self, rows: Mask) -> dict[str, Array]:
         """The values of some candidates, with the sensitivity."""
         chosen = {n: value[rows] for n, value in self.values.items()}
-        return chosen | {"MaxSensitivity": np.max(self.sensitivities(rows), axis=0)}
+        return chosen | {"MaxSensitivity": np.max(self.sensitivities(rows), axis=1)}
 
     def sensitivities(self, rows: Mask) -> Array:
-        """Ms of some candidates, a row a reference; infinite where the response runs away."""
-        found = np.full((len(self.references), len(rows)), np.inf)
-        for peaks, measured in zip(found, self.references, strict=True):
-            wanted = rows & measured.sound
-            if wanted.any():
-                ends = measured.x_end[wanted], measured.command[wanted]
-                peaks[wanted] = self._simulator.sensitivities(self._p[wanted], *ends)
-        return found[:, rows]
+        """Ms of some candidates, a column a case; infinite where the response runs away."""
+        measured = self._measured
+        found = np.full(len(measured.sound), np.inf)
+        wanted = measured.sound & rows[np.nonzero(self._lanes)[0]]
+        if wanted.any():
+            ends = measured.x_end[wanted], measured.command[wanted]
+            found[wanted] = self._simulator.sensitivities(self._p[wanted], *ends)
+        return self.spread(found)[rows]
+
+    def spread(self, lanes: Array) -> Array:
+        """Numbers of the lanes as a table, shape (m, n_cases); minus infinity where a case was not run."""
+        table = np.full(self._lanes.shape, -np.inf)
+        table[self._lanes] = lanes
+        return table
 
 
 def each(values: Mapping[str, Array]) -> list[dict[str, float]]:
@@ -224,17 +324,61 @@ def each(values: Mapping[str, Array]) -> list[dict[str, float]]:
 
 
 def worst(found: Sequence[dict[str, float]]) -> dict[str, float]:
-    """The largest of each value over the references; NaN wins."""
+    """The largest of each value over the cases; NaN wins."""
     return {n: float(np.max([values[n] for values in found])) for n in found[0]}
 
 
-def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array | None:
+def is_sound(y: Array, x_end: Array) -> Mask:
+    """Which lanes did not run away."""
+    with np.errstate(all="ignore"):
+        tame = np.all(np.abs(y) < RUNAWAY, axis=(1, 2))
+    return np.asarray(tame & np.isfinite(x_end).all(axis=1))
+
+
+def watched(loop: ClosedLoop) -> Pieces:
+    """The loop's sampled step with no outputs but the measured signal and the command."""
+    whole, outputs = loop.discrete().pieces, names(loop.outputs)
+    kept = [outputs.index(loop.feedback.name), outputs.index("control")]
+
+    def reduced(function: ca.Function) -> ca.Function:
+        arguments = [ca.SX.sym(function.name_in(i), function.size1_in(i)) for i in range(function.n_in())]
+        first, y = function(*arguments)
+        labels = [function.name_in(i) for i in range(function.n_in())]
+        return ca.Function(function.name(), arguments, [first, y[kept]], labels, list(function.name_out()))
+
+    return Pieces(reduced(whole.step), whole.update, None if whole.ode is None else reduced(whole.ode))
+
+
+def _grids(loop: ClosedLoop, references: Sequence[Step]) -> list[Grid]:
+    found = []
+    for reference in references:
+        h = spacing(loop, reference)
+        run = inputs(loop, reference, h)
+        found.append(Grid(reference, run.t, run.matrix(names(loop.inputs)), h))
+    return found
+
+
+def _metrics(grid: Grid, y: Array, band: float, period: float | None) -> dict[str, Array]:
+    reference, signal = grid.reference, y[:, :, SIGNAL]
+    late = grid.t >= 0.8 * reference.horizon + 0.2 * reference.at
+    measured = batch_metrics(
+        grid.t,
+        signal,
+        reference.final,
+        reference.initial,
+        start=reference.at,
+        band=band,
+        about=About.REFERENCE,
+        dither_period=period,
+        control=y[:, :, CONTROL],
+    )
+    measured["Excess"] = np.abs(signal[:, late] - reference.final).mean(axis=1) / abs(reference.size)
+    return {n: measured[n] for n in READ}
+
+
+def _rest(loop: ClosedLoop, space: Space, case: Case) -> Array | None:
     """The loop's rest before the step where it does not depend on the gains."""
     other = space.draw(np.full(len(space.names), 0.7))
-    first, second = (_initial(loop, space, point, reference) for point in (space.start, other))
+    first, second = (case.initial(loop, space.filled(point)) for point in (space.start, other))
     scale = np.array([q.nominal for q in loop.states])
     return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
-
-
-def _initial(loop: ClosedLoop, space: Space, point: Array, reference: Step) -> Array:
-    return loop.initial(space.filled(point), reference=reference.initial, start=reference.start)

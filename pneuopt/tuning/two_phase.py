@@ -185,7 +185,8 @@ def _extended(
     )
     longest = max(max(extra[SETTLING].upper / method.nodes[0], r.horizon / method.nodes[1]) for r in references)
     own = Space(space.parameters.select(loop.parameters), space.names)
-    steps = substeps(fastest(loop, own, [np.zeros(len(loop.states))]), longest)
+    rates = fastest(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))])
+    steps = substeps(float(rates.max()), longest)
     return discretise(
         System(system.states, system.inputs, system.outputs, system.parameters | extra, ode), max(2, steps)
     )

@@ -1,0 +1,72 @@
+"""The [scenarios] of a tuning.toml: corners and samples of the plant, tolerances of the gains."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from pneuopt.errors import InputError, check_known, require
+from pneuopt.parameters import ParameterSet
+from pneuopt.scenarios import Scenarios, Spread, corners, samples, tolerances
+from pneuopt.units import read_value
+
+KINDS = ("corners", "samples", "tolerances")
+_DRAWN = (("count", 20), ("seed", 0))
+
+
+def read_scenarios(said: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
+    """The plants and tolerances of a section, joined.
+
+    Parameters
+    ----------
+    said : mapping
+        By kind: names or patterns to "30 %", or to ["3 kg", "7 kg"]; under samples also count, and seed.
+    where : str
+        The file.
+    parameters : ParameterSet
+        The nominal values.
+
+    Returns
+    -------
+    mapping of str to mapping
+
+    Raises
+    ------
+    InputError
+        The message names file, section and key.
+    """
+    check_known("kind", said, KINDS, f"{where}: [scenarios]")
+    found: dict[str, Any] = {}
+    for kind, given in said.items():
+        spot = f"{where}: [scenarios.{kind}]"
+        require(isinstance(given, dict), f'{spot} must be a section, with "load.mass" = "30 %" in it')
+        found |= _of(kind, given, spot, parameters)
+    return found
+
+
+def _of(kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
+    entries = dict(given)
+    count, seed = (entries.pop(key, default) if kind == "samples" else 0 for key, default in _DRAWN)
+    require(isinstance(count, int) and isinstance(seed, int), f"{where} count and seed are whole numbers")
+    try:
+        spreads = _spreads(entries, where, parameters)
+        if kind == "samples":
+            return samples(parameters, spreads, count, seed=seed)
+        if kind == "corners":
+            return corners(parameters, spreads)
+        pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
+        require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
+        return tolerances(parameters, {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)})
+    except InputError as error:
+        raise error if where in str(error) else InputError(f"{where} {error}") from None
+
+
+def _spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
+    found: dict[str, Spread] = {}
+    for pattern, given in entries.items():
+        if isinstance(given, list):
+            unit = parameters[parameters.matching(pattern)[0]].unit
+            require(len(given) == 2, f'{where} {pattern}: write a fraction, "30 %", or two values, the least first')
+            low, high = (read_value(end, unit, where=f"{where} {pattern}") for end in given)
+            found[pattern] = (low, high)
+        else:
+            found[pattern] = read_value(given, "1", where=f"{where} {pattern}")
+    return found

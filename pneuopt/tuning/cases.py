@@ -1,0 +1,114 @@
+"""Cases of a tuning: every reference on every plant that the design has to live with, the nominal one first."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Step
+from pneuopt.errors import ConvergenceError, InputError, check_known, require
+from pneuopt.parameters import ParameterSet
+from pneuopt.scenarios import Factor, Scenarios, applied
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One reference on one plant.
+
+    Parameters
+    ----------
+    reference : Step
+    scenario : str
+        Empty: the nominal plant.
+    values : mapping of str to float or Factor
+        What differs there.
+    """
+
+    reference: Step
+    scenario: str = ""
+    values: Mapping[str, float | Factor] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """How a table heads it: "0 to 0.2 [load.mass high]"."""
+        return f"{self.reference.label} [{self.scenario}]" if self.scenario else self.reference.label
+
+    def filled(self, parameters: ParameterSet) -> ParameterSet:
+        """The parameters of this case's plant, and gains."""
+        return applied(parameters, self.values)
+
+    def rows(self, p: Array, order: Sequence[str]) -> Array:
+        """The same on vectors of every parameter, shape (m, n_parameters), by copy."""
+        out = p.copy()
+        for n, value in self.values.items():
+            k = order.index(n)
+            out[:, k] = p[:, k] * value.share if isinstance(value, Factor) else value
+        return out
+
+    def slopes(self, names: Sequence[str]) -> Array:
+        """The derivative of this case's parameters to the candidate's, shape (n,): 0 where a value stands for it."""
+        values = (self.values.get(n, Factor(1.0)) for n in names)
+        return np.array([v.share if isinstance(v, Factor) else 0.0 for v in values])
+
+    def initial(self, loop: ClosedLoop, parameters: ParameterSet) -> Array:
+        """The state in which the loop waits for the step.
+
+        Raises
+        ------
+        InputError, ConvergenceError
+            As `ClosedLoop.initial`; the message names the scenario.
+        """
+        own, step = self.filled(parameters), self.reference
+        try:
+            return loop.initial(own, reference=step.initial, start=step.start)
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{self._lead}{error}", error.solution) from None
+        except InputError as error:
+            raise InputError(f"{self._lead}{error}") from None
+
+    @property
+    def _lead(self) -> str:
+        return f"scenario {self.scenario!r}: " if self.scenario else ""
+
+
+def cases(
+    references: Sequence[Step], scenarios: Scenarios, parameters: ParameterSet, tuned: Collection[str] = ()
+) -> tuple[Case, ...]:
+    """Every reference on the nominal plant, then on each scenario's.
+
+    Parameters
+    ----------
+    references : sequence of Step
+    scenarios : mapping of str to mapping
+    parameters : ParameterSet
+        Those that a scenario may change.
+    tuned : collection of str
+        Those of them that a scenario may change by a factor only.
+
+    Raises
+    ------
+    InputError
+        If two references have one label, or a scenario names an unknown parameter, or gives a tuned one a value.
+    """
+    labels = [r.label for r in references]
+    twice = next((n for n in labels if labels.count(n) > 1), "")
+    require(not twice, f"two references are {twice!r}, and tables tell them by that; leave one out")
+    for name, values in scenarios.items():
+        require(bool(name), "a scenario needs a name: {'heavy load': {'load.mass': 8.0}}")
+        _check(name, values, parameters, tuned)
+    nominal = [Case(r) for r in references]
+    return (*nominal, *(Case(r, name, values) for name, values in scenarios.items() for r in references))
+
+
+def _check(name: str, values: Mapping[str, float | Factor], parameters: ParameterSet, tuned: Collection[str]) -> None:
+    check_known("parameter", values, parameters, f"scenario {name!r}")
+    for n, value in values.items():
+        require(
+            isinstance(value, Factor) or n not in tuned,
+            f"scenario {name!r}: {n} is tuned, so no scenario can give it a value; for a tolerance around it write "
+            f"tolerances(parameters, {{{n!r}: 0.01}})",
+        )

@@ -1,0 +1,93 @@
+"""[scenarios] of a tuning.toml."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pneuopt.cli import app
+from pneuopt.errors import InputError
+from pneuopt.models.linear import SecondOrder
+from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.scenariofile import read_scenarios
+from pneuopt.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
+from pneuopt.tomlfile import read_toml
+from pneuopt.tuningfile import read_tuning
+
+RIG = ParameterSet({"load.mass": Parameter(5.0, "kg", 1.0, 20.0), "friction.coulomb": Parameter(40.0, "N")})
+RIG = RIG | ParameterSet({"pid.Kp": Parameter(2.0, "V*s/m", free=True)})
+
+
+def read(tmp_path: Path, text: str) -> Scenarios:
+    path = tmp_path / "tuning.toml"
+    path.write_text(text, encoding="utf-8")
+    return read_scenarios(read_toml(path).unwrap()["scenarios"], "tuning.toml", RIG)
+
+
+def test_corners_samples_and_tolerances_join(tmp_path: Path) -> None:
+    found = read(
+        tmp_path,
+        """
+[scenarios.corners]
+"load.mass" = "30 %"
+"friction.*" = ["30 N", "60 N"]
+[scenarios.samples]
+count = 3
+seed = 7
+"load.mass" = 0.1
+[scenarios.tolerances]
+"pid.*" = "1 %"
+""",
+    )
+    spreads: dict[str, Spread] = {"load.mass": 0.3, "friction.*": (30.0, 60.0)}
+    assert found == {
+        **corners(RIG, spreads),
+        **samples(RIG, {"load.mass": 0.1}, 3, seed=7),
+        **tolerances(RIG, {"pid.*": 0.01}),
+    }
+    assert found["pid.* high"] == {"pid.Kp": Factor(1.01)}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[scenarios.corner]\n"load.mass" = "30 %"', r"tuning\.toml: \[scenarios\].*corner"),
+        ('[scenarios]\ncorners = "30 %"', r"\[scenarios\.corners\] must be a section"),
+        ('[scenarios.corners]\n"load.mas" = "30 %"', r"\[scenarios\.corners\] .*load\.mas"),
+        ('[scenarios.corners]\n"load.mass" = ["3 kg"]', r"\[scenarios\.corners\] load\.mass: write a fraction"),
+        ('[scenarios.corners]\n"load.mass" = "3 kg"', r"\[scenarios\.corners\] load\.mass"),
+        ('[scenarios.tolerances]\n"pid.Kp" = ["1 V*s/m", "3 V*s/m"]', "a tolerance is a fraction"),
+        ('[scenarios.samples]\ncount = "many"\n"load.mass" = "30 %"', "count and seed are whole numbers"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_section(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, text)
+
+
+def test_a_tuning_gives_the_scenarios_of_a_fit(tmp_path: Path) -> None:
+    path = tmp_path / "tuning.toml"
+    lines = ['[pid]\nKp = "2 V*s/m"', '[[reference]]\nstep = "0.2 m/s"\nhorizon = "1 s"']
+    path.write_text("\n".join(lines), encoding="utf-8")
+    plant = SecondOrder().system()
+    assert dict(read_tuning(path, plant).scenarios(plant.parameters)) == {}
+    path.write_text("\n".join([*lines, '[scenarios.corners]\n"plant.gain" = "20 %"']), encoding="utf-8")
+    fitted = plant.parameters.with_values({"plant.gain": 3.0})
+    values = [case["plant.gain"] for case in read_tuning(path, plant).scenarios(fitted).values()]
+    assert values == pytest.approx([2.4, 3.6])
+
+
+def test_the_commands_certify_every_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    drive = '[drive]\nkind = "force"\n[load]\nmass = "5 kg"\n[friction]\nmodel = "viscous"\nviscous = "40 N*s/m"'
+    loop = '[pid]\nsample_time = "5 ms"\nKp = "300 N*s/m"\nKi = "5000 N/m"\n[[reference]]\nstep = "0.2 m/s"'
+    Path("drive.toml").write_text(drive, encoding="utf-8")
+    scenarios = '[scenarios.corners]\n"load.mass" = "30 %"'
+    Path("tuning.toml").write_text(f'{loop}\nhorizon = "0.3 s"\n{scenarios}', encoding="utf-8")
+    result = CliRunner().invoke(app, ["simulate", "drive.toml", "tuning.toml", "--json", "out.json"])
+    assert result.exit_code == 0, result.output
+    rows = json.loads(Path("out.json").read_text(encoding="utf-8"))["certified"]
+    assert len(rows) == 3
+    slow, fast = (rows[k]["RiseTime"] for k in (2, 1))
+    assert slow > 1.3 * fast

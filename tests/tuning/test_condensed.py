@@ -1,0 +1,211 @@
+"""Condensed multiple shooting: exact gradients, known optima, and every limit certified in every scenario."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck, Viscous
+from pneuopt.models.linear import Integrator
+from pneuopt.nlp.status import Code
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import (
+    MaxSensitivity,
+    Overshoot,
+    PeakControl,
+    Requirement,
+    SettlingTime,
+    SteadyStateError,
+    specify,
+)
+from pneuopt.scenarios import Scenarios, corners, tolerances
+from pneuopt.tune import TuningResult, tune
+from pneuopt.tuning.candidates import span
+from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.simulator import Simulator
+
+STEP = Step(1.0, horizon=2.0)
+QUICK = Condensed(members=8, generations=(3, 0, 0, 0), keep=(2, 2, 2, 1), iterations=(4, 4, 4, 12), polish=4)
+SPEC = specify(SettlingTime(), [Overshoot(0.1), SteadyStateError(0.05), PeakControl(200.0), MaxSensitivity(1.6)])
+
+
+def integrator(sample_time: float | None = None) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(Integrator().system(), PID(sample_time=sample_time, limits=False))
+    given = loop.parameters.with_values({"plant.gain": 1.0, "pid.Kp": 5.0})
+    return loop, given.with_bounds({"pid.Kp": (2.0, 20.0)}).freed("pid.Kp")
+
+
+def friction_loop(dither: Dither | None = None) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=1e-3), dither)
+    values = {"friction.coulomb": 40.0, "friction.static": 70.0, "friction.stribeck_velocity": 0.02}
+    values |= {"friction.viscous": 80.0, "pid.Kp": 200.0, "pid.Ki": 500.0, "pid.lower": -300.0, "pid.upper": 300.0}
+    bounds = {"pid.Kp": (10.0, 1000.0), "pid.Ki": (1.0, 10000.0), "pid.Kd": (0.0, 1.0)}
+    bounds |= {"dither.amplitude": (1.0, 50.0)} if dither else {}
+    values |= {"dither.amplitude": 5.0} if dither else {}
+    return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
+
+
+def problem(loop: ClosedLoop, given: ParameterSet, steps: list[Step], scenarios: Scenarios) -> Linearised:
+    simulator = Simulator(loop, steps, span(loop, given), scenarios)
+    return Linearised(simulator, differentiated(simulator), SPEC, 60, 1.0)
+
+
+@pytest.mark.parametrize("dither", [None, Dither(80.0)])
+def test_slopes_are_those_of_finite_differences(dither: Dither | None) -> None:
+    """From rest and from motion, where the rest itself moves with the gains; a plant and a tolerance beside."""
+    loop, given = friction_loop(dither)
+    scenarios = {"heavy": {"load.mass": 1.3 * given.value("load.mass")}, **tolerances(given, {"pid.Kp": 0.1})}
+    posed = problem(loop, given, [Step(0.1, horizon=0.3), Step(0.1, at=0.05, initial=0.05, horizon=0.3)], scenarios)
+    rng = np.random.default_rng(2)
+    n = len(posed.bounds) - 1
+    z = np.append(rng.uniform(0.3, 0.6, n), 0.2037)
+    (point,) = posed.evaluate(z[None])
+    for k in range(n + 1):
+        nudge = 1e-6 * (np.arange(n + 1) == k)
+        above, below = posed.evaluate(np.array([z + nudge, z - nudge]))
+        slopes = (above.values - below.values) / 2e-6
+        scale = np.abs(point.slopes[:, k]).max() + 1e-3
+        off = np.abs(slopes - point.slopes[:, k])
+        assert np.quantile(off, 0.99) < 2e-3 * scale, k
+        assert np.median(off) < 1e-5 * scale, k
+
+
+def test_the_best_settling_time_is_the_one_that_is_measured() -> None:
+    loop, given = friction_loop()
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], span(loop, given), corners(given, {"load.mass": 0.3}))
+    posed = Linearised(simulator, differentiated(simulator), specify(SettlingTime()), 1000, 1.0)
+    unit = np.array([[0.3, 0.95, 0.0], [0.6, 0.9, 0.0]])
+    measured = simulator.values(simulator.space.draw(unit), specify(SettlingTime()))["SettlingTime"]
+    found = [posed.improve(point) for point in posed.evaluate(posed.start(unit))]
+    assert np.isfinite(measured).all()
+    for point, expected in zip(found, measured, strict=True):
+        assert point.z[-1] * posed.horizon == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_slowest_plant_decides_the_gain() -> None:
+    loop, given = integrator()
+    best = tune(
+        loop,
+        STEP,
+        given,
+        minimise=PeakControl(),
+        subject_to=[SettlingTime(0.02, max=0.4)],
+        scenarios=corners(given, {"plant.gain": 0.2}),
+        method=QUICK,
+    )
+    assert best.parameters.value("pid.Kp") == pytest.approx(math.log(50) / 0.32, rel=0.015)
+    assert 0.39 <= best.certified["0 to 1 [plant.gain low]"]["SettlingTime"] <= 0.4
+
+
+@pytest.mark.parametrize("sample_time", [None, 1e-3])
+def test_a_tolerance_spreads_the_candidate(sample_time: float | None) -> None:
+    loop, given = integrator(sample_time)
+    best = tune(
+        loop,
+        STEP,
+        given,
+        minimise=SettlingTime(),
+        subject_to=[PeakControl(11.0)],
+        scenarios=tolerances(given, {"pid.Kp": 0.1}),
+        method=QUICK,
+    )
+    assert best.parameters.value("pid.Kp") == pytest.approx(10.0, rel=0.01)
+    assert best.certified["0 to 1 [pid.Kp high]"]["PeakControl"] <= 11.0
+    assert best.certified["0 to 1 [pid.Kp low]"]["SettlingTime"] == pytest.approx(math.log(50) / 9.0, rel=0.015)
+
+
+def on_corners(limits: list[Requirement], method: Condensed | None = None) -> TuningResult:
+    loop, given = friction_loop(Dither(80.0))
+    spreads: dict[str | tuple[str, ...], float] = {"load.mass": 0.3, ("friction.coulomb", "friction.static"): 0.2}
+    scenarios = corners(given, spreads)
+    return tune(
+        loop,
+        Step(0.1, horizon=0.4),
+        given,
+        minimise=SettlingTime(),
+        subject_to=limits,
+        scenarios=scenarios,
+        method=method,
+    )
+
+
+def test_limits_are_kept_in_every_corner() -> None:
+    best = on_corners([Overshoot(0.05), MaxSensitivity(1.5), SteadyStateError(0.02)], QUICK)
+    assert best.status.converged
+    assert best.certified.shape[1] == 5
+    assert bool((best.certified.loc["Overshoot"] <= 5.0).all())
+    assert bool((best.certified.loc["MaxSensitivity"] <= 1.5).all())
+    assert bool((best.certified.loc["SteadyStateError"] <= 2.0).all())
+    assert best.stats["deviation.SettlingTime"] < 2e-3
+
+
+def test_a_limit_holds_the_answer_back() -> None:
+    free = on_corners([Overshoot(0.05)], QUICK).certified
+    most = 0.85 * free.loc["PeakControl"].to_numpy(dtype=float).max()
+    held = on_corners([Overshoot(0.05), PeakControl(most)], QUICK)
+    assert held.certified.loc["PeakControl"].max() <= most
+    assert held.certified.loc["SettlingTime"].max() > 1.02 * free.loc["SettlingTime"].max()
+    assert "PeakControl" in held.active
+
+
+def test_what_has_no_gradient_is_refused() -> None:
+    loop, given = friction_loop(Dither(80.0))
+    free = given.with_bounds({"dither.frequency": (40.0, 100.0)}).freed("dither.frequency")
+    with pytest.raises(InputError, match=r"no gradient for dither\.frequency; use method=Screening"):
+        tune(loop, Step(0.1), free, minimise=SettlingTime(), method=QUICK)
+
+
+def test_bad_options_are_refused() -> None:
+    with pytest.raises(InputError, match="4 numbers, one a band"):
+        Condensed(keep=(3, 2))
+    with pytest.raises(InputError, match="nothing to start from"):
+        Condensed(generations=(0, 0, 0, 0))
+    with pytest.raises(InputError, match="working must be at least 1"):
+        Condensed(working=0)
+
+
+def test_ctrl_c_keeps_the_given_gains() -> None:
+    loop, given = friction_loop()
+
+    def stop(_: str) -> None:
+        raise KeyboardInterrupt
+
+    result = tune(loop, Step(0.1), given, minimise=SettlingTime(), method=QUICK, throw=False, progress=stop)
+    assert result.status.code is Code.INTERRUPTED
+    assert result.parameters.value("pid.Kp") == given.value("pid.Kp")
+
+
+def test_a_working_set_takes_in_the_case_that_it_missed() -> None:
+    """One case at a time; the answer is still that of the slowest of six."""
+    loop, given = integrator()
+    scenarios = {f"gain {k:g}": {"plant.gain": k} for k in (0.7, 0.9, 1.1, 1.2, 1.3)}
+    method = Condensed(members=8, generations=(2, 0, 0, 0), keep=(1,) * 4, iterations=(4,) * 4, working=2, polish=2)
+    best = tune(
+        loop,
+        STEP,
+        given,
+        minimise=PeakControl(),
+        subject_to=[SettlingTime(0.02, max=0.5)],
+        scenarios=scenarios,
+        method=method,
+    )
+    assert best.parameters.value("pid.Kp") == pytest.approx(math.log(50) / 0.35, rel=0.015)
+
+
+@pytest.mark.parametrize(("friction", "kind"), [(Viscous(), "TwoPhase"), (Stribeck(), "Screening")])
+def test_one_plant_and_few_gains_are_left_to_the_other_methods(friction: Viscous | Stribeck, kind: str) -> None:
+    from pneuopt.tune import _checked
+
+    loop = ClosedLoop(ForceDrive(friction).system(), PID())
+    given = loop.parameters.with_bounds({"pid.Kp": (1.0, 10.0)}).freed("pid.Kp")
+    space, spec = span(loop, given), specify(SettlingTime())
+    assert type(_checked(None, loop, {}, space, spec)).__name__ == kind
+    heavy: Scenarios = {"heavy": {"load.mass": 9.0}}
+    assert type(_checked(None, loop, heavy, space, spec)).__name__ == "Condensed"
