@@ -51,7 +51,24 @@ from pneuopt.plotting import (
     save_figure,
 )
 from pneuopt.profiles import Profile, profile
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.requirements import (
+    IAE,
+    ISE,
+    ITAE,
+    ControlRate,
+    GainMargin,
+    MaxComplementarySensitivity,
+    MaxSensitivity,
+    NoiseGain,
+    Overshoot,
+    PeakControl,
+    PhaseMargin,
+    Ripple,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    StepEnvelope,
+)
 from pneuopt.reweighting import Huber, SoftL1
 from pneuopt.rig import Rig, record
 from pneuopt.scenarios import corners, draws, samples, tolerances
@@ -68,11 +85,15 @@ from pneuopt.tuningfile import read_tuning, write_tuned
 
 __version__: str
 __all__ = [
+    "IAE",
+    "ISE",
+    "ITAE",
     "PID",
     "Actuator",
     "Asymmetric",
     "ClosedLoop",
     "Condensed",
+    "ControlRate",
     "ConvergenceError",
     "Coulomb",
     "Cylinder",
@@ -84,6 +105,7 @@ __all__ = [
     "FirstOrder",
     "ForceDrive",
     "FullSpace",
+    "GainMargin",
     "Huber",
     "IdentificationResult",
     "InputError",
@@ -95,13 +117,16 @@ __all__ = [
     "Load",
     "LogComparison",
     "LuGre",
+    "MaxComplementarySensitivity",
     "MaxSensitivity",
     "ModelSelection",
     "MotionDrive",
+    "NoiseGain",
     "Overshoot",
     "Parameter",
     "ParameterSet",
     "PeakControl",
+    "PhaseMargin",
     "PhysicsWarning",
     "PneumaticDrive",
     "PneuoptError",
@@ -111,6 +136,8 @@ __all__ = [
     "ProportionalValve",
     "Quantity",
     "Rig",
+    "Ripple",
+    "RiseTime",
     "Screening",
     "SecondOrder",
     "Sensor",
@@ -120,6 +147,7 @@ __all__ = [
     "Spool",
     "SteadyStateError",
     "Step",
+    "StepEnvelope",
     "Stribeck",
     "System",
     "Thermal",

@@ -15,8 +15,9 @@ from pneuopt.errors import ConvergenceError, PhysicsWarning
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.provenance import provenance
-from pneuopt.requirements import Specification, name, read
+from pneuopt.requirements import name, read, told
 from pneuopt.scenarios import Scenarios
+from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.simulator import Simulator, worst
 
@@ -39,7 +40,8 @@ class TuningResult:
     claimed, certified : DataFrame
         A row a metric, a column a reference, then one a reference and scenario: SettlingTime [s], Overshoot and
         SteadyStateError [% of the step], PeakControl [the command's unit], MaxSensitivity, with dither Ripple [the
-        measured signal's unit]; by the search's own simulation, and by the independent one.
+        measured signal's unit], and what else was asked for, as `evaluate` has it; by the search's own simulation, and
+        by the independent one.
     active : tuple of str
         Requirements and bounds that hold the objective back.
     status : Status
@@ -102,7 +104,8 @@ class Notary:
         import pandas as pd
 
         parameters = self.space.filled(point)
-        shown = [*SHOWN, "Ripple"] if self.loop.dither_period(parameters) else list(SHOWN)
+        ripple = ("Ripple",) if self.loop.dither_period(parameters) else ()
+        shown = list(dict.fromkeys((*SHOWN, *ripple, *self.spec.kinds)))
         rows = zip(simulator.cases, simulator.table(point, self.spec), strict=True)
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:
@@ -130,7 +133,14 @@ class Notary:
         """The certificate, and what the responses ran into."""
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", PhysicsWarning)
-            certified = evaluate(self.loop, self.references, parameters, scenarios=self.scenarios, band=self.spec.band)
+            certified = evaluate(
+                self.loop,
+                self.references,
+                parameters,
+                scenarios=self.scenarios,
+                band=self.spec.band,
+                envelope=self.spec.envelope,
+            )
         return certified, [str(w.message) for w in told if issubclass(w.category, PhysicsWarning)]
 
     def _verdict(self, found: Found, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
@@ -139,10 +149,10 @@ class Notary:
             return found.status
         claim, proof = (worst([read(dict(f[r])) for r in f]) for f in (claimed, certified))
         for q in self.spec.violated(proof):
-            n, limit = name(q), q.max or 0.0
+            n, (value, allowed) = name(q), told(q, proof[name(q)])
             return Status(
                 Code.NOT_CERTIFIED,
-                f"{n} is {proof[n]:.6g}{self._where(certified, n)}, allowed {limit:.6g}, claimed {claim[n]:.6g}; "
+                f"{n} is {value}{self._where(certified, n)}, {allowed}, claimed {told(q, claim[n])[0]}; "
                 f"give {n} more room",
             )
         ours, theirs = self.spec.objective(proof), min(self.spec.objective(claim), found.stats["optimum"])
@@ -161,8 +171,8 @@ class Notary:
         return Status(Code.CONVERGED, message)
 
     def _where(self, certified: "pd.DataFrame", metric: str) -> str:
-        """The case with the largest value, where there are several."""
-        values = certified.loc[metric].to_numpy(dtype=float)
+        """The worst case, where there are several."""
+        values = read({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
         k = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
         return f" at {certified.columns[k]}" if len(values) > 1 else ""
 

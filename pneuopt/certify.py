@@ -1,20 +1,23 @@
 """`evaluate`: what a loop's gains are worth, by a simulation that shares nothing with the search; or on a rig."""
 
 from collections.abc import Sequence
+from math import inf, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import margins
+from pneuopt.control.margins import margins, noise_gain
+from pneuopt.control.metrics import Envelope
 from pneuopt.control.reference import Step
 from pneuopt.errors import ModelError
 from pneuopt.parameters import ParameterSet
 from pneuopt.rig import Rig, record
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.simulate import simulate
+from pneuopt.system import Array
 from pneuopt.trajectories import Trajectory
-from pneuopt.tuning.candidates import cut, inputs, measure, spacing
+from pneuopt.tuning.candidates import cut, filtered, inputs, measure, spacing
 from pneuopt.tuning.cases import Case, cases
 
 if TYPE_CHECKING:
@@ -30,6 +33,7 @@ def evaluate(
     *,
     scenarios: Scenarios = NOMINAL,
     band: float = 0.02,
+    envelope: Envelope = (),
 ) -> "pd.DataFrame":
     """Certified metrics: by the tight independent simulation, at the given parameters.
 
@@ -46,13 +50,17 @@ def evaluate(
         Further plants, or tolerances: of `corners`, `samples`, `draws`, `tolerances`.
     band : float
         Half width of the settling band around the reference, a fraction of the step.
+    envelope : sequence of (float, float, float)
+        The bounds of a `StepEnvelope`.
 
     Returns
     -------
     DataFrame
         A row a metric, a column a reference ("0 to 0.25"), then one a reference and scenario
         ("0 to 0.25 [load.mass high]"): those of `step_metrics`, then, not for a rig,
-        MaxSensitivity, GainMargin and PhaseMargin [deg] about the state in which the response ends.
+        MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin [deg] and NoiseGain [command's
+        unit/measured unit] of the loop linearised about the state in which the response ends, with the slope that
+        friction has at that speed; infinite, and the margins NaN, where that loop is unstable.
 
     Raises
     ------
@@ -86,7 +94,7 @@ def evaluate(
     steps = [references] if isinstance(references, Step) else list(references)
     full = _inner(loop).parameters | parameters
     every = cases(steps, scenarios, full)
-    return pd.DataFrame({case.label: _certified(loop, case, full, band) for case in every})
+    return pd.DataFrame({case.label: _certified(loop, case, full, band, envelope) for case in every})
 
 
 def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
@@ -112,19 +120,30 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     return simulate(inner, run, parameters, initial=start, t_out=fine)
 
 
-def _certified(loop: ClosedLoop | Rig, case: Case, parameters: ParameterSet, band: float) -> dict[str, float]:
+def _certified(
+    loop: ClosedLoop | Rig, case: Case, parameters: ParameterSet, band: float, envelope: Envelope
+) -> dict[str, float]:
     inner, parameters = _inner(loop), case.filled(parameters)
     response = respond(loop, case.reference, parameters)
-    metrics = measure(inner, parameters, case.reference, response, band)
+    metrics = measure(inner, parameters, case.reference, response, band, envelope)
     if isinstance(loop, Rig):
         return metrics
     x = np.array([response[q.name][-1] for q in inner.plant.states])
-    robust = margins(cut(inner, parameters, x, float(response["control"][-1])))
-    return metrics | {
-        "MaxSensitivity": robust.max_sensitivity if robust.stable else np.inf,
+    return metrics | _margins(inner, parameters, x, float(response["control"][-1]))
+
+
+def _margins(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> dict[str, float]:
+    open_loop = cut(loop, parameters, x, command)
+    robust, gains = margins(open_loop), filtered(loop, parameters)
+    Kp, Ki, Kd, Tf = (gains.value(f"pid.{n}") for n in ("Kp", "Ki", "Kd", "Tf"))
+    found = {
+        "MaxSensitivity": robust.max_sensitivity,
+        "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
         "GainMargin": robust.gain_margin,
         "PhaseMargin": robust.phase_margin,
+        "NoiseGain": noise_gain(open_loop, (Kp, Ki, Kd, Tf)),
     }
+    return found if robust.stable else {n: nan if n.endswith("Margin") else inf for n in found}
 
 
 def _inner(loop: ClosedLoop | Rig) -> ClosedLoop:

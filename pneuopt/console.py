@@ -19,7 +19,7 @@ from pneuopt.identifiability import Verdict
 from pneuopt.nlp.least_squares import Progress as Tell
 from pneuopt.nlp.status import Status
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import PERCENT, Requirement, name
+from pneuopt.requirements import AT_LEAST, PERCENT, Requirement, name
 from pneuopt.scrutiny import NOT_TOLD
 from pneuopt.selection import ModelSelection
 from pneuopt.study import INTERRUPTED
@@ -177,16 +177,14 @@ def show_metrics(
         The same with the gains before.
     limits : sequence of Requirement
     """
-    units, allowed = metric_units(loop), {name(q): q.max for q in limits}
+    units, allowed = metric_units(loop), {name(q): _allowed(q) for q in limits}
     several = len(metrics.columns) > MOST_REFERENCES
     columns = [f"worst of {len(metrics.columns)}"] if several else [f"{c} {loop.feedback.unit}" for c in metrics]
     table = _table(title, *columns, *(["limit"] if allowed else []), "unit")
     for metric in (m for m in units if m in metrics.index and (m != "Ripple" or loop.dither)):
         now, was = (_row(frame, metric, several) for frame in (metrics, before))
         cells = [_metric(metric, v) + (f" (was {_metric(metric, was[k])})" if was else "") for k, v in enumerate(now)]
-        most = allowed.get(metric)
-        factor = 100 if metric in PERCENT else 1
-        limit = [f"<= {_figure(factor * most, 4)}" if most is not None else ""] if allowed else []
+        limit = [allowed.get(metric, "")] if allowed else []
         table.add_row(metric, *cells, *limit, units[metric])
     console.print(table)
 
@@ -226,11 +224,18 @@ def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
         "RiseTime": "s",
         "Overshoot": "%",
         "SteadyStateError": "%",
+        "StepEnvelope": "",
+        "IAE": "s",
+        "ISE": "s",
+        "ITAE": "s^2",
         "PeakControl": loop.command.unit,
+        "ControlRate": f"{loop.command.unit}/s",
         "Ripple": loop.feedback.unit,
         "MaxSensitivity": "",
+        "MaxComplementarySensitivity": "",
         "GainMargin": "",
         "PhaseMargin": "deg",
+        "NoiseGain": f"{loop.command.unit}/({loop.feedback.unit})",
     }
 
 
@@ -294,8 +299,16 @@ def _table(*columns: str) -> Table:
             "in log",
             "",
         )
-        table.add_column(column, justify="left" if text else "right", overflow="fold")
+        whole = column in ("certified", "rejected", "best so far")
+        table.add_column(column, justify="left" if text else "right", overflow="fold", no_wrap=whole)
     return table
+
+
+def _allowed(requirement: Requirement) -> str:
+    if isinstance(requirement, AT_LEAST):
+        return "" if requirement.min is None else f">= {_figure(requirement.min, 4)}"
+    factor = 100 if name(requirement) in PERCENT else 1
+    return "" if requirement.max is None else f"<= {_figure(factor * requirement.max, 4)}"
 
 
 def _metric(metric: str, value: float) -> str:

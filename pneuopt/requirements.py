@@ -1,12 +1,15 @@
-"""What a tuned loop shall do, as types: each is an objective, a weighted term of one, or with `max` a limit.
+"""What a tuned loop shall do, as types: each is an objective, a weighted term of one, or with a bound a limit.
 
-Values are fractions of the step's size, seconds, or the command's unit: `Overshoot(max=0.05)` is 5 %.
+Values are fractions of the step's size, seconds, or the command's unit: `Overshoot(max=0.05)` is 5 %. Margins and the
+like are those of the loop linearised about the state in which the response ends, the moving reference: friction counts
+with its slope at that speed. A gain or phase margin has a `min`; as a term its reciprocal is minimised.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
 from math import inf
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +18,7 @@ from pneuopt.errors import require
 
 Value = TypeVar("Value", float, NDArray[np.float64])
 PERCENT = ("Overshoot", "SteadyStateError")
+Bounds = tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,132 @@ class SteadyStateError:
 
 
 @dataclass(frozen=True)
+class RiseTime:
+    """Time from 10 to 90 % of the change to the final value [s].
+
+    Parameters
+    ----------
+    max : float, optional
+        [s]
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """Peak to peak of the signal, not averaged, over the last dither periods or 5 % of the record [measured unit].
+
+    Parameters
+    ----------
+    max : float, optional
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
+class IAE:
+    """Integral of the error's size from the step to the end of the horizon, over the step's size [s].
+
+    Parameters
+    ----------
+    max : float, optional
+        [s]
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
+class ISE:
+    """Integral of the squared error likewise, over the square of the step's size [s].
+
+    Parameters
+    ----------
+    max : float, optional
+        [s]
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
+class ITAE:
+    """Integral of the error's size times the time since the step, over the step's size [s^2].
+
+    Parameters
+    ----------
+    max : float, optional
+        [s^2]
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
+class StepEnvelope:
+    """The response between bounds that vary over time: distance from their middle over their half width, the largest.
+
+    Parameters
+    ----------
+    bounds : tuple of (float, float, float)
+        Instants after the step [s], in order, each with the lower and upper bound that hold from then to the next, as
+        fractions of the step: 0 is where it begins, 1 the reference.
+    max : float or None
+        1: the bounds are kept; None: a term only.
+
+    Examples
+    --------
+    >>> tube = StepEnvelope(((0.0, -0.1, 1.1), (0.5, 0.95, 1.05)))
+    """
+
+    bounds: Bounds
+    max: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        times = [t for t, _, _ in self.bounds]
+        ordered = len(times) > 0 and times[0] >= 0 and all(a < b for a, b in pairwise(times))
+        require(ordered, f"StepEnvelope: times count from the step and increase, got {times}")
+        for t, lower, upper in self.bounds:
+            proper = -inf < lower < upper < inf
+            require(proper, f"StepEnvelope: at {t:g} s the bounds must be finite and in order, got {lower}, {upper}")
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
 class PeakControl:
     """Largest absolute command, dither included [the command's unit].
+
+    Parameters
+    ----------
+    max : float, optional
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
+class ControlRate:
+    """Largest change of the command over time, dither included, the jump at the step left out [its unit/s].
 
     Parameters
     ----------
@@ -99,105 +227,107 @@ class MaxSensitivity:
         _check_limit(self, 1.0)
 
 
-Requirement = SettlingTime | Overshoot | SteadyStateError | PeakControl | MaxSensitivity
-
-
-@dataclass(frozen=True, eq=False)
-class Specification:
-    """An objective and its limits, checked.
-
-    Attributes
-    ----------
-    weights : mapping of Requirement to float
-        The terms of the objective.
-    limits : tuple of Requirement
-        Each with its `max`; at most one of a kind, the tightest.
-    band : float
-        The settling band, the same wherever one is named; 2 % otherwise.
-    """
-
-    weights: Mapping[Requirement, float]
-    limits: tuple[Requirement, ...]
-    band: float
-
-    def limit(self, kind: type) -> float:
-        """The largest value allowed for this kind of requirement; inf where there is none."""
-        return next((q.max for q in self.limits if isinstance(q, kind) and q.max is not None), inf)
-
-    def weight(self, kind: type) -> float:
-        """The weight of this kind of requirement in the objective; 0 where it is no term."""
-        return next((w for q, w in self.weights.items() if isinstance(q, kind)), 0.0)
-
-    def concerns(self, kind: type) -> bool:
-        """Whether this kind of requirement is a term or a limit."""
-        return self.weight(kind) > 0 or self.limit(kind) < inf
-
-    def tightened(self, margin: float, peaks: float) -> "Specification":
-        """Bands and fractions smaller by `margin`, a share; peak control and sensitivity by the share `peaks`.
-
-        An optimum lies on its limits: found on tightened ones, it keeps those asked for when simulated and printed.
-        """
-        room = {"SettlingTime": 0.0, "PeakControl": peaks, "MaxSensitivity": peaks}
-        limits = tuple(replace(q, max=(q.max or 0.0) * (1 - room.get(name(q), margin))) for q in self.limits)
-        return replace(self, limits=limits, band=self.band * (1 - margin))
-
-    def without(self, kind: type) -> "Specification":
-        """The same without the limit of this kind, by copy."""
-        return replace(self, limits=tuple(q for q in self.limits if not isinstance(q, kind)))
-
-    def with_band(self, band: float) -> "Specification":
-        """Another settling band, by copy."""
-        return replace(self, band=band)
-
-    def objective(self, values: Mapping[str, float]) -> float:
-        """The weighted sum, of values by kind as `read` gives them."""
-        return sum(weight * values[name(q)] for q, weight in self.weights.items())
-
-    def violated(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
-        """The limits that `values` do not keep, NaN among them; `slack` is relative."""
-        return tuple(q for q in self.limits if not values[name(q)] <= (q.max or 0.0) * (1 + slack))
-
-
-def specify(
-    minimise: Requirement | Mapping[Requirement, float], subject_to: Sequence[Requirement] = ()
-) -> Specification:
-    """Check an objective and its limits.
+@dataclass(frozen=True)
+class MaxComplementarySensitivity:
+    """``Mt = max |L(jw)/(1 + L(jw))|``, the closed loop's resonance peak.
 
     Parameters
     ----------
-    minimise : Requirement, or mapping of Requirement to weight
-        A term with a `max` is a limit as well.
-    subject_to : sequence of Requirement
+    max : float, optional
+    """
 
-    Raises
-    ------
-    InputError
-        If a limit has no `max`, a weight is not positive, a kind is weighted twice, or the bands differ.
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
+class GainMargin:
+    """Factor on the loop's gain, up or down, that makes it oscillate; at least 2 is usual.
+
+    Parameters
+    ----------
+    min : float, optional
+    """
+
+    min: float | None = None
+
+    def __post_init__(self) -> None:
+        least = self.min
+        require(least is None or 1 < least < inf, f"GainMargin: min is a factor above 1, got {least}; 2 is usual")
+
+
+@dataclass(frozen=True)
+class PhaseMargin:
+    """Phase by which the loop at gain one stays clear of -180 deg [deg].
+
+    Parameters
+    ----------
+    min : float, optional
+        [deg]
+    """
+
+    min: float | None = None
+
+    def __post_init__(self) -> None:
+        least = self.min
+        require(least is None or 0 < least < inf, f"PhaseMargin: min is an angle above 0 deg, got {least}; 45 is usual")
+
+
+@dataclass(frozen=True)
+class NoiseGain:
+    """``max |C(jw)/(1 + L(jw))|``, from measurement noise to the command [its unit/measured unit]; see `noise_gain`.
+
+    Parameters
+    ----------
+    max : float, optional
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+Robustness = MaxSensitivity | MaxComplementarySensitivity | GainMargin | PhaseMargin | NoiseGain
+Requirement = (
+    SettlingTime
+    | RiseTime
+    | Overshoot
+    | SteadyStateError
+    | Ripple
+    | IAE
+    | ISE
+    | ITAE
+    | StepEnvelope
+    | PeakControl
+    | ControlRate
+    | Robustness
+)
+ROBUSTNESS = (MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin, NoiseGain)
+AT_LEAST = (GainMargin, PhaseMargin)
+KINDS: tuple[type[Requirement], ...] = get_args(Requirement)
+
+
+def most(requirement: Requirement) -> float:
+    """The largest value allowed, of those that `read` gives: a margin's is the reciprocal of its `min`; inf without."""
+    if isinstance(requirement, AT_LEAST):
+        return inf if requirement.min is None else 1 / requirement.min
+    return inf if requirement.max is None else requirement.max
+
+
+def told(requirement: Requirement, value: float) -> tuple[str, str]:
+    """A value as `read` gives it, and what is allowed, as the user writes them: ("1.8", "at least 2").
 
     Examples
     --------
-    >>> spec = specify({SettlingTime(): 1.0, Overshoot(): 2.0}, [MaxSensitivity(1.6)])
-    >>> spec.objective({"SettlingTime": 0.3, "Overshoot": 0.05, "MaxSensitivity": 1.5})
-    0.4
+    >>> told(GainMargin(min=2.0), 1 / 1.8), told(Overshoot(max=0.05), 0.06)
+    (('1.8', 'at least 2'), ('0.06', 'allowed 0.05'))
     """
-    weights = dict(minimise) if isinstance(minimise, Mapping) else {minimise: 1.0}
-    require(len(weights) > 0, "minimise is empty: name at least one requirement, SettlingTime() say")
-    for q in (*weights, *subject_to):
-        require(isinstance(q, Requirement), f"{q!r} is no requirement; write {_types()}, as in Overshoot(max=0.05)")
-    for q, weight in weights.items():
-        require(0 < weight < inf, f"the weight of {name(q)} must be positive, got {weight:g}")
-    for q in subject_to:
-        require(q.max is not None, f"{name(q)} in subject_to has no limit; write {name(q)}(max=...)")
-    terms = [name(q) for q in weights]
-    require(len(set(terms)) == len(terms), f"minimise names a kind of requirement twice: {', '.join(terms)}")
-    bands = {q.band for q in (*weights, *subject_to) if isinstance(q, SettlingTime)}
-    require(len(bands) <= 1, f"settling bands differ: {sorted(bands)}; one band holds for the whole tuning")
-    limits: dict[str, Requirement] = {}
-    for q in (*weights, *subject_to):
-        tightest = limits.get(name(q))
-        if q.max is not None and (tightest is None or q.max < (tightest.max or inf)):
-            limits[name(q)] = q
-    return Specification(weights, tuple(limits.values()), next(iter(bands), 0.02))
+    if isinstance(requirement, AT_LEAST):
+        return f"{1 / value if value else inf:.6g}", f"at least {requirement.min:.6g}"
+    return f"{value:.6g}", f"allowed {requirement.max:.6g}"
 
 
 def name(requirement: Requirement) -> str:
@@ -206,16 +336,23 @@ def name(requirement: Requirement) -> str:
 
 
 def read(metrics: Mapping[str, Value]) -> dict[str, Value]:
-    """The requirements' values from metrics, numbers or arrays: fractions where those are in percent."""
-    kinds = [k.__name__ for k in Requirement.__args__]
-    return {k: metrics[k] / (100 if k in PERCENT else 1) for k in kinds if k in metrics}
+    """The requirements' values from metrics, numbers or arrays, all of which shall be small.
+
+    Fractions where metrics are in percent; a margin's reciprocal, of a gain margin below one the margin itself.
+    """
+    return {k.__name__: _value(k, metrics[k.__name__]) for k in KINDS if k.__name__ in metrics}
 
 
-def _types() -> str:
-    return ", ".join(k.__name__ for k in Requirement.__args__)
+def _value(kind: type, metric: Value) -> Value:
+    with np.errstate(divide="ignore"):
+        if kind is GainMargin:
+            return np.exp(-np.abs(np.log(metric)))  # type: ignore[no-any-return]
+        if kind is PhaseMargin:
+            return np.divide(1.0, np.abs(metric))  # type: ignore[no-any-return]
+    return metric / (100 if kind.__name__ in PERCENT else 1)
 
 
 def _check_limit(requirement: Requirement, least: float) -> None:
-    limit = requirement.max
+    limit = getattr(requirement, "max", None)
     wrong = limit is not None and not least < limit < inf
     require(not wrong, f"{name(requirement)}: max must be above {least:g} and finite, got {limit}")

@@ -18,14 +18,15 @@ from pneuopt.control.reference import Step
 from pneuopt.errors import ConvergenceError, require
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import PeakControl, Requirement, Specification, name, specify
+from pneuopt.requirements import PeakControl, Requirement, most, name, told
 from pneuopt.scenarios import NOMINAL, Scenarios
+from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space, Tell, span
 from pneuopt.tuning.cases import cases
 from pneuopt.tuning.condensed import Condensed, check_differentiable, condense, is_differentiable
 from pneuopt.tuning.screening import Screening, merit, screen
 from pneuopt.tuning.simulator import Simulator, each
-from pneuopt.tuning.two_phase import TwoPhase, is_linear, solve_two_phase
+from pneuopt.tuning.two_phase import TwoPhase, check_exact, is_exact, is_linear, solve_two_phase
 
 __all__ = ["TuningResult", "tune"]
 Array = NDArray[np.float64]
@@ -63,13 +64,13 @@ def tune(
         Of plant, controller and dither. The free ones ("pid.*", "dither.*") are tuned and need two finite bounds each.
     minimise : Requirement, or mapping of Requirement to weight
     subject_to : sequence of Requirement
-        Each with its `max`.
+        Each with its bound, `max` or `min`.
     scenarios : mapping of str to mapping, optional
         Plants beside the nominal one, or tolerances of the gains: of `corners`, `samples`, `draws`, `tolerances`, or
         several of them joined with ``|``. The worst over references and scenarios counts.
     method : TwoPhase, Screening or Condensed, optional
-        By default the first for one linear plant with a continuous controller; else the last for scenarios or many
-        gains where all is differentiable, and the second.
+        By default the first for one linear plant with a continuous controller, if it has equations for all that is
+        asked for; else the last for scenarios or many gains where all is differentiable, and the second.
     throw : bool
         Raise if nothing could be certified; otherwise the result says so in its status.
     progress : callable, optional
@@ -134,11 +135,12 @@ def _checked(
         told = "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()"
         require(linear, told)
         require(not scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
+        check_exact(spec)
     if isinstance(method, Condensed):
         check_differentiable(space, spec)
     if method is not None:
         return method
-    if linear and not scenarios:
+    if linear and not scenarios and is_exact(spec):
         return TwoPhase()
     many = bool(scenarios) or len(space.names) > FEW_GAINS
     return Condensed() if many and is_differentiable(space, spec) else Screening()
@@ -162,7 +164,7 @@ class _Search:
 
     def run(self) -> TuningResult:
         loop, references = self.notary.loop, self.notary.references
-        simulator = Simulator(loop, references, self.space, self.notary.scenarios)
+        simulator = Simulator(loop, references, self.space, self.notary.scenarios, self.spec)
         result, start, counts = None, self.space.start, dict[str, float]()
         for attempt in range(ATTEMPTS):
             margin = min(self.method.margin * 2**attempt, 0.5)
@@ -259,7 +261,7 @@ class _Search:
 
 def _screened(spec: Specification, values: Mapping[str, float]) -> Status:
     """What a screening achieved: it keeps the limits, or the closest it came."""
-    broken = [f"{name(q)} {values[name(q)]:.6g}, allowed {q.max:.6g}" for q in spec.violated(values, SLACK)]
+    broken = [f"{name(q)} {', '.join(told(q, values[name(q)]))}" for q in spec.violated(values, SLACK)]
     if broken:
         return Status(Code.INFEASIBLE, f"the closest found has {'; '.join(broken)}; relax a limit or widen the bounds")
     if not np.isfinite(spec.objective(values)):
@@ -271,7 +273,7 @@ def _screened(spec: Specification, values: Mapping[str, float]) -> Status:
 
 def _active(space: Space, spec: Specification, point: Array, values: Mapping[str, float]) -> tuple[str, ...]:
     """Limits within 2 % of being reached, gains within 0.1 % of their range of a bound."""
-    limits = [name(q) for q in spec.limits if values[name(q)] >= 0.98 * (q.max or 0.0)]
+    limits = [name(q) for q in spec.limits if values[name(q)] >= 0.98 * most(q)]
     low, up = space.bounds.T
     near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
     return (*limits, *(n for n, held in zip(space.names, near, strict=True) if held))

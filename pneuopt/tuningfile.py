@@ -1,5 +1,6 @@
 """tuning.toml: the controller, what may be tuned, the steps to follow and what counts; tuned.toml is made from it."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,17 +18,10 @@ from pneuopt.errors import InputError, check_known, require
 from pneuopt.nlp.status import Status
 from pneuopt.output import plain, write_text
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.requirements import (
-    MaxSensitivity,
-    Overshoot,
-    PeakControl,
-    Requirement,
-    SettlingTime,
-    SteadyStateError,
-    specify,
-)
+from pneuopt.requirements import AT_LEAST, KINDS, Bounds, Requirement
 from pneuopt.scenariofile import read_scenarios
 from pneuopt.scenarios import NOMINAL, Scenarios
+from pneuopt.specification import specify
 from pneuopt.system import System
 from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.units import read_value, write_value
@@ -51,13 +45,8 @@ _GAINS: Mapping[str, tuple[str, ...]] = {
     "parallel": ("Kp", "Ki", "Kd", "Tf", "b", "c", "Tt"),
     "standard": ("Kp", "Ti", "Td", "N", "b", "c", "Tt"),
 }
-_REQUIREMENTS: Mapping[str, Callable[..., Requirement]] = {
-    "settling_time": SettlingTime,
-    "overshoot": Overshoot,
-    "steady_state_error": SteadyStateError,
-    "peak_control": PeakControl,
-    "max_sensitivity": MaxSensitivity,
-}
+_REQUIREMENTS = {re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in KINDS}
+_OWN: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,35 +288,64 @@ def _minimise(said: Sections, path: str | Path) -> dict[Requirement, float]:
     for key, entry in said.get("minimise", {}).items():
         spot = f"{where} {key}"
         require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
-        check_known("key", entry, ("weight", *_band_key(key)), spot)
+        check_known("key", entry, ("weight", *_own(key)), spot)
         weight = _value(entry, "weight", "1", spot) if "weight" in entry else 1.0
         require(0 < weight < float("inf"), f"{spot}: weight must be positive, got {weight:g}")
-        weights[_requirement(key, entry, {}, spot)] = weight
+        weights[_requirement(key, entry, {"max": None} if key == "step_envelope" else {}, spot)] = weight
     return weights
 
 
 def _limits(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Requirement, ...]:
     where = f"{path}: [limits]"
     check_known("requirement", said.get("limits", {}), _REQUIREMENTS, where)
-    units = {"settling_time": "s", "peak_control": loop.command.unit}
-    found = []
+    units, found = _units(loop), []
     for key, given in said.get("limits", {}).items():
         spot = f"{where} {key}"
-        entry = given if isinstance(given, dict) else {"max": given}
-        check_known("key", entry, ("max", *_band_key(key)), spot)
-        require("max" in entry, f"{spot} says no max")
-        most = read_value(entry["max"], units.get(key, "1"), where=f"{spot} max" if entry is given else spot)
-        found.append(_requirement(key, entry, {"max": most}, spot))
+        bound = "min" if issubclass(_REQUIREMENTS[key], AT_LEAST) else "max"
+        entry = given if isinstance(given, dict) else {bound: given}
+        check_known("key", entry, (bound, *_own(key)), spot)
+        require(bound in entry or key == "step_envelope", f"{spot} says no {bound}")
+        at = f"{spot} {bound}" if entry is given else spot
+        limit = {bound: read_value(entry[bound], units.get(key, "1"), where=at)} if bound in entry else {}
+        found.append(_requirement(key, entry, limit, spot))
     return tuple(found)
 
 
-def _requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float], where: str) -> Requirement:
-    band = {"band": _value(entry, "band", "1", where)} if "band" in entry else {}
-    return _checked(lambda: _REQUIREMENTS[key](**band, **limit), where)
+def _units(loop: ClosedLoop) -> dict[str, str]:
+    """The units of what is not a number alone."""
+    command, measured = loop.command.unit, loop.feedback.unit.partition("(")[0]
+    times = dict.fromkeys(("settling_time", "rise_time", "iae", "ise"), "s")
+    return times | {
+        "itae": "s^2",
+        "ripple": measured,
+        "peak_control": command,
+        "control_rate": f"{command}/s",
+        "phase_margin": "deg",
+        "noise_gain": f"{command}/({measured})",
+    }
 
 
-def _band_key(key: str) -> tuple[str, ...]:
-    return ("band",) if key == "settling_time" else ()
+def _requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], where: str) -> Requirement:
+    own: dict[str, Any] = dict(limit)
+    if key == "step_envelope":
+        own["bounds"] = _bounds(entry.get("bounds"), f"{where} bounds")
+    elif "band" in entry:
+        own["band"] = _value(entry, "band", "1", where)
+    return _checked(lambda: _REQUIREMENTS[key](**own), where)
+
+
+def _bounds(said: Any, where: str) -> Bounds:
+    rows = said if isinstance(said, list) else []
+    proper = len(rows) > 0 and all(isinstance(row, list) and len(row) == 3 for row in rows)
+    require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
+    return tuple(
+        (read_value(t, "s", where=where), read_value(low, "1", where=where), read_value(up, "1", where=where))
+        for t, low, up in rows
+    )
+
+
+def _own(key: str) -> tuple[str, ...]:
+    return (_OWN[key],) if key in _OWN else ()
 
 
 def _fill(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:

@@ -26,7 +26,7 @@ from scipy.optimize import differential_evolution
 import pneuopt as po
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.requirements import Specification, specify
+from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space, span
 from pneuopt.tuning.screening import merit, screen
 from pneuopt.tuning.simulator import Responses, Simulator

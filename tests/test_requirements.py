@@ -1,50 +1,65 @@
 import math
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pneuopt.errors import InputError
 from pneuopt.requirements import (
+    IAE,
+    KINDS,
+    ControlRate,
+    GainMargin,
+    MaxComplementarySensitivity,
     MaxSensitivity,
+    NoiseGain,
     Overshoot,
     PeakControl,
+    PhaseMargin,
     Requirement,
     SettlingTime,
     SteadyStateError,
+    StepEnvelope,
+    most,
+    name,
     read,
-    specify,
+    told,
 )
 
 
-def test_a_term_with_a_limit_is_both() -> None:
-    spec = specify(SettlingTime(band=0.05, max=0.4), [Overshoot(0.1)])
-    assert spec.band == 0.05
-    assert spec.weight(SettlingTime) == 1.0
-    assert (spec.limit(SettlingTime), spec.limit(Overshoot), spec.limit(PeakControl)) == (0.4, 0.1, math.inf)
-    assert not spec.concerns(PeakControl)
-
-
-def test_the_tightest_limit_counts() -> None:
-    spec = specify(SettlingTime(), [Overshoot(0.1), Overshoot(0.02), Overshoot(0.05)])
-    assert spec.limit(Overshoot) == 0.02
-
-
-def test_violated_names_what_is_not_kept_nan_included() -> None:
-    spec = specify(SettlingTime(max=1.0), [Overshoot(0.1), MaxSensitivity(1.6)])
-    values = {"SettlingTime": math.nan, "Overshoot": 0.1, "MaxSensitivity": 1.7}
-    assert [type(q) for q in spec.violated(values)] == [SettlingTime, MaxSensitivity]
-
-
 def test_metrics_in_percent_become_fractions() -> None:
-    metrics = {"SettlingTime": 0.3, "Overshoot": 5.0, "SteadyStateError": 2.0, "PeakControl": 4.0, "RiseTime": 0.1}
+    metrics = {"SettlingTime": 0.3, "Overshoot": 5.0, "SteadyStateError": 2.0, "PeakControl": 4.0, "Undershoot": 0.1}
     assert read(metrics) == {"SettlingTime": 0.3, "Overshoot": 0.05, "SteadyStateError": 0.02, "PeakControl": 4.0}
 
 
-def test_tightening_leaves_room_inside() -> None:
-    spec = specify(SettlingTime(band=0.02, max=1.0), [Overshoot(0.1), MaxSensitivity(1.6)]).tightened(0.03, 1e-4)
-    assert spec.band == pytest.approx(0.0194)
-    assert spec.limit(Overshoot) == pytest.approx(0.097)
-    assert spec.limit(MaxSensitivity) == pytest.approx(1.6 * (1 - 1e-4))
-    assert spec.limit(SettlingTime) == 1.0
+def test_a_margin_counts_by_its_reciprocal() -> None:
+    """A gain margin below one is the factor down that makes a loop oscillate: 0.5 is as good as 2."""
+    values = read(
+        {"GainMargin": np.array([2.0, 0.5, 4.0, math.inf]), "PhaseMargin": np.array([50.0, -50.0, 0.0, math.inf])}
+    )
+    np.testing.assert_allclose(values["GainMargin"], [0.5, 0.5, 0.25, 0.0])
+    np.testing.assert_allclose(values["PhaseMargin"], [0.02, 0.02, math.inf, 0.0])
+    assert math.isnan(read({"PhaseMargin": math.nan})["PhaseMargin"])
+
+
+@given(st.floats(1.001, 100.0), st.floats(1.001, 100.0))
+def test_a_margin_is_kept_where_it_is_large_enough(least: float, margin: float) -> None:
+    for requirement, metric in ((GainMargin(least), "GainMargin"), (PhaseMargin(least), "PhaseMargin")):
+        kept = read({metric: margin})[metric] <= most(requirement) * (1 + 1e-12)
+        assert kept == (margin >= least * (1 - 1e-12)) or margin == pytest.approx(least, rel=1e-9)
+
+
+def test_limits_are_told_as_they_were_written() -> None:
+    assert told(PhaseMargin(45.0), 1 / 30) == ("30", "at least 45")
+    assert told(GainMargin(2.0), 0.0) == ("inf", "at least 2")
+    assert told(IAE(0.1), 0.125) == ("0.125", "allowed 0.1")
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k is not StepEnvelope])
+def test_without_a_bound_nothing_is_forbidden(kind: type[Requirement]) -> None:
+    assert most(kind()) == math.inf  # type: ignore[call-arg]
+    assert name(kind()) == kind.__name__  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize(
@@ -54,8 +69,16 @@ def test_tightening_leaves_room_inside() -> None:
         (Overshoot, -0.1, "above 0"),
         (SteadyStateError, 2.0, "2 % is 0.02"),
         (MaxSensitivity, 0.9, "above 1"),
+        (MaxComplementarySensitivity, 0.0, "above 0"),
         (PeakControl, math.inf, "finite"),
         (PeakControl, math.nan, "finite"),
+        (ControlRate, -1.0, "ControlRate: max must be above 0"),
+        (NoiseGain, 0.0, "NoiseGain: max must be above 0"),
+        (IAE, math.nan, "IAE: max"),
+        (GainMargin, 0.5, "a factor above 1, got 0.5"),
+        (GainMargin, math.inf, "a factor above 1"),
+        (PhaseMargin, -10.0, "above 0 deg"),
+        (PhaseMargin, math.nan, "above 0 deg"),
     ],
 )
 def test_a_bad_limit_is_refused(kind: type[Overshoot], value: float, words: str) -> None:
@@ -69,16 +92,16 @@ def test_a_band_is_a_fraction() -> None:
 
 
 @pytest.mark.parametrize(
-    ("minimise", "subject_to", "words"),
+    ("bounds", "words"),
     [
-        (SettlingTime(), [Overshoot()], r"Overshoot\(max="),
-        ({}, [], "minimise is empty"),
-        ({SettlingTime(): 0.0}, [], "weight of SettlingTime"),
-        ({Overshoot(): 1.0, Overshoot(0.1): 1.0}, [], "twice"),
-        (SettlingTime(band=0.02), [SettlingTime(band=0.05, max=1.0)], "bands differ"),
-        ("settling_time", [], "is no requirement"),
+        ((), "times count from the step and increase"),
+        (((-0.1, 0.0, 1.0),), "times count from the step"),
+        (((0.0, 0.0, 1.0), (0.0, 0.5, 1.0)), "increase, got"),
+        (((0.0, 1.1, 0.9),), "at 0 s the bounds must be finite and in order"),
+        (((0.0, -math.inf, 1.1),), "finite"),
+        (((0.0, 0.0, math.nan),), "finite"),
     ],
 )
-def test_a_bad_specification_is_refused(minimise: Requirement, subject_to: list[Requirement], words: str) -> None:
+def test_a_bad_envelope_is_refused(bounds: tuple[tuple[float, float, float], ...], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        specify(minimise, subject_to)
+        StepEnvelope(bounds)

@@ -17,15 +17,8 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.nlp.status import Code
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import (
-    MaxSensitivity,
-    Overshoot,
-    PeakControl,
-    Requirement,
-    SettlingTime,
-    SteadyStateError,
-    specify,
-)
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
+from pneuopt.specification import specify
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import Judge, Screening, screen

@@ -19,7 +19,24 @@ from pneuopt.models.friction import Coulomb, PressureDependent
 from pneuopt.models.linear import SecondOrder
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.requirements import (
+    IAE,
+    ISE,
+    ITAE,
+    ControlRate,
+    GainMargin,
+    MaxComplementarySensitivity,
+    MaxSensitivity,
+    NoiseGain,
+    Overshoot,
+    PeakControl,
+    PhaseMargin,
+    Ripple,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    StepEnvelope,
+)
 from pneuopt.tomlfile import read_toml
 from pneuopt.tuningfile import Tuning, read_tuning, write_tuned
 
@@ -300,3 +317,64 @@ def test_a_bad_sensor_is_refused(tmp_path: Path, section: str, message: str) -> 
     path.write_text(TUNING + section, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_tuning(path, PLANT)
+
+
+KINDS = """
+[minimise]
+iae = { weight = 1.0 }
+noise_gain = { weight = 0.01 }
+[limits]
+rise_time = "200 ms"
+ripple = "1 mm/s"
+ise = "50 ms"
+itae = "0.02 s^2"
+control_rate = "2 V/ms"
+max_complementary_sensitivity = 1.3
+gain_margin = 2.5
+phase_margin = { min = "45 deg" }
+step_envelope = { bounds = [["0 s", "-10 %", "110 %"], ["300 ms", 0.9, 1.1]] }
+"""
+
+
+def test_every_kind_of_requirement_has_a_key_and_its_units(tmp_path: Path) -> None:
+    text = TUNING[: TUNING.index("[minimise]")]
+    tuning = read_tuning(written(tmp_path, text + KINDS), PLANT)
+    assert tuning.minimise == {IAE(): 1.0, NoiseGain(): 0.01}
+    assert tuning.subject_to == (
+        RiseTime(0.2),
+        Ripple(1e-3),
+        ISE(0.05),
+        ITAE(0.02),
+        ControlRate(2000.0),
+        MaxComplementarySensitivity(1.3),
+        GainMargin(2.5),
+        PhaseMargin(45.0),
+        StepEnvelope(((0.0, -0.1, 1.1), (0.3, 0.9, 1.1))),
+    )
+    term = KINDS.replace("iae = { weight = 1.0 }", 'step_envelope = { bounds = [["0 s", -1, 2]], weight = 3 }')
+    term = term[: term.index('step_envelope = { bounds = [["0 s", "-10')] + 'noise_gain = "0.5 V*s/m"\n'
+    again = read_tuning(written(tmp_path, text + term), PLANT)
+    assert again.minimise == {StepEnvelope(((0.0, -1.0, 2.0),), max=None): 3.0, NoiseGain(): 0.01}
+    assert again.subject_to[-1] == NoiseGain(0.5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("gain_margin = 2.5", "gain_margin = { max = 2.5 }", "[limits] gain_margin: unknown key 'max'"),
+        ("gain_margin = 2.5", "gain_margin = {}", "[limits] gain_margin says no min"),
+        ("gain_margin = 2.5", "gain_margin = 0.5", "[limits] gain_margin: GainMargin: min is a factor above 1"),
+        ('"45 deg"', "45", '[limits] phase_margin min: 45 has no unit; write "45 deg"'),
+        ('"2 V/ms"', '"2 V"', "[limits] control_rate: unit 'V' does not measure 'V/s'"),
+        ('[["0 s", "-10 %", "110 %"],', '[["0 s", "-10 %"],', "bounds: write instants with a lower and an upper"),
+        ("step_envelope = {", "step_envelope = { band = 0.1,", "[limits] step_envelope: unknown key 'band'"),
+        ('"300 ms", 0.9', '"300 ms", 1.9', "[limits] step_envelope: StepEnvelope: at 0.3 s the bounds"),
+        ("rise_time", "risetime", "[limits]: unknown requirement 'risetime'; did you mean 'rise_time'?"),
+    ],
+)
+def test_refuses_a_bad_requirement_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in KINDS
+    path = written(tmp_path, TUNING[: TUNING.index("[minimise]")] + KINDS.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        read_tuning(path, PLANT)
+    assert said in str(error.value)

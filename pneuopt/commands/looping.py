@@ -16,6 +16,7 @@ from pneuopt.commands.shared import (
     background,
     band_of,
     beside,
+    envelope_of,
     figure_writers,
     finish,
     hashes,
@@ -84,7 +85,14 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     outputs.check([fit, tuning], "bode")
     asked, parameters = read_loop(fit, tuning)
     scenarios = asked.scenarios(parameters)
-    metrics = evaluate(asked.loop, asked.references, parameters, scenarios=scenarios, band=band_of(asked))
+    metrics = evaluate(
+        asked.loop,
+        asked.references,
+        parameters,
+        scenarios=scenarios,
+        band=band_of(asked),
+        envelope=envelope_of(asked),
+    )
     show_metrics(screen(), metrics, asked.loop, limits=asked.subject_to)
     writers: Writers = {}
     if outputs.output is not None:
@@ -103,7 +111,12 @@ def _before(asked: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
     """The metrics with the gains as given; None where that loop cannot be simulated."""
     try:
         return evaluate(
-            asked.loop, asked.references, parameters, scenarios=asked.scenarios(parameters), band=band_of(asked)
+            asked.loop,
+            asked.references,
+            parameters,
+            scenarios=asked.scenarios(parameters),
+            band=band_of(asked),
+            envelope=envelope_of(asked),
         )
     except (ConvergenceError, InputError):
         return None

@@ -17,7 +17,7 @@ from pneuopt.nlp.status import Code, Status
 from pneuopt.output import check_outputs, write_json, write_text
 from pneuopt.parameters import ParameterSet
 from pneuopt.plotting import check_figure_path, save_figure
-from pneuopt.requirements import SettlingTime
+from pneuopt.requirements import Bounds, SettlingTime, StepEnvelope
 from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult
 from pneuopt.tuningfile import Tuning, read_tuning
@@ -89,6 +89,12 @@ def band_of(asked: Tuning) -> float:
     """The settling band that the requirements name; 2 % otherwise."""
     requirements = (*asked.minimise, *asked.subject_to)
     return next((q.band for q in requirements if isinstance(q, SettlingTime)), 0.02)
+
+
+def envelope_of(asked: Tuning) -> Bounds:
+    """The bounds over time that the requirements name; none without."""
+    requirements = (*asked.minimise, *asked.subject_to)
+    return next((q.bounds for q in requirements if isinstance(q, StepEnvelope)), ())
 
 
 def figure_writers(path: Path, figures: Mapping[str, "Figure"]) -> Writers:

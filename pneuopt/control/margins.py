@@ -7,7 +7,7 @@ How a tuner limits the maximum sensitivity Ms::
     terms(p) >= 1 / Ms**2                                    # p in the order of loop.parameters: numbers, SX or MX
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from math import inf, nan
 from typing import Any
@@ -43,6 +43,8 @@ class Margins:
         ``Ms = max |1/(1 + L(jw))|``; its inverse is the Nyquist curve's distance from -1.
     max_sensitivity_frequency : float
         [rad/s]; inf if the sensitivity only approaches its maximum.
+    max_complementary_sensitivity : float
+        ``Mt = max |L(jw)/(1 + L(jw))|``, the resonance peak from reference to signal where the PID weights both alike.
     stable : bool
         Whether the closed loop is stable; if not, the margins are no margins.
     """
@@ -53,6 +55,7 @@ class Margins:
     phase_crossover: float
     max_sensitivity: float
     max_sensitivity_frequency: float
+    max_complementary_sensitivity: float
     stable: bool
 
 
@@ -92,8 +95,45 @@ def margins(open_loop: Linearisation) -> Margins:
     gains = [(1 / abs(z), w) for w in real if (z := response(w)).real < 0]
     gain_margin, phase_crossover = min(gains, key=lambda g: abs(np.log(g[0])), default=(inf, nan))
     phase_margin, gain_crossover = min(phases, key=lambda m: abs(m[0]), default=(inf, nan))
-    peak, at = _max_sensitivity(open_loop, omega, L)
-    return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, peak, at, _stable(open_loop))
+    D = float(open_loop.D[0, 0])
+    Ms, at = _peak(lambda w: 1 / (1 + frequency_response(open_loop, w)), omega, 1 / (1 + D))
+    Mt, _ = _peak(lambda w: 1 - 1 / (1 + frequency_response(open_loop, w)), omega, D / (1 + D))
+    return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, _stable(open_loop))
+
+
+def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float]) -> float:
+    """``max |C(jw)/(1 + L(jw))|``: how much of the measurement noise the command shows at worst.
+
+    The maximum control sensitivity of B. Kristiansson and B. Lennartson, Robust and optimal tuning of PI and PID
+    controllers, IEE Proc. Control Theory Appl. 149 (2002) 17-25; with a fast filter it is Kp + Kd/Tf.
+
+    Parameters
+    ----------
+    open_loop : Linearisation
+        ``L = C P`` (`ClosedLoop.open_loop`), strictly proper.
+    gains : (float, float, float, float)
+        Kp, Ki, Kd, Tf of the PID C, with Tf > 0.
+
+    Returns
+    -------
+    float
+        [command's unit/measured unit]
+
+    Examples
+    --------
+    A gain of 3 before ``1/(s + 1)`` follows noise at high frequencies with that gain, at rest with 3/4:
+
+    >>> L = Linearisation(*(np.array([[v]]) for v in (-1.0, 1.0, 3.0, 0.0)), ("x",), ("u",), ("y",))
+    >>> noise_gain(L, (3.0, 0.0, 0.0, 0.01))
+    3.0
+    """
+    Kp, _, Kd, Tf = gains
+
+    def control(w: Array) -> ComplexArray:
+        a, b = _controller(gains, w)
+        return np.asarray((a + 1j * b) / (1 + frequency_response(open_loop, w)))
+
+    return _peak(control, frequency_grid(open_loop), Kp + Kd / Tf)[0]
 
 
 def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:
@@ -177,22 +217,46 @@ def sensitivity_terms(
     return ca.Function("sensitivity_terms", [ca.vertcat(*p.values())], [terms], ["p"], ["terms"])
 
 
-def sensitivities(loop: ClosedLoop, omega: ArrayLike) -> Callable[[Array, Array, Array], Array]:
-    """Ms on a grid of frequencies, for many gains and operating points at once.
+def robustness(
+    loop: ClosedLoop, omega: ArrayLike
+) -> Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]:
+    """Margins and the like on a grid of frequencies, for many gains and operating points at once.
 
     Parameters
     ----------
     loop : ClosedLoop
     omega : array_like, shape (n,)
-        [rad/s], positive.
+        [rad/s], positive, increasing.
 
     Returns
     -------
     callable
-        ``(p, x, command) -> Ms``, shapes (m, n_parameters) in the order of ``loop.parameters``, (m, n_plant_states),
-        (m,) and (m,); the plant's other inputs are zero. What is impossible is not checked. Tf > 0.
+        ``(p, x, command, only) -> found``, shapes (m, n_parameters) in the order of ``loop.parameters``,
+        (m, n_plant_states) and (m,); the plant's other inputs are zero. Found is of shape (m,) for each name in `only`:
+        "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in `Margins`, crossings
+        interpolated, and "NoiseGain". What is impossible is not checked. Tf > 0.
     """
-    plant, w, h = loop.plant, np.asarray(omega, dtype=float), loop.pid.sample_time or 0.0
+    w = np.asarray(omega, dtype=float)
+    plants, position = _plants(loop, w), {name: k for k, name in enumerate(loop.parameters)}
+    gains = [position[f"pid.{k}"] for k in ("Kp", "Ki", "Kd", "Tf")]
+
+    def read(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
+        Kp, Ki, Kd, Tf = (p[:, [k]] for k in gains)
+        a, b = _controller((Kp, Ki, Kd, Tf), w)
+        C = a + 1j * b
+        L = plants(p, x, commands) * C
+        with np.errstate(all="ignore"):
+            found = {n: _OF_LOOP[n](L) for n in only if n in _OF_LOOP}
+        if "NoiseGain" in only:
+            found["NoiseGain"] = np.maximum(np.abs(C / (1 + L)).max(axis=1), np.abs(Kp + Kd / Tf)[:, 0])
+        return found
+
+    return read
+
+
+def _plants(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], ComplexArray]:
+    """Responses of the plant with sensor and hold, shape (m, n)."""
+    plant, h = loop.plant, loop.pid.sample_time or 0.0
     x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
     command, output = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
     xdot, y = plant.ode(0, x, u, q)
@@ -202,21 +266,52 @@ def sensitivities(loop: ClosedLoop, omega: ArrayLike) -> Callable[[Array, Array,
     C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
     matrices = compiled(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
     n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
-    shapes = ((n, n), (n,), (n,), (1,))
-    own, gains = [position[name] for name in plant.parameters], [position[f"pid.{k}"] for k in ("Kp", "Ki", "Kd", "Tf")]
+    shapes, own = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
 
-    def largest(p: Array, x: Array, commands: Array) -> Array:
+    def responses(p: Array, x: Array, commands: Array) -> ComplexArray:
         us = np.zeros((len(p), u.numel()))
         us[:, command] = commands
         found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
         A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
         P = (_responses(A, B, C, w) + D) * _hold(w, h)
-        if loop.sensor is not None:
-            P = P / (1 + 1j * w * p[:, [position["sensor.lag"]]])
-        a, b = _controller((p[:, [k]] for k in gains), w)
-        return np.asarray(1 / np.abs(1 + P * (a + 1j * b)).min(axis=1))
+        return np.asarray(P if loop.sensor is None else P / (1 + 1j * w * p[:, [position["sensor.lag"]]]))
 
-    return largest
+    return responses
+
+
+def _gain_margins(L: ComplexArray) -> Array:
+    """Crossings of -180 deg are interpolated in phase and logarithm of gain."""
+    phase, gain = np.angle(-L), np.log(np.abs(L))
+    at, crossing = _interpolated(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
+    return np.asarray(np.exp(_smallest(np.where(crossing, -at, inf))))
+
+
+def _phase_margins(L: ComplexArray) -> Array:
+    """Crossings of gain one, likewise."""
+    phase, gain = np.unwrap(np.angle(-L), axis=1), np.log(np.abs(L))
+    at, crossing = _interpolated(gain, phase)
+    return np.degrees(_smallest(np.where(crossing, (at + np.pi) % (2 * np.pi) - np.pi, inf)))
+
+
+def _interpolated(values: Array, others: Array, allowed: Any = True) -> tuple[Array, NDArray[np.bool_]]:
+    """The others where the values cross zero, linear between neighbours, and whether they do."""
+    step = np.diff(values, axis=1)
+    crossing = (values[:, :-1] * values[:, 1:] <= 0) & (step != 0) & allowed
+    share = -values[:, :-1] / np.where(crossing, step, 1.0)
+    return others[:, :-1] + share * np.diff(others, axis=1), crossing
+
+
+def _smallest(rows: Array) -> Array:
+    """The entry of each row that is smallest in size."""
+    return np.asarray(rows[np.arange(len(rows)), np.argmin(np.abs(rows), axis=1)])
+
+
+_OF_LOOP: dict[str, Callable[[ComplexArray], Array]] = {
+    "MaxSensitivity": lambda L: 1 / np.abs(1 + L).min(axis=1),
+    "MaxComplementarySensitivity": lambda L: np.abs(L / (1 + L)).max(axis=1),
+    "GainMargin": _gain_margins,
+    "PhaseMargin": _phase_margins,
+}
 
 
 def _responses(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
@@ -259,16 +354,18 @@ def _crossings(function: Callable[[float], float], omega: Array, values: Array) 
     return sorted(exact + [float(brentq(function, omega[k], omega[k + 1], xtol=1e-14 * omega[k])) for k in brackets])
 
 
-def _max_sensitivity(open_loop: Linearisation, omega: Array, L: ComplexArray) -> tuple[float, float]:
-    def distance(log_w: float) -> float:
-        return float(abs(1 + frequency_response(open_loop, [np.exp(log_w)])[0]))
+def _peak(response: Callable[[Array], ComplexArray], omega: Array, limit: float) -> tuple[float, float]:
+    """The largest size of a response and its frequency, refined from the grid; `limit` is its value at infinity."""
 
-    k = int(np.argmin(np.abs(1 + L)))
+    def size(log_w: float) -> float:
+        return -float(abs(response(np.array([np.exp(log_w)]))[0]))
+
+    on_grid = np.abs(response(omega))
+    k = int(np.argmax(on_grid))
     ends = np.log(omega[[max(k - 1, 0), min(k + 1, len(omega) - 1)]])
-    best = minimize_scalar(distance, bounds=tuple(ends), method="bounded", options={"xatol": 1e-12})
-    nearest, at = min((float(best.fun), float(np.exp(best.x))), (float(abs(1 + L[k])), float(omega[k])))
-    limit = float(abs(1 + open_loop.D[0, 0]))
-    return (1 / nearest, at) if nearest < limit else (1 / limit, inf)
+    best = minimize_scalar(size, bounds=tuple(ends), method="bounded", options={"xatol": 1e-12})
+    largest, at = max((-float(best.fun), float(np.exp(best.x))), (float(on_grid[k]), float(omega[k])))
+    return (largest, at) if largest > abs(limit) else (abs(limit), inf)
 
 
 def _closed_poles(open_loop: Linearisation) -> ComplexArray:

@@ -1,5 +1,6 @@
 """Figures of a step response, with python-control's keys, relative to the step's size."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from math import nan
@@ -14,6 +15,10 @@ Array = NDArray[np.float64]
 PERIODS_AT_END = 5
 PERIODS_INSIDE = 2  # of the dither, at least, of a response that has settled
 TAIL = 0.05
+INTEGRALS = ("IAE", "ISE", "ITAE")
+
+Envelope = Sequence[tuple[float, float, float]]
+"""Instants after the step [s], each with the lower and upper bound from then on, as fractions of the step."""
 
 
 class About(Enum):
@@ -34,7 +39,9 @@ def step_metrics(
     about: About = About.FINAL,
     dither_period: float | None = None,
     control: ArrayLike | None = None,
+    sample_time: float | None = None,
     final: float | None = None,
+    envelope: Envelope = (),
 ) -> dict[str, float]:
     """Measure a step response.
 
@@ -55,10 +62,15 @@ def step_metrics(
     dither_period : float, optional
         Average over this time first, without phase shift [s]: a whole number of dither periods (`Dither.period`).
     control : array_like, shape (n,), optional
-        The command, for PeakControl [its unit]; it is not averaged.
+        The command, for PeakControl and ControlRate [its unit]; it is not averaged.
+    sample_time : float, optional
+        Of the controller that holds the command, over which ControlRate is read [s]; by default from sample to sample.
     final : float, optional
         The final value where it is known (a dc gain) [unit]; by default the last sample, with dither the mean over the
         last periods (five, or as many as there are).
+    envelope : sequence of (float, float, float)
+        Instants after the step, in order [s], each with the lower and upper bound that hold from then on, as fractions
+        of the step: 0 is `initial`, 1 the reference.
 
     Returns
     -------
@@ -81,8 +93,17 @@ def step_metrics(
             The final value [unit]; its distance from the reference, in % of the step.
         Ripple
             Peak to peak of the signal as it is, over the last periods, without dither over the last 5 % [unit].
+        IAE, ISE, ITAE
+            Integrals from the step to the record's end of the error's size [s], of its square [s], and of its size
+            times the time since the step [s^2]; the error is the distance from the reference over the step's size.
+        StepEnvelope
+            Largest distance from the middle of `envelope`, over its half width: at most 1 where the response keeps it;
+            only with an envelope.
         PeakControl
-            Largest absolute command [its unit]; NaN without `control`.
+            Largest absolute command, dither included [its unit]; NaN without `control`.
+        ControlRate
+            Largest change of the command over time, dither included [its unit/s]; NaN without `control`. It begins
+            with the first command after the step: the jump of a proportional gain is not in it.
 
     Raises
     ------
@@ -111,7 +132,9 @@ def step_metrics(
         about=about,
         dither_period=dither_period,
         control=commands if commands is None else commands[None],
+        sample_time=sample_time,
         final=final,
+        envelope=envelope,
     )
     return {name: float(value[0]) for name, value in found.items()}
 
@@ -127,7 +150,10 @@ def batch_metrics(
     about: About = About.FINAL,
     dither_period: float | None = None,
     control: Array | None = None,
+    sample_time: float | None = None,
     final: float | None = None,
+    envelope: Envelope = (),
+    only: Collection[str] | None = None,
 ) -> dict[str, Array]:
     """Measure many step responses on one grid at once; see `step_metrics`.
 
@@ -136,40 +162,33 @@ def batch_metrics(
     t : ndarray, shape (n,)
     y, control : ndarray, shape (m, n)
         A row a response.
+    only : collection of str, optional
+        What is asked for: ControlRate and the integrals, which take their time, are left out where they are not in it.
 
     Returns
     -------
     dict of str to ndarray, shape (m,)
     """
-    raw = _record(t, y, reference_final, initial, start, band)
-    size = reference_final - initial
+    raw, size = _record(t, y, reference_final, initial, start, band), reference_final - initial
     smooth = raw if dither_period is None else _averaged(raw, initial, dither_period)
-    tail = _tail(raw, dither_period)
-    last = smooth.y[:, -1] if dither_period is None else _mean(tail)
-    steady = last if final is None else np.full(len(raw.y), final)
-    change = steady - initial
-    peak = _at(smooth.y, np.argmax(smooth.y * np.sign(size), axis=1))
-    rise, lowest, highest = _rise(smooth, initial, change)
-    centre, width = (steady, band * np.abs(change))
+    steady = end_mean(raw.t, raw.y, dither_period) if final is None else np.full(len(raw.y), final)
+    rise, lowest, highest = _rise(smooth, initial, steady - initial)
+    centre, width = steady, band * np.abs(steady - initial)
     if about is About.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
     latest = raw.t[-1] - max(TAIL * raw.t[-1], PERIODS_INSIDE * (dither_period or 0.0))
-    with np.errstate(all="ignore"):
-        beyond = np.where(change * size > 0, 100 * np.maximum(0.0, (peak - steady) / change), nan)
     return {
         "RiseTime": rise,
         "SettlingTime": _settling(smooth, centre, width, latest),
         "SettlingMin": np.minimum(lowest, steady),
         "SettlingMax": np.maximum(highest, steady),
-        "Overshoot": 100 * np.maximum(0.0, (peak - reference_final) / size),
-        "OvershootFinal": beyond,
-        "Undershoot": 100 * np.maximum(0.0, np.max((initial - smooth.y) / size, axis=1)),
-        "Peak": peak,
-        "PeakTime": smooth.t[np.argmax(smooth.y * np.sign(size), axis=1)],
+        **_extremes(smooth, steady, reference_final, initial),
         "SteadyStateValue": steady,
         "SteadyStateError": 100 * np.abs(reference_final - steady) / abs(size),
-        "Ripple": np.ptp(tail.y, axis=1),
-        "PeakControl": _peak(t, control, start, len(raw.y)),
+        "Ripple": np.ptp(_tail(raw, dither_period).y, axis=1),
+        **_integrals(smooth, reference_final, size, only),
+        **_enveloped(smooth, initial, size, envelope),
+        **_effort(t, control, start, sample_time, len(raw.y), only),
     }
 
 
@@ -196,17 +215,43 @@ def _since(t: Array, start: float) -> NDArray[np.bool_]:
 
 
 def _averaged(record: _Record, initial: float, period: float) -> _Record:
-    """Centred mean over one period of a signal that is linear between samples, and `initial` before the step."""
     last = record.t[-1] - period / 2
     require(
         period > 0 and last > record.t[0] + period,
         f"the record of {record.t[-1]:g} s is too short to average over {period:g} s; simulate longer",
     )
     t = record.t[record.t <= last]
-    steps = 0.5 * np.diff(record.t) * (record.y[:, 1:] + record.y[:, :-1])
+    return _Record(t, period_mean(record.t, record.y, initial, period, t))
+
+
+def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
+    """Centred mean over one period of signals that are linear between samples, and `initial` before the first.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+    y : ndarray, shape (m, n)
+    initial : float
+    period : float
+        [s]
+    at : ndarray, shape (k,)
+        Instants, half a period from the end at most [s].
+
+    Returns
+    -------
+    ndarray, shape (m, k)
+    """
+    record = _Record(t, y)
+    steps = 0.5 * np.diff(t) * (y[:, 1:] + y[:, :-1])
     whole = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
-    ends = (_integral(record, whole, initial, t + side * period / 2) for side in (1, -1))
-    return _Record(t, (next(ends) - next(ends)) / period)
+    ends = (_integral(record, whole, initial, at + side * period / 2) for side in (1, -1))
+    mean: Array = (next(ends) - next(ends)) / period
+    return mean
+
+
+def end_mean(t: Array, y: Array, period: float | None) -> Array:
+    """The final values as `step_metrics` reads them, shape (m,): the last sample, or the mean over the last periods."""
+    return y[:, -1] if period is None else _mean(_tail(_Record(t, y), period))
 
 
 def _integral(record: _Record, whole: Array, initial: float, at: Array) -> Array:
@@ -271,9 +316,69 @@ def _at(rows: Array, k: NDArray[np.intp]) -> Array:
     return np.asarray(rows[np.arange(len(rows)), k], dtype=float)
 
 
-def _peak(t: Array, control: Array | None, start: float, rows: int) -> Array:
+def _extremes(record: _Record, steady: Array, reference: float, initial: float) -> dict[str, Array]:
+    size, change = reference - initial, steady - initial
+    k = np.argmax(record.y * np.sign(size), axis=1)
+    peak = _at(record.y, k)
+    with np.errstate(all="ignore"):
+        beyond = np.where(change * size > 0, 100 * np.maximum(0.0, (peak - steady) / change), nan)
+    return {
+        "Overshoot": 100 * np.maximum(0.0, (peak - reference) / size),
+        "OvershootFinal": beyond,
+        "Undershoot": 100 * np.maximum(0.0, np.max((initial - record.y) / size, axis=1)),
+        "Peak": peak,
+        "PeakTime": record.t[k],
+    }
+
+
+def _integrals(record: _Record, reference: float, size: float, only: Collection[str] | None) -> dict[str, Array]:
+    """By the trapezoidal rule; its weights at the samples make the integrals products."""
+    if only is not None and not set(INTEGRALS) & set(only):
+        return {}
+    h, error = np.diff(record.t), np.abs(record.y - reference) / abs(size)
+    weights = 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
+    return {"IAE": error @ weights, "ISE": error**2 @ weights, "ITAE": error @ (weights * record.t)}
+
+
+def _enveloped(record: _Record, initial: float, size: float, envelope: Envelope) -> dict[str, Array]:
+    if not envelope:
+        return {}
+    used, y = np.zeros(len(record.y)), (record.y - initial) / size
+    ends = [*(begin for begin, _, _ in envelope[1:]), np.inf]
+    for (begin, lower, upper), end in zip(envelope, ends, strict=True):
+        if begin < record.t[-1]:
+            part = _between(record.t, y, begin, min(end, record.t[-1]))
+            used = np.maximum(used, np.max(np.abs(part - (lower + upper) / 2), axis=1) / ((upper - lower) / 2))
+    return {"StepEnvelope": used}
+
+
+def _between(t: Array, y: Array, begin: float, end: float) -> Array:
+    """Samples in a span, and the values at its ends, linear between samples."""
+    at = np.array([begin, end])
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    ends = y[:, k] + (at - t[k]) / (t[k + 1] - t[k]) * (y[:, k + 1] - y[:, k])
+    return np.concatenate([ends, y[:, (t > begin) & (t < end)]], axis=1)
+
+
+def _effort(
+    t: Array, control: Array | None, start: float, sample_time: float | None, rows: int, only: Collection[str] | None
+) -> dict[str, Array]:
     if control is None:
-        return np.full(rows, nan)
+        return {"PeakControl": np.full(rows, nan), "ControlRate": np.full(rows, nan)}
     fits = control.shape[-1:] == t.shape
     require(fits, f"t and control differ in shape: {t.shape} and {control.shape[-1:]}")
-    return np.asarray(np.max(np.abs(control[:, _since(t, start)]), axis=1))
+    kept = _since(t, start)
+    found = {"PeakControl": np.asarray(np.max(np.abs(control[:, kept]), axis=1))}
+    if only is None or "ControlRate" in only:
+        found["ControlRate"] = _rate(t[kept], control[:, kept], sample_time)
+    return found
+
+
+def _rate(t: Array, u: Array, sample_time: float | None) -> Array:
+    """A held command jumps within a sample of a finer grid: its rate is the jump over the controller's sample."""
+    if sample_time is None:
+        return np.asarray(np.max(np.abs(np.diff(u, axis=1)) / np.diff(t), axis=1))
+    begin = np.flatnonzero(t <= t[-1] - 0.999 * sample_time)
+    require(len(begin) > 0, f"the record of {t[-1] - t[0]:g} s is shorter than the controller's sample time")
+    end = np.searchsorted(t, t[begin] + 0.999 * sample_time)
+    return np.asarray(np.max(np.abs(u[:, end] - u[:, begin]), axis=1) / sample_time)

@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,16 +23,28 @@ from pneuopt.units import ATMOSPHERE
 Array = NDArray[np.float64]
 Runs = Callable[[Mapping[str, Log]], Mapping[str, Run]]
 BETTER = 1.5  # times smaller residuals make another zero point the better one (tests/models/test_pressure_zero.py)
+BELIEVED = 0.02  # the same: what a right zero point may leave unquestioned (a wrong one leaves 0.03 or more)
 EXPLAINED = 0.2  # of a pressure's squared rates: what a zero point that is believed leaves at most
 LONG = 1.0  # [s] of a log that is judged on its own
+MOST = 2000  # samples of a log that are looked at
 SUPPLY = "supply.pressure"
 ADDED, LESS = f"{ATMOSPHERE / 1e5:.3f} bar added", f"{ATMOSPHERE / 1e5:.3f} bar taken off"
-REMEDIES = {  # by what is added to the logged pressures, and to the supply's, in atmospheres
-    (0, 0): "",
-    (1, 0): f"{ADDED}: is it a gauge sensor? Then write its unit as bar(g)",
-    (-1, 0): f"{LESS}: is an absolute sensor read as bar(g)? Then write its unit as bar(a)",
-    (0, 1): f"{ADDED} to {SUPPLY}: is that too low, or a gauge pressure? Then write it in bar(g)",
-}
+
+
+class Remedy(NamedTuple):
+    """What is added to the logged pressures and to the supply's [atmospheres], and what that would mean."""
+
+    sensors: int
+    supply: int
+    told: str = ""
+
+
+REMEDIES = (
+    Remedy(0, 0),
+    Remedy(1, 0, f"{ADDED}: is it a gauge sensor? Then write its unit as bar(g)"),
+    Remedy(-1, 0, f"{LESS}: is an absolute sensor read as bar(g)? Then write its unit as bar(a)"),
+    Remedy(0, 1, f"{ADDED} to {SUPPLY}: is that too low, or a gauge pressure? Then write it in bar(g)"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,28 +61,57 @@ class PressureZeros:
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """Return a sentence for each pressure whose chamber's equation holds better from another zero point."""
-        telling = {name: log for name, log in logs.items() if _tells(log)}
+        telling = {name: _liveliest(log) for name, log in logs.items() if _tells(log)}
         left = self._left(telling) if telling else {}
-        told = list(_sentences("".join(logs) if len(logs) == 1 else "", left.values()))
-        long = [] if told else [name for name in left if float(np.ptp(logs[name].measured.t)) >= LONG]
+        together = left.values() if len(left) == len(telling) else ()
+        told = list(_sentences("".join(logs) if len(logs) == 1 else "", together))
+        long = [] if told else [name for name in left if float(np.ptp(telling[name].measured.t)) >= LONG]
         return told + [sentence for name in long for sentence in _sentences(name, [left[name]])]
 
     def _left(self, logs: Mapping[str, Log]) -> dict[str, dict[str, Array]]:
-        """By log and logged pressure: its rates' squares, and what of them each shift leaves [Pa^2/s^2]."""
-        left = {name: {n: [_spread(log, n)] for n in _logged(log)} for name, log in logs.items()}
-        for shift in REMEDIES:
-            for name, run in self.runs({name: _moved(log, *shift) for name, log in logs.items()}).items():
-                parts = [run.valve_columns(shape) for shape in _shapes(logs[name])]
-                for k, n in enumerate(run.logged):
-                    fits = (_squares(columns[:, k], wanted[:, k]) for columns, wanted in parts)
-                    left[name][n].append(min(fits) if run.led[n].min() > 0 else math.inf)
-        return {name: {n: np.array(row) for n, row in rows.items()} for name, rows in left.items()}
+        """By doubtful log and logged pressure: its rates' squares, and what of them each shift leaves [Pa^2/s^2]."""
+        spread = {name: {n: _spread(log, n) for n in _logged(log)} for name, log in logs.items()}
+        found = [self._squares(logs, REMEDIES[0])]
+        doubtful = {
+            name: log
+            for name, log in logs.items()
+            if any(left > BELIEVED * spread[name][n] for n, left in found[0][name].items())
+        }
+        found += [self._squares(doubtful, remedy) for remedy in REMEDIES[1:]] if doubtful else []
+        return {
+            name: {n: np.array([spread[name][n], *(each[name][n] for each in found)]) for n in spread[name]}
+            for name in doubtful
+        }
+
+    def _squares(self, logs: Mapping[str, Log], remedy: Remedy) -> dict[str, dict[str, float]]:
+        """What a shift of the zero points leaves of each log's pressure rates [Pa^2/s^2]."""
+        left: dict[str, dict[str, float]] = {}
+        for name, run in self.runs({n: _moved(log, remedy) for n, log in logs.items()}).items():
+            parts = [run.valve_columns(shape) for shape in _shapes(logs[name])]
+            left[name] = {
+                n: min(_squares(columns[:, k], wanted[:, k]) for columns, wanted in parts)
+                if run.led[n].min() > 0
+                else math.inf
+                for k, n in enumerate(run.logged)
+            }
+        return left
 
 
 def _tells(log: Log) -> bool:
     """Whether it holds motion and a pressure, and the supply is known: the ratio to a guess says nothing."""
     known = SUPPLY not in log.parameters.free_names
     return known and any(n in log.measured for n in ("position", "speed")) and bool(_logged(log))
+
+
+def _liveliest(log: Log) -> Log:
+    """The part of a long log in which the pressures change most: enough to tell, for less than a fit's step costs."""
+    data = log.measured
+    if len(data) <= MOST:
+        return log
+    path = np.sum([np.abs(filtered(data, n, 1)) / float(np.nanmean(data[n])) for n in _logged(log)], axis=0)
+    within = np.convolve(path, np.ones(MOST), "valid")
+    first = int(np.argmax(within))
+    return log._replace(measured=data.rows(first, first + MOST))
 
 
 def _logged(log: Log) -> list[str]:
@@ -82,11 +124,11 @@ def _spread(log: Log, name: str) -> float:
     return float(np.sum((rates - rates.mean()) ** 2))
 
 
-def _moved(log: Log, sensors: float, supply: float) -> Log:
+def _moved(log: Log, remedy: Remedy) -> Log:
     """The log with other zero points, so many atmospheres away."""
     measured, p = log
-    measured = measured.with_columns({n: measured[n] + sensors * ATMOSPHERE for n in _logged(log)})
-    moved = {SUPPLY: p.value(SUPPLY) + supply * ATMOSPHERE}
+    measured = measured.with_columns({n: measured[n] + remedy.sensors * ATMOSPHERE for n in _logged(log)})
+    moved = {SUPPLY: p.value(SUPPLY) + remedy.supply * ATMOSPHERE}
     return Log(measured, p.with_bounds(dict.fromkeys(moved, (0.0, math.inf))).with_values(moved))
 
 
@@ -113,4 +155,4 @@ def _sentences(name: str, logs: Collection[Mapping[str, Array]]) -> Iterator[str
         if 0 < shifted[best] < min(given / BETTER**2, EXPLAINED * total):
             better = f"leaves {math.sqrt(given / shifted[best]):.1f} times smaller residuals"
             where = f"{channel} of {name}" if name else channel
-            yield f"{where}: its chamber's mass balance {better} with {[*REMEDIES.values()][1 + best]}"
+            yield f"{where}: its chamber's mass balance {better} with {REMEDIES[1 + best].told}"

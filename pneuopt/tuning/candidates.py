@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.metrics import About, step_metrics
+from pneuopt.control.metrics import About, Envelope, step_metrics
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
 from pneuopt.parameters import Parameter, ParameterSet
@@ -153,7 +153,12 @@ def span(loop: ClosedLoop, parameters: ParameterSet) -> Space:
 
 
 def measure(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory, band: float
+    loop: ClosedLoop,
+    parameters: ParameterSet,
+    reference: Step,
+    response: Trajectory,
+    band: float,
+    envelope: Envelope = (),
 ) -> dict[str, float]:
     """The metrics of a simulated response, the settling band around the reference.
 
@@ -174,18 +179,24 @@ def measure(
         about=About.REFERENCE,
         dither_period=loop.dither_period(parameters),
         control=response["control"],
+        sample_time=loop.pid.sample_time,
+        envelope=envelope,
     )
 
 
 def cut(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> Linearisation:
     """The open loop for margins, about a plant state x under a command.
 
-    A sampled derivative without a filter is one over a sample, which lags by half of it: that counts as its filter.
+    The filter is that of `filtered`.
     """
+    return loop.open_loop(filtered(loop, parameters), x, {loop.command.name: command})
+
+
+def filtered(loop: ClosedLoop, parameters: ParameterSet) -> ParameterSet:
+    """With a filter for margins: a sampled derivative without one is a difference over a sample, which lags by half."""
     h = loop.pid.sample_time
     unfiltered = h is not None and "pid.Tf" in parameters and parameters.value("pid.Tf") == 0
-    filtered = parameters | ParameterSet({"pid.Tf": Parameter(0.5 * (h or 0.0), "s")}) if unfiltered else parameters
-    return loop.open_loop(filtered, x, {loop.command.name: command})
+    return parameters | ParameterSet({"pid.Tf": Parameter(0.5 * (h or 0.0), "s")}) if unfiltered else parameters
 
 
 def inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:

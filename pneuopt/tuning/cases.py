@@ -11,6 +11,7 @@ from pneuopt.control.reference import Step
 from pneuopt.errors import ConvergenceError, InputError, check_known, require
 from pneuopt.parameters import ParameterSet
 from pneuopt.scenarios import Factor, Scenarios, applied
+from pneuopt.tuning.candidates import Space
 
 Array = NDArray[np.float64]
 
@@ -69,6 +70,13 @@ class Case:
             raise ConvergenceError(f"{self._lead}{error}", error.solution) from None
         except InputError as error:
             raise InputError(f"{self._lead}{error}") from None
+
+    def rest(self, loop: ClosedLoop, space: Space) -> Array | None:
+        """The state before the step where it does not depend on the gains."""
+        other = space.draw(np.full(len(space.names), 0.7))
+        first, second = (self.initial(loop, space.filled(point)) for point in (space.start, other))
+        scale = np.array([q.nominal for q in loop.states])
+        return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
 
     @property
     def _lead(self) -> str:

@@ -14,15 +14,8 @@ from numpy.typing import NDArray
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
 from pneuopt.nlp.sqp import SQP, Point, descend
-from pneuopt.requirements import (
-    MaxSensitivity,
-    Overshoot,
-    PeakControl,
-    SettlingTime,
-    Specification,
-    SteadyStateError,
-    name,
-)
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError, name
+from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.screening import Judge, Screened, first_population, generation, merit

@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 from pneuopt.codegen import Rollout
 from pneuopt.control.metrics import PERIODS_INSIDE, TAIL, end_mean, period_mean
 from pneuopt.nlp.sqp import Groups, Point
-from pneuopt.requirements import (
-    MaxSensitivity,
-    Overshoot,
-    PeakControl,
-    SettlingTime,
-    Specification,
-    SteadyStateError,
-)
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.specification import Specification
 from pneuopt.tuning.simulator import CONTROL, SIGNAL, Grid, Simulator, is_sound, watched
 
 Array = NDArray[np.float64]
@@ -259,7 +253,8 @@ class Linearised:
         nudged = [p, *(p + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping)]
         ends = np.tile(x_end[sound], (len(nudged), 1)), np.tile(lanes.y[sound, -1, CONTROL], len(nudged))
         stacked = np.concatenate([q[sound] for q in nudged])
-        peaks = self._simulator.sensitivities(stacked, *ends).reshape(len(nudged), -1)
+        found = self._simulator.robustness(stacked, *ends, ("MaxSensitivity",))["MaxSensitivity"]
+        peaks = found.reshape(len(nudged), -1)
         values[sound, 0] = peaks[0]
         factors = np.array([c.slopes(names) for c in self._simulator.cases])[case[sound]]
         rates = self._space.rates(points[sound]) * factors

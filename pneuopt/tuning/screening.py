@@ -14,7 +14,8 @@ from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
-from pneuopt.requirements import MaxSensitivity, Specification, name
+from pneuopt.requirements import ROBUSTNESS, most, name
+from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.simulator import Index, Mask, Responses, Simulator
 
@@ -180,26 +181,28 @@ class Judge:
     ) -> tuple[Array, Index, dict[str, Array]]:
         """Merits, worst cases and values over the cases of `lanes` and what was `seen` before.
 
-        The sensitivity, a frequency response each, costs as much as a simulation; as a limit it only adds.
+        Margins, a frequency response each, cost as much as a simulation; as limits they only add.
         """
         given = () if lanes is None else (lanes,)
         responses = self._simulator.respond(points, self._spec.band, *given)
-        plain = self._spec.without(MaxSensitivity)
+        plain = self._spec.without(ROBUSTNESS)
         values = _larger(responses.values, seen)
         merits = np.full(len(points), -np.inf)
-        if not self._spec.weight(MaxSensitivity):
+        if not self._spec.weight(ROBUSTNESS):
             merits = merit(values, plain, self._scale)
-        if self._spec.concerns(MaxSensitivity):
+        if self._spec.concerns(ROBUSTNESS):
             ahead = merits <= rivals
-            peaks = np.full(len(points), -np.inf)
-            peaks[ahead] = responses.robust(ahead)["MaxSensitivity"]
-            values = _larger({**values, "MaxSensitivity": peaks}, seen)
+            margins = {n: np.full(len(points), -np.inf) for n in self._simulator.margins}
+            robust = responses.robust(ahead)
+            for n, value in margins.items():
+                value[ahead] = robust[n]
+            values = _larger({**values, **margins}, seen)
             merits[ahead] = merit({n: value[ahead] for n, value in values.items()}, self._spec, self._scale)
         return merits, self._worst(responses, plain), values
 
     def _worst(self, responses: Responses, plain: Specification) -> Index:
-        """The case with the largest merit, the sensitivity left out."""
-        if len(self._simulator.cases) == 1 or self._spec.weight(MaxSensitivity):
+        """The case with the largest merit, margins left out."""
+        if len(self._simulator.cases) == 1 or self._spec.weight(ROBUSTNESS):
             return np.zeros(len(responses.values["Excess"]), dtype=np.intp)
         table = responses.spread(merit(responses.by_case(), plain, self._scale))
         return np.asarray(np.argmax(table, axis=1))
@@ -259,7 +262,7 @@ def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Arr
     for q, weight in spec.weights.items():
         total += weight * filled[name(q)]
     for q in spec.limits:
-        total += PENALTY * scale * np.maximum(0.0, filled[name(q)] / (q.max or 1.0) - 1)
+        total += PENALTY * scale * np.maximum(0.0, filled[name(q)] / most(q) - 1)
     return np.minimum(total, LOST)
 
 

@@ -1,7 +1,7 @@
 """`Simulator`: how many candidates respond to the references, at once and compiled, and what is read off them."""
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 from pneuopt.codegen import Pieces, Rollout
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import sensitivities
-from pneuopt.control.metrics import About, batch_metrics
+from pneuopt.control.margins import robustness
+from pneuopt.control.metrics import About, Envelope, batch_metrics
 from pneuopt.control.reference import Step
-from pneuopt.requirements import MaxSensitivity, Specification, read
+from pneuopt.requirements import AT_LEAST, ROBUSTNESS, read
 from pneuopt.scenarios import NOMINAL, Scenarios
+from pneuopt.specification import Specification
 from pneuopt.system import names
 from pneuopt.tuning.candidates import MOST_SUBSTEPS, Space, fastest, inputs, spacing, substeps
-from pneuopt.tuning.cases import Case, cases
+from pneuopt.tuning.cases import cases
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,18 +43,31 @@ class Simulator:
     space : Space
     scenarios : mapping of str to mapping, optional
         The plants beside the nominal one.
+    spec : Specification, optional
+        Whose kinds are read beside the common ones.
 
     Attributes
     ----------
     cases : tuple of Case
+    read, margins : tuple of str
+        The metrics read off the responses, and off the loop linearised about their ends.
     """
 
     def __init__(
-        self, loop: ClosedLoop, references: Sequence[Step], space: Space, scenarios: Scenarios = NOMINAL
+        self,
+        loop: ClosedLoop,
+        references: Sequence[Step],
+        space: Space,
+        scenarios: Scenarios = NOMINAL,
+        spec: Specification | None = None,
     ) -> None:
+        linearised, kinds = [k.__name__ for k in ROBUSTNESS], spec.kinds if spec else ()
+        self.read = tuple(dict.fromkeys((*READ, *(k for k in kinds if k not in linearised))))
+        self.margins = tuple(dict.fromkeys(("MaxSensitivity", *(k for k in kinds if k in linearised))))
+        self._envelope = spec.envelope if spec else ()
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
-        self._rest = [_rest(loop, space, case) for case in self.cases]
+        self._rest = [case.rest(loop, space) for case in self.cases]
         self._rollout = Rollout(watched(loop))
         self.grids = _grids(loop, references)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
@@ -61,7 +75,9 @@ class Simulator:
         self.substeps = [substeps(rate, grid.spacing) for grid in self.grids]
         slowest = 1 / max(r.horizon for r in references)
         omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
-        self._sensitivities = sensitivities(loop, omega)
+        if len(self.margins) > 1:  # unlike the sensitivity's peak, crossings lie where a slow integral puts them
+            omega = np.concatenate([np.geomspace(3e-5, 0.29, 60) * slowest, omega])
+        self._robustness = robustness(loop, omega)
 
     def only(self, chosen: Sequence[int]) -> "Simulator":
         """The same with some of the cases, by copy."""
@@ -98,7 +114,7 @@ class Simulator:
         wanted = np.ones((len(points), len(self.cases)), dtype=bool) if lanes is None else lanes
         rows, case = np.nonzero(wanted)
         p, starts = self.lanes(points, rows, case)
-        measured = Measured.empty(len(rows), len(self.loop.states))
+        measured = Measured.empty(len(rows), len(self.loop.states), self.read)
         for chunk in self._chunks(case):
             self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
         return Responses(self, wanted, p, measured)
@@ -110,23 +126,23 @@ class Simulator:
         ----------
         points : ndarray, shape (m, n)
         spec : Specification
-            Its band counts, and whether the sensitivity does.
+            Its band counts, and whether margins do.
         """
         responses = self.respond(points, spec.band)
         every = np.ones(len(points), dtype=bool)
-        return responses.robust(every) if spec.concerns(MaxSensitivity) else responses.values
+        return responses.robust(every) if spec.concerns(ROBUSTNESS) else responses.values
 
     def table(self, point: Array, spec: Specification) -> list[dict[str, float]]:
         """The metrics of one candidate, a row a case."""
         responses = self.respond(point[None], spec.band)
-        peaks = responses.sensitivities(np.ones(1, dtype=bool))[0]
-        return each({n: responses.table(n)[0] for n in READ} | {"MaxSensitivity": peaks})
+        margins = {n: table[0] for n, table in responses.margins(np.ones(1, dtype=bool)).items()}
+        return each({n: responses.table(n)[0] for n in self.read} | margins)
 
-    def sensitivities(self, p: Array, x_end: Array, commands: Array) -> Array:
-        """Ms on a grid, about the states in which the responses end; an absent filter counts as in `cut`."""
+    def robustness(self, p: Array, x_end: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
+        """Margins on a grid, about the states in which the responses end; an absent filter counts as in `cut`."""
         p, filtered = p.copy(), list(self.loop.parameters).index("pid.Tf")
         p[:, filtered] = np.where(p[:, filtered] == 0, 0.5 * (self.loop.pid.sample_time or 0.0), p[:, filtered])
-        return self._sensitivities(p, x_end[:, : len(self.loop.plant.states)], commands)
+        return self._robustness(p, x_end[:, : len(self.loop.plant.states)], commands, only)
 
     def lanes(self, points: Array, rows: Index, case: Index) -> tuple[Array, Array]:
         """Parameters and start states of lanes, each a candidate's row and a case."""
@@ -186,7 +202,7 @@ class Simulator:
             sound = is_sound(y, found.x_end[own])
             out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL]
             for period, rows in self.periods(p[own], sound):
-                for n, value in _metrics(grid, y[rows], band, period).items():
+                for n, value in _metrics(grid, y[rows], band, period, self.read, self._envelope).items():
                     out.metrics[n][chunk[own][rows]] = value
 
     def _dither_rates(self, p: Array) -> Array:
@@ -265,25 +281,25 @@ class Measured:
     command: Array
 
     @staticmethod
-    def empty(m: int, n_states: int) -> "Measured":
+    def empty(m: int, n_states: int, read: Sequence[str]) -> "Measured":
         """For m lanes, to be filled."""
         return Measured(
-            {n: np.full(m, np.inf) for n in READ}, np.zeros(m, dtype=bool), np.empty((m, n_states)), np.empty(m)
+            {n: np.full(m, np.inf) for n in read}, np.zeros(m, dtype=bool), np.empty((m, n_states)), np.empty(m)
         )
 
 
 class Responses:
-    """Simulated candidates; their sensitivities, a frequency response each, are computed only where asked for.
+    """Simulated candidates; their margins, a frequency response each, are computed only where asked for.
 
     Attributes
     ----------
     values : dict of str to ndarray, shape (m,)
-        What the requirements read but for the sensitivity, the worst over the cases that were run.
+        What the requirements read but for margins, the worst over the cases that were run.
     """
 
     def __init__(self, simulator: Simulator, lanes: Mask, p: Array, measured: Measured) -> None:
         self._simulator, self._lanes, self._p, self._measured = simulator, lanes, p, measured
-        metrics = {n: self.table(n).max(axis=1) for n in READ}
+        metrics = {n: self.table(n).max(axis=1) for n in simulator.read}
         self.values = {**read(metrics), "Excess": metrics["Excess"]}
 
     def table(self, metric: str) -> Array:
@@ -296,19 +312,23 @@ class Responses:
         return {**read(metrics), "Excess": metrics["Excess"]}
 
     def robust(self, rows: Mask) -> dict[str, Array]:
-        """The values of some candidates, with the sensitivity."""
+        """The values of some candidates, with their margins."""
         chosen = {n: value[rows] for n, value in self.values.items()}
-        return chosen | {"MaxSensitivity": np.max(self.sensitivities(rows), axis=1)}
+        margins = read(self.margins(rows))
+        ran = self._lanes[rows]
+        return chosen | {n: np.max(np.where(ran, table, -np.inf), axis=1) for n, table in margins.items()}
 
-    def sensitivities(self, rows: Mask) -> Array:
-        """Ms of some candidates, a column a case; infinite where the response runs away."""
-        measured = self._measured
-        found = np.full(len(measured.sound), np.inf)
+    def margins(self, rows: Mask) -> dict[str, Array]:
+        """Margins and peaks of some candidates, a column a case; NaN and infinite where the response runs away."""
+        measured, names = self._measured, self._simulator.margins
+        absent = {k.__name__: np.nan for k in AT_LEAST}
+        found = {n: np.full(len(measured.sound), absent.get(n, np.inf)) for n in names}
         wanted = measured.sound & rows[np.nonzero(self._lanes)[0]]
         if wanted.any():
             ends = measured.x_end[wanted], measured.command[wanted]
-            found[wanted] = self._simulator.sensitivities(self._p[wanted], *ends)
-        return self.spread(found)[rows]
+            for n, value in self._simulator.robustness(self._p[wanted], *ends, names).items():
+                found[n][wanted] = value
+        return {n: self.spread(value)[rows] for n, value in found.items()}
 
     def spread(self, lanes: Array) -> Array:
         """Numbers of the lanes as a table, shape (m, n_cases); minus infinity where a case was not run."""
@@ -358,7 +378,9 @@ def _grids(loop: ClosedLoop, references: Sequence[Step]) -> list[Grid]:
     return found
 
 
-def _metrics(grid: Grid, y: Array, band: float, period: float | None) -> dict[str, Array]:
+def _metrics(
+    grid: Grid, y: Array, band: float, period: float | None, only: Collection[str], envelope: Envelope
+) -> dict[str, Array]:
     reference, signal = grid.reference, y[:, :, SIGNAL]
     late = grid.t >= 0.8 * reference.horizon + 0.2 * reference.at
     measured = batch_metrics(
@@ -371,14 +393,8 @@ def _metrics(grid: Grid, y: Array, band: float, period: float | None) -> dict[st
         about=About.REFERENCE,
         dither_period=period,
         control=y[:, :, CONTROL],
+        envelope=envelope,
+        only=only,
     )
     measured["Excess"] = np.abs(signal[:, late] - reference.final).mean(axis=1) / abs(reference.size)
-    return {n: measured[n] for n in READ}
-
-
-def _rest(loop: ClosedLoop, space: Space, case: Case) -> Array | None:
-    """The loop's rest before the step where it does not depend on the gains."""
-    other = space.draw(np.full(len(space.names), 0.7))
-    first, second = (case.initial(loop, space.filled(point)) for point in (space.start, other))
-    scale = np.array([q.nominal for q in loop.states])
-    return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
+    return {n: measured[n] for n in only}

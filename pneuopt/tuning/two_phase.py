@@ -23,14 +23,8 @@ from pneuopt.nlp.full_space import FullSpace, prepare, solve_from
 from pneuopt.nlp.status import Solution
 from pneuopt.nlp.transcription import Cost, Limit, Phase, Transcription, Where, every
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.requirements import (
-    MaxSensitivity,
-    Overshoot,
-    PeakControl,
-    SettlingTime,
-    Specification,
-    SteadyStateError,
-)
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.specification import Specification
 from pneuopt.system import DiscreteSystem, System, discretise, names
 from pneuopt.tuning.candidates import Space, Tell, fastest, substeps
 
@@ -91,6 +85,20 @@ def is_linear(loop: ClosedLoop) -> bool:
     t, x, u, p = (ca.SX.sym(k, ode.size1_in(i)) for i, k in enumerate("txup"))
     signals = ca.vertcat(x, u)
     return not ca.depends_on(ca.jacobian(ca.vertcat(*ode(t, x, u, p)), signals), signals)
+
+
+def is_exact(spec: Specification) -> bool:
+    """Whether the two-phase problem has an equation for all that is asked for."""
+    return not _strange(spec)
+
+
+def check_exact(spec: Specification) -> None:
+    """Refuse what the problem has no equation for: `InputError` names it and the remedy."""
+    require(not _strange(spec), f"TwoPhase has no equation for {', '.join(_strange(spec))}; use method=Screening()")
+
+
+def _strange(spec: Specification) -> list[str]:
+    return [n for n in spec.kinds if n not in {k.__name__ for k in (SettlingTime, *KINDS)}]
 
 
 def unlimited(loop: ClosedLoop) -> ClosedLoop:

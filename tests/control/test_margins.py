@@ -14,7 +14,8 @@ from pneuopt.control.margins import (
     frequency_grid,
     frequency_response,
     margins,
-    sensitivities,
+    noise_gain,
+    robustness,
     sensitivity_terms,
 )
 from pneuopt.control.pid import PID
@@ -156,7 +157,8 @@ def test_many_sensitivities_are_those_of_one_loop_after_another(measured: str, s
         (loop.parameters | rig.fixed("*")).with_values({"pid.Kp": Kp, "pid.Ki": 40.0, "pid.Kd": 0.1, "pid.Tf": 0.01})
         for Kp in (1.0, 3.0, 10.0, 20.0, 60.0)
     ]
-    found = sensitivities(loop, omega)(np.array([loop.numbers(p) for p in sets]), points, commands)
+    numbers = np.array([loop.numbers(p) for p in sets])
+    found = robustness(loop, omega)(numbers, points, commands, ("MaxSensitivity",))["MaxSensitivity"]
     for p, x, command, Ms in zip(sets, points, commands, found, strict=True):
         L = frequency_response(loop.open_loop(p, x, {loop.command.name: command}), omega)
         assert_allclose(Ms, 1 / np.abs(1 + L).min(), rtol=1e-6)
@@ -167,3 +169,68 @@ def test_systems_without_a_basis_of_modes_are_solved_instead() -> None:
     omega = np.array([0.1, 1.0, 10.0])
     found = _responses(np.stack([chain, chain - np.eye(3)]), np.eye(3)[[2, 2]], np.eye(3)[[0, 0]], omega)
     assert_allclose(found, [1 / (1j * omega) ** 3, 1 / (1j * omega + 1) ** 3], rtol=1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.1, 0.3, 0.6, 0.9])
+def test_the_resonance_peak_of_a_second_order_lag(damping: float) -> None:
+    """L = w0^2/(s^2 + 2 z w0 s) closes to a second-order lag: Mt = 1/(2 z sqrt(1 - z^2)), or 1 without a resonance."""
+    m = margins(linearised([25.0], [1.0, 10.0 * damping, 0.0]))
+    peak = 1 / (2 * damping * np.sqrt(1 - damping**2)) if damping < np.sqrt(0.5) else 1.0
+    assert m.max_complementary_sensitivity == pytest.approx(peak, rel=1e-6)
+
+
+def test_the_resonance_peak_is_python_controls(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID())
+    L = loop.open_loop(loop.parameters)
+    T = control.feedback(control.ss(L.A, L.B, L.C, L.D), 1)
+    w = np.geomspace(1.0, 1e3, 20001)
+    assert margins(L).max_complementary_sensitivity == pytest.approx(np.abs(T(1j * w)).max(), rel=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(Kp=st.floats(0.02, 2.0), Ki=st.floats(0.01, 20.0), Kd=st.floats(0.0, 0.05), Tf=st.floats(1e-3, 0.1))
+def test_no_frequency_beats_the_noise_gain(Kp: float, Ki: float, Kd: float, Tf: float) -> None:
+    s = control.tf("s")
+    C = Kp + Ki / s + Kd * s / (Tf * s + 1)
+    L = 1270.12 / (s**2 + 17.5 * s + 86.34) * C
+    open_loop = linearised(list(L.num[0][0]), list(L.den[0][0]))
+    w = np.union1d(np.geomspace(1e-6, 1e6, 4000), frequency_grid(open_loop))
+    largest = np.abs(C(1j * w) / (1 + L(1j * w))).max()
+    found = noise_gain(open_loop, (Kp, Ki, Kd, Tf))
+    assert found >= largest * (1 - 1e-6)  # at rest it is approached only
+    assert found <= max(largest, Kp + Kd / Tf) * (1 + 1e-2)
+
+
+@pytest.mark.parametrize("sample_time", [None, 2e-3])
+def test_margins_on_a_grid_are_those_of_one_loop_after_another(second_order: System, sample_time: float | None) -> None:
+    loop = ClosedLoop(second_order, PID(sample_time=sample_time))
+    gains = [(0.05, 0.2, 0.0, 0.02), (0.2, 1.1, 0.009, 0.02), (0.9, 30.0, 0.0, 0.01), (4.0, 1.0, 0.2, 0.05)]
+    sets = [
+        loop.parameters.with_values(dict(zip(("pid.Kp", "pid.Ki", "pid.Kd", "pid.Tf"), g, strict=True))) for g in gains
+    ]
+    only = ("MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin", "NoiseGain")
+    p, x = np.array([loop.numbers(s) for s in sets]), np.zeros((len(sets), 2))
+    found = robustness(loop, np.geomspace(0.1, 1e4, 2000))(p, x, np.zeros(len(sets)), only)
+    exact = [margins(loop.open_loop(s)) for s in sets]
+    assert np.isfinite([m.gain_margin for m in exact]).any()
+    assert_allclose(found["GainMargin"], [m.gain_margin for m in exact], rtol=1e-3)
+    assert_allclose(found["PhaseMargin"], [m.phase_margin for m in exact], atol=0.02)
+    peaks = [[m.max_sensitivity, m.max_complementary_sensitivity] for m in exact]
+    on_grid = np.column_stack([found["MaxSensitivity"], found["MaxComplementarySensitivity"]])
+    assert_allclose(on_grid, peaks, rtol=5e-3)
+    assert np.all(on_grid <= np.array(peaks) * (1 + 1e-9))
+    gained = [noise_gain(loop.open_loop(s), g) for s, g in zip(sets, gains, strict=True)]
+    assert_allclose(found["NoiseGain"], gained, rtol=1e-3)
+
+
+def test_without_gain_there_is_no_crossing(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID())
+    p = loop.numbers(loop.parameters.with_values({"pid.Kp": 0.0, "pid.Ki": 0.0, "pid.Kd": 0.0, "pid.Tf": 0.1}))
+    found = robustness(loop, [1.0, 10.0, 100.0])(
+        p[None], np.zeros((1, 2)), np.zeros(1), ("GainMargin", "PhaseMargin", "NoiseGain")
+    )
+    assert {n: v.tolist() for n, v in found.items()} == {
+        "GainMargin": [np.inf],
+        "PhaseMargin": [np.inf],
+        "NoiseGain": [0.0],
+    }

@@ -192,3 +192,82 @@ def test_records_that_cannot_be_measured_are_refused(change: dict[str, object], 
     fields: dict[str, object] = {"t": T, "y": response(), "reference_final": 1.0, "initial": 0.0} | change
     with pytest.raises(InputError, match=message):
         step_metrics(**fields)  # type: ignore[arg-type]
+
+
+@settings(deadline=None)
+@given(size=st.floats(0.01, 100).flatmap(lambda s: st.sampled_from([s, -s])), lag=st.floats(0.3, 1.0))
+def test_integrals_of_a_first_order_lag(size: float, lag: float) -> None:
+    """Of exp(-t/T): T, T/2 and T^2, whatever the step's size."""
+    t = np.linspace(0.0, 20.0, 4001)
+    m = step_metrics(2.0 + t, 5.0 + size * (1 - np.exp(-t / lag)), 5.0 + size, 5.0, start=2.0)
+    found = [m["IAE"], m["ISE"], m["ITAE"]]
+    np.testing.assert_allclose(found, [lag, lag / 2, lag**2], rtol=1e-4)
+
+
+def test_integrals_under_dither_are_those_of_the_average() -> None:
+    t = np.linspace(0.0, 20.0, 20001)
+    y = 1 - np.exp(-t)
+    plain, dithered = (
+        step_metrics(t, y + a * np.sin(2 * np.pi * t / 0.1), 1.0, 0.0, dither_period=0.1 if a else None)
+        for a in (0.0, 0.2)
+    )
+    for key in ("IAE", "ISE", "ITAE"):
+        assert dithered[key] == pytest.approx(plain[key], rel=0.01), key
+
+
+def test_the_rate_of_a_sine_and_of_a_held_command() -> None:
+    rate = step_metrics(T, response(), 1.0, 0.0, control=0.3 * np.sin(5.0 * T))["ControlRate"]
+    assert rate == pytest.approx(1.5, rel=1e-3)
+    jumps = np.array([0.0, 1.0, 0.5, 0.5, 2.5])
+    for finer in (1, 4):
+        t = np.arange(4 * finer + 1) * (0.1 / finer)
+        held = jumps[np.minimum((np.arange(len(t)) + 1e-9) // finer, 4).astype(int)]
+        m = step_metrics(t, t, 1.0, 0.0, control=held, sample_time=0.1)
+        assert m["ControlRate"] == pytest.approx(20.0)
+    assert np.isnan(step_metrics(T, response(), 1.0, 0.0)["ControlRate"])
+
+
+def test_the_jump_at_the_step_is_no_rate() -> None:
+    u = np.where(T < 6.0, 0.0, 3.0 + np.sin(T))
+    m = step_metrics(T, response(), 1.0, 0.0, start=6.0, control=u)
+    assert m["ControlRate"] <= 1.0
+    assert m["PeakControl"] == pytest.approx(4.0, abs=1e-3)
+
+
+ENVELOPE = ((0.0, -0.2, 1.6), (2.0, 0.7, 1.3), (6.0, 0.9, 1.1))
+
+
+def test_the_envelopes_bounds_hold_from_instant_to_instant() -> None:
+    for rises, used in ((400, 0.7 / 0.9), (401, 1.0 / 0.3)):  # the sample at 2 s, the one after
+        late = step_metrics(T, np.where(np.arange(len(T)) >= rises, 1.0, 0.0), 1.0, 0.0, envelope=ENVELOPE)
+        assert late["StepEnvelope"] == pytest.approx(used)
+    ramp = step_metrics(T, T / 2.0, 1.0, 0.0, envelope=ENVELOPE[:1])["StepEnvelope"]
+    assert ramp == pytest.approx((6.0 - 0.7) / 0.9)
+    for at, edge in ((1.0, 1.6), (3.0, 0.7), (8.0, 1.1)):
+        for share, kept in ((0.99, True), (1.01, False)):
+            y = 1.0 + share * (edge - 1.0) * (np.abs(T - at) < 0.1)
+            assert (step_metrics(T, y, 1.0, 0.0, envelope=ENVELOPE)["StepEnvelope"] <= 1.0) == kept, at
+    assert "StepEnvelope" not in step_metrics(T, response(), 1.0, 0.0)
+
+
+@given(size=st.floats(0.01, 100).flatmap(lambda s: st.sampled_from([s, -s])), shift=st.floats(-5, 5))
+def test_the_envelope_moves_with_the_step(size: float, shift: float) -> None:
+    y = response()
+    plain = step_metrics(T, y, 1.0, 0.0, envelope=ENVELOPE)["StepEnvelope"]
+    moved = step_metrics(T, shift + size * y, shift + size, shift, envelope=ENVELOPE)["StepEnvelope"]
+    assert moved == pytest.approx(plain, rel=1e-9 * max(1.0, abs(shift / size)))
+
+
+def test_an_envelopes_edge_between_samples_counts() -> None:
+    """A ramp that is out of bounds between two samples only, where the bounds change."""
+    t = np.linspace(0.0, 2.0, 3)
+    used = step_metrics(t, t, 2.0, 0.0, envelope=((0.0, -0.1, 0.3), (0.5, 0.1, 2.0)))["StepEnvelope"]
+    assert used == pytest.approx(max(abs(0.25 - 0.1) / 0.2, (1.05 - 0.25) / 0.95))
+
+
+def test_what_is_not_asked_for_is_left_out() -> None:
+    rows = response()[None]
+    few = batch_metrics(T, rows, 1.0, 0.0, control=rows, only=("SettlingTime",))
+    all_ = batch_metrics(T, rows, 1.0, 0.0, control=rows)
+    assert set(all_) - set(few) == {"IAE", "ISE", "ITAE", "ControlRate"}
+    assert set(batch_metrics(T, rows, 1.0, 0.0, control=rows, only=("ISE",))) >= {"IAE", "ISE", "ITAE"}

@@ -15,16 +15,9 @@ from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import Integrator
 from pneuopt.nlp.status import Code
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import (
-    MaxSensitivity,
-    Overshoot,
-    PeakControl,
-    Requirement,
-    SettlingTime,
-    SteadyStateError,
-    specify,
-)
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
 from pneuopt.scenarios import Scenarios, corners, tolerances
+from pneuopt.specification import specify
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed

@@ -15,8 +15,9 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import Integrator
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, specify
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
 from pneuopt.scenarios import Factor, Scenarios, applied, corners, samples, tolerances
+from pneuopt.specification import specify
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.cases import cases

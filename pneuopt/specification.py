@@ -1,0 +1,142 @@
+"""`Specification`: the objective and the limits of a tuning, checked, and what values are worth by them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import inf
+
+from pneuopt.errors import require
+from pneuopt.requirements import (
+    AT_LEAST,
+    KINDS,
+    Bounds,
+    MaxComplementarySensitivity,
+    MaxSensitivity,
+    PeakControl,
+    Requirement,
+    SettlingTime,
+    StepEnvelope,
+    most,
+    name,
+)
+
+Kind = type | tuple[type, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Specification:
+    """An objective and its limits, checked.
+
+    Attributes
+    ----------
+    weights : mapping of Requirement to float
+        The terms of the objective.
+    limits : tuple of Requirement
+        At most one of a kind, the tightest.
+    band : float
+        The settling band, the same wherever one is named; 2 % otherwise.
+    """
+
+    weights: Mapping[Requirement, float]
+    limits: tuple[Requirement, ...]
+    band: float
+
+    @property
+    def envelope(self) -> Bounds:
+        """The bounds of its `StepEnvelope`; none without."""
+        return next((q.bounds for q in (*self.weights, *self.limits) if isinstance(q, StepEnvelope)), ())
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The names of what it limits or minimises."""
+        return tuple(dict.fromkeys(name(q) for q in (*self.weights, *self.limits)))
+
+    def limit(self, kind: Kind) -> float:
+        """The largest value allowed for this kind of requirement, as `most`; inf where there is none."""
+        return next((most(q) for q in self.limits if isinstance(q, kind)), inf)
+
+    def weight(self, kind: Kind) -> float:
+        """The weight of this kind of requirement in the objective; 0 where it is no term."""
+        return next((w for q, w in self.weights.items() if isinstance(q, kind)), 0.0)
+
+    def concerns(self, kind: Kind) -> bool:
+        """Whether this kind of requirement is a term or a limit."""
+        return self.weight(kind) > 0 or self.limit(kind) < inf
+
+    def tightened(self, margin: float, peaks: float) -> "Specification":
+        """Band and values allowed smaller by `margin`, a share; peak control and sensitivities by the share `peaks`.
+
+        An optimum lies on its limits: found on tightened ones, it keeps those asked for when simulated and printed.
+        """
+        room: dict[type, float] = {SettlingTime: 0.0}
+        room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
+        limits = tuple(_allowing(q, most(q) * (1 - room.get(type(q), margin))) for q in self.limits)
+        return replace(self, limits=limits, band=self.band * (1 - margin))
+
+    def without(self, kind: Kind) -> "Specification":
+        """The same without the limit of this kind, by copy."""
+        return replace(self, limits=tuple(q for q in self.limits if not isinstance(q, kind)))
+
+    def with_band(self, band: float) -> "Specification":
+        """Another settling band, by copy."""
+        return replace(self, band=band)
+
+    def objective(self, values: Mapping[str, float]) -> float:
+        """The weighted sum, of values by kind as `read` gives them."""
+        return sum(weight * values[name(q)] for q, weight in self.weights.items())
+
+    def violated(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
+        """The limits that `values` do not keep, NaN among them; `slack` is relative."""
+        return tuple(q for q in self.limits if not values[name(q)] <= most(q) * (1 + slack))
+
+
+def specify(
+    minimise: Requirement | Mapping[Requirement, float], subject_to: Sequence[Requirement] = ()
+) -> Specification:
+    """Check an objective and its limits.
+
+    Parameters
+    ----------
+    minimise : Requirement, or mapping of Requirement to weight
+        A term with a bound is a limit as well.
+    subject_to : sequence of Requirement
+
+    Raises
+    ------
+    InputError
+        If a limit has no bound, a weight is not positive, a kind is weighted twice, or bands or envelopes differ.
+
+    Examples
+    --------
+    >>> from pneuopt.requirements import Overshoot
+    >>> spec = specify({SettlingTime(): 1.0, Overshoot(): 2.0}, [MaxSensitivity(1.6)])
+    >>> spec.objective({"SettlingTime": 0.3, "Overshoot": 0.05, "MaxSensitivity": 1.5})
+    0.4
+    """
+    weights = dict(minimise) if isinstance(minimise, Mapping) else {minimise: 1.0}
+    require(len(weights) > 0, "minimise is empty: name at least one requirement, SettlingTime() say")
+    for q in (*weights, *subject_to):
+        known = ", ".join(k.__name__ for k in KINDS)
+        require(isinstance(q, Requirement), f"{q!r} is no requirement; write {known}, as in Overshoot(max=0.05)")
+    for q, weight in weights.items():
+        require(0 < weight < inf, f"the weight of {name(q)} must be positive, got {weight:g}")
+    for q in subject_to:
+        bound = "min" if isinstance(q, AT_LEAST) else "max"
+        require(most(q) < inf, f"{name(q)} in subject_to has no limit; write {name(q)}({bound}=...)")
+    terms = [name(q) for q in weights]
+    require(len(set(terms)) == len(terms), f"minimise names a kind of requirement twice: {', '.join(terms)}")
+    bands = {q.band for q in (*weights, *subject_to) if isinstance(q, SettlingTime)}
+    require(len(bands) <= 1, f"settling bands differ: {sorted(bands)}; one band holds for the whole tuning")
+    tubes = {q.bounds for q in (*weights, *subject_to) if isinstance(q, StepEnvelope)}
+    require(len(tubes) <= 1, "two StepEnvelopes differ; join them to one")
+    limits: dict[str, Requirement] = {}
+    for q in (*weights, *subject_to):
+        if most(q) < (most(limits[name(q)]) if name(q) in limits else inf):
+            limits[name(q)] = q
+    return Specification(weights, tuple(limits.values()), next(iter(bands), 0.02))
+
+
+def _allowing(requirement: Requirement, value: float) -> Requirement:
+    """The same with another largest value, by copy."""
+    if isinstance(requirement, AT_LEAST):
+        return replace(requirement, min=1 / value)
+    return replace(requirement, max=value)

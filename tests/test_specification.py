@@ -1,0 +1,90 @@
+import math
+
+import pytest
+
+from pneuopt.errors import InputError
+from pneuopt.requirements import (
+    GainMargin,
+    MaxComplementarySensitivity,
+    MaxSensitivity,
+    Overshoot,
+    PeakControl,
+    PhaseMargin,
+    Requirement,
+    SettlingTime,
+    StepEnvelope,
+)
+from pneuopt.specification import specify
+
+TUBE, OTHER = ((0.0, -0.1, 1.1), (0.5, 0.9, 1.1)), ((0.0, -0.2, 1.2),)
+
+
+def test_a_term_with_a_limit_is_both() -> None:
+    spec = specify(SettlingTime(band=0.05, max=0.4), [Overshoot(0.1)])
+    assert spec.band == 0.05
+    assert spec.weight(SettlingTime) == 1.0
+    assert (spec.limit(SettlingTime), spec.limit(Overshoot), spec.limit(PeakControl)) == (0.4, 0.1, math.inf)
+    assert not spec.concerns(PeakControl)
+    assert spec.kinds == ("SettlingTime", "Overshoot")
+
+
+def test_the_tightest_limit_counts() -> None:
+    spec = specify(SettlingTime(), [Overshoot(0.1), Overshoot(0.02), Overshoot(0.05)])
+    assert spec.limit(Overshoot) == 0.02
+    margins = specify(SettlingTime(), [PhaseMargin(30.0), PhaseMargin(60.0), PhaseMargin(45.0)])
+    assert margins.limits == (PhaseMargin(60.0),)
+
+
+def test_violated_names_what_is_not_kept_nan_included() -> None:
+    spec = specify(SettlingTime(max=1.0), [Overshoot(0.1), MaxSensitivity(1.6), GainMargin(2.0), PhaseMargin(45.0)])
+    values = {"SettlingTime": math.nan, "Overshoot": 0.1, "MaxSensitivity": 1.7, "GainMargin": 0.6, "PhaseMargin": 0.02}
+    assert [type(q) for q in spec.violated(values)] == [SettlingTime, MaxSensitivity, GainMargin]
+
+
+def test_tightening_leaves_room_inside() -> None:
+    limits: list[Requirement] = [
+        Overshoot(0.1),
+        MaxSensitivity(1.6),
+        MaxComplementarySensitivity(1.3),
+        GainMargin(3.0),
+        StepEnvelope(TUBE),
+    ]
+    spec = specify(SettlingTime(band=0.02, max=1.0), limits).tightened(0.03, 1e-4)
+    assert spec.band == pytest.approx(0.0194)
+    assert spec.limit(Overshoot) == pytest.approx(0.097)
+    assert spec.limit(MaxSensitivity) == pytest.approx(1.6 * (1 - 1e-4))
+    assert spec.limit(MaxComplementarySensitivity) == pytest.approx(1.3 * (1 - 1e-4))
+    assert spec.limit(SettlingTime) == 1.0
+    assert spec.limit(StepEnvelope) == pytest.approx(0.97)
+    assert next(q.min for q in spec.limits if isinstance(q, GainMargin)) == pytest.approx(3.0 / 0.97)
+
+
+def test_several_kinds_are_asked_about_at_once() -> None:
+    spec = specify(SettlingTime(), [PhaseMargin(45.0), Overshoot(0.1)])
+    assert spec.concerns((MaxSensitivity, PhaseMargin))
+    assert not spec.concerns((MaxSensitivity, GainMargin))
+    assert spec.without((MaxSensitivity, PhaseMargin)).limits == (Overshoot(0.1),)
+
+
+def test_the_envelope_is_that_of_a_term_or_limit() -> None:
+    assert specify(SettlingTime()).envelope == ()
+    assert specify(SettlingTime(), [StepEnvelope(TUBE)]).envelope == TUBE
+    assert specify(StepEnvelope(TUBE, max=None)).limits == ()
+
+
+@pytest.mark.parametrize(
+    ("minimise", "subject_to", "words"),
+    [
+        (SettlingTime(), [Overshoot()], r"Overshoot\(max="),
+        (SettlingTime(), [PhaseMargin()], r"PhaseMargin\(min="),
+        (SettlingTime(), [StepEnvelope(TUBE), StepEnvelope(OTHER)], "two StepEnvelopes differ"),
+        ({}, [], "minimise is empty"),
+        ({SettlingTime(): 0.0}, [], "weight of SettlingTime"),
+        ({Overshoot(): 1.0, Overshoot(0.1): 1.0}, [], "twice"),
+        (SettlingTime(band=0.02), [SettlingTime(band=0.05, max=1.0)], "bands differ"),
+        ("settling_time", [], "is no requirement"),
+    ],
+)
+def test_a_bad_specification_is_refused(minimise: Requirement, subject_to: list[Requirement], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        specify(minimise, subject_to)

@@ -1,0 +1,168 @@
+"""Every kind of requirement as objective, weighted term and limit: found by the search, certified by the simulation."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pneuopt.certify import evaluate
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder, SecondOrder
+from pneuopt.nlp.status import Code
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import (
+    IAE,
+    ISE,
+    ITAE,
+    ControlRate,
+    GainMargin,
+    MaxComplementarySensitivity,
+    MaxSensitivity,
+    NoiseGain,
+    Overshoot,
+    PeakControl,
+    PhaseMargin,
+    Requirement,
+    Ripple,
+    RiseTime,
+    SettlingTime,
+    StepEnvelope,
+    most,
+    name,
+    read,
+)
+from pneuopt.tune import TuningResult, tune
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.two_phase import TwoPhase
+
+FAST = Screening(members=10, generations=4, bands=(0.1,), refinements=50)
+STEP, SETTLING = Step(1.0, horizon=1.5), SettlingTime()
+TUBE = ((0.0, -0.1, 1.1), (0.3, 0.8, 1.05), (0.8, 0.97, 1.03))
+FREE = {"pid.Kp": (0.02, 1.0), "pid.Ki": (0.1, 20.0)}
+
+
+def speed_loop() -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(SecondOrder().system(), PID(sample_time=2e-3))
+    return loop, loop.parameters.with_values({"pid.Kp": 0.1, "pid.Ki": 1.0}).with_bounds(FREE).freed(*FREE)
+
+
+@cache
+def tuned(*limits: Requirement, minimise: Requirement = SETTLING) -> TuningResult:
+    loop, given = speed_loop()
+    return tune(loop, STEP, given, minimise=minimise, subject_to=limits, method=FAST, throw=False)
+
+
+def column(table: pd.DataFrame, case: str = "0 to 1") -> dict[str, float]:
+    return {str(n): float(v) for n, v in zip(table.index, table[case].to_numpy(dtype=float), strict=True)}
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [
+        RiseTime(0.12),
+        Ripple(0.002),
+        IAE(0.16),
+        ISE(0.1),
+        ITAE(0.03),
+        StepEnvelope(TUBE),
+        ControlRate(6.0),
+        MaxComplementarySensitivity(1.01),
+        GainMargin(60.0),
+        PhaseMargin(66.0),
+        NoiseGain(1.05),
+    ],
+    ids=name,
+)
+def test_each_kind_is_a_limit_that_is_certified(limit: Requirement) -> None:
+    """Found by the search, kept by the independent simulation, which reads what the search claims."""
+    found = tuned(limit)
+    assert found.status.converged, found.status
+    certified, kind = column(found.certified), name(limit)
+    assert read(certified)[kind] <= most(limit)
+    assert column(found.claimed)[kind] == pytest.approx(certified[kind], rel=2e-3, abs=1e-5)
+
+
+def test_a_limit_changes_the_answer() -> None:
+    free, held = tuned(), tuned(PhaseMargin(72.0))
+    assert free.status.converged
+    assert held.status.converged, held.status
+    assert 72.0 <= column(held.certified)["PhaseMargin"] <= 76.0
+    assert "PhaseMargin" in held.active
+    assert column(held.certified)["SettlingTime"] > column(free.certified)["SettlingTime"]
+
+
+def test_what_cannot_be_kept_is_said_as_it_was_asked() -> None:
+    found = tuned(PhaseMargin(179.0))
+    assert found.status.code is Code.INFEASIBLE
+    assert "at least 179; relax a limit" in found.status.message
+
+
+@pytest.mark.parametrize("kind", [IAE, ISE, ITAE, GainMargin, PhaseMargin, NoiseGain, MaxComplementarySensitivity])
+def test_each_kind_is_an_objective(kind: type[Requirement]) -> None:
+    """Whatever is minimised ends better than where another one is."""
+    other = tuned(RiseTime(0.3), minimise=ControlRate())
+    best = tuned(RiseTime(0.3), minimise=kind())  # type: ignore[call-arg]
+    assert best.status.converged, best.status
+    loop, given = speed_loop()
+    values = [read(column(evaluate(loop, STEP, given | found.parameters)))[kind.__name__] for found in (best, other)]
+    assert values[0] <= values[1] * (1 + 1e-3)
+
+
+def test_a_weighted_term_shifts_the_compromise() -> None:
+    (loop, given), gains = speed_loop(), list[float]()
+    for weight in (1e-3, 1.0):
+        found = tune(loop, STEP, given, minimise={ITAE(): 1.0, NoiseGain(): weight}, method=FAST)
+        gains.append(column(found.certified)["NoiseGain"])
+    assert gains[1] < gains[0]
+
+
+def test_a_linear_loop_is_screened_where_the_exact_problem_has_no_equation() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
+    limits: list[Requirement] = [PeakControl(4.0), ControlRate(30.0)]
+    with pytest.raises(InputError, match=r"TwoPhase has no equation for IAE, ControlRate; use method=Screening\(\)"):
+        tune(loop, Step(1.0), given, minimise=IAE(), subject_to=limits, method=TwoPhase())
+    found = tune(loop, Step(1.0), given, minimise=IAE(), subject_to=limits)
+    assert column(found.certified)["ControlRate"] <= 30.0
+    assert "simulations" in found.stats
+
+
+def test_margins_of_a_drive_with_friction_hold_about_the_moving_reference() -> None:
+    """Friction's slope at the speed reached counts: a falling one costs phase where the drive creeps."""
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=1e-3))
+    given = loop.parameters.with_values({"pid.Kp": 300.0, "pid.Ki": 4000.0})
+    slow, fast = (column(evaluate(loop, Step(v, horizon=1.0), given), f"0 to {v:g}") for v in (0.03, 0.2))
+    assert slow["PhaseMargin"] < fast["PhaseMargin"] - 1.0
+    assert slow["MaxSensitivity"] > fast["MaxSensitivity"]
+
+
+def test_an_unstable_loop_has_no_margins() -> None:
+    loop = ClosedLoop(SecondOrder().system(), PID(sample_time=2e-3))
+    given = loop.parameters.with_values({"pid.Kp": 0.9, "pid.Ki": 30.0, "pid.lower": -1.0, "pid.upper": 1.0})
+    found = column(evaluate(loop, Step(0.1, horizon=0.5), given), "0 to 0.1")
+    assert found["MaxSensitivity"] == found["MaxComplementarySensitivity"] == found["NoiseGain"] == math.inf
+    assert np.isnan([found["GainMargin"], found["PhaseMargin"]]).all()
+
+
+def test_margins_hold_on_every_scenarios_plant() -> None:
+    loop, given = speed_loop()
+    stronger = {"stronger": {"plant.gain": 1.5 * given.value("plant.gain")}}
+    found = tune(
+        loop,
+        STEP,
+        given,
+        minimise=SettlingTime(),
+        subject_to=[PhaseMargin(50.0), MaxSensitivity(1.8), Overshoot(0.1)],
+        scenarios=stronger,
+        method=FAST,
+    )
+    margins = [column(found.certified, case)["PhaseMargin"] for case in ("0 to 1", "0 to 1 [stronger]")]
+    assert min(margins) >= 50.0
+    assert margins[1] < margins[0]
