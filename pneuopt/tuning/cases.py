@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError, check_known, require
+from pneuopt.errors import ConvergenceError, HardwareError, InputError, check_known, require
 from pneuopt.parameters import ParameterSet
 from pneuopt.scenarios import Factor, Scenarios, applied
 from pneuopt.tuning.candidates import Space
@@ -68,6 +68,8 @@ class Case:
             return loop.initial(own, reference=step.initial, start=step.start)
         except ConvergenceError as error:
             raise ConvergenceError(f"{self._lead}{error}", error.solution) from None
+        except HardwareError as error:
+            raise HardwareError(f"{self._lead}{error}", error.parameter, error.remedy) from None
         except InputError as error:
             raise InputError(f"{self._lead}{error}") from None
 
