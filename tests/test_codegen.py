@@ -149,9 +149,9 @@ def test_the_number_of_lanes_changes_nothing(lanes: int, name: str) -> None:
 
 
 @needs_compiler
-def test_lanes_are_as_many_as_the_cpu_has() -> None:
+def test_lanes_are_as_many_as_pay_on_the_cpu() -> None:
     flags = compiler._cpu().split()
-    expected = 8 if "avx512f" in flags else 4 if "avx" in flags else 2
+    expected = 4 if "avx" in flags else 2  # eight, under AVX-512, took longer than four
     assert Case("stribeck").rollout().lanes == expected
 
 
