@@ -102,8 +102,8 @@ class Rollout:
     threads : int, optional
         Default: one a processor.
     lanes : int, optional
-        Segments that one processor runs at once, a power of 2. Default: as many as pay on the CPU, 4 with AVX, or one where
-        the compiler knows no vectors; 0: the CasADi VM.
+        Segments that one processor runs at once, a power of 2. Default: as many as pay on the CPU (4 with AVX), or one
+        where the compiler knows no vectors; 0: the CasADi VM.
 
     Attributes
     ----------
