@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import b32
-import coverage
+import interval_coverage
 import mismatch
 import numpy as np
 import pandas as pd
@@ -19,8 +19,8 @@ def failed(rows: pd.DataFrame) -> list[str]:
 def coverage_rows(covered: float) -> pd.DataFrame:
     """400 draws, whose intervals hold the truth in this share."""
     held = np.arange(400) < 400 * covered
-    rows = {f"covered {n}": held.astype(float) for n in coverage.WANTED}
-    scaled = {f"scaled {n}": np.random.default_rng(0).standard_normal(400) for n in coverage.WANTED}
+    rows = {f"covered {n}": held.astype(float) for n in interval_coverage.WANTED}
+    scaled = {f"scaled {n}": np.random.default_rng(0).standard_normal(400) for n in interval_coverage.WANTED}
     return pd.DataFrame(rows | scaled | {"converged": 1.0, "misfit": 1.0, "seconds": 0.6})
 
 
@@ -28,21 +28,25 @@ def coverage_rows(covered: float) -> pd.DataFrame:
     ("covered", "holds"), [(0.91, False), (0.925, True), (0.95, True), (0.975, True), (0.99, False)]
 )
 def test_400_draws_are_held_to_92_to_98_percent(covered: float, holds: bool) -> None:
-    claims = {c.name: c for c in coverage._claims("right", coverage_rows(covered))}
+    claims = {c.name: c for c in interval_coverage._claims("right", coverage_rows(covered))}
     assert claims["right.friction.static"].holds is holds
     assert claims["right.scaled_error"].holds
-    assert all(c.bound == "" for c in coverage._claims("wrong", coverage_rows(covered)))
+    assert all(c.bound == "" for c in interval_coverage._claims("wrong", coverage_rows(covered)))
 
 
 def test_what_did_not_converge_covers_nothing_and_is_counted() -> None:
     rows = coverage_rows(1.0)
     rows.loc[:39, "converged"] = 0.0
-    claims = {c.name: c for c in coverage._claims("right", rows)}
+    claims = {c.name: c for c in interval_coverage._claims("right", rows)}
     assert (claims["right.converged"].value, claims["right.converged"].holds) == (90, False)
 
 
 def test_draws_share_the_exact_log_and_state_their_noise() -> None:
-    one, two, wrong = coverage.drawn("right", 1), coverage.drawn("right", 2), coverage.drawn("wrong", 1)
+    one, two, wrong = (
+        interval_coverage.drawn("right", 1),
+        interval_coverage.drawn("right", 2),
+        interval_coverage.drawn("wrong", 1),
+    )
     assert np.array_equal(one.trajectory["valve_voltage"], two.trajectory["valve_voltage"])
     apart = one.trajectory["position"] - two.trajectory["position"]
     assert np.std(apart) == pytest.approx(np.sqrt(2) * b32.NOISE["position"], rel=0.05)
@@ -71,9 +75,9 @@ def test_the_rig_sticks_where_the_smooth_model_creeps(monkeypatch: pytest.Monkey
 
 @pytest.mark.slow
 def test_coverage(tmp_path: Path) -> None:
-    draws = coverage.run(6, cases=("right", "estimated"))
-    assert failed(coverage.main(draws)) == []
-    coverage.figure(draws).savefig(tmp_path / "coverage.png")
+    draws = interval_coverage.run(6, cases=("right", "estimated"))
+    assert failed(interval_coverage.main(draws)) == []
+    interval_coverage.figure(draws).savefig(tmp_path / "coverage.png")
     assert (tmp_path / "coverage.png").stat().st_size > 10_000
 
 

@@ -1,6 +1,7 @@
 """Whether a 95 % confidence interval holds the truth 95 times in 100: b32.py's log under many draws of its noise.
 
-    python problems/coverage.py [--count N] [--first SEED] [--case right|wrong|estimated] [--json FILE] [--out DIR]
+    python problems/interval_coverage.py [--count N] [--first SEED] [--case right|wrong|estimated] [--json FILE]
+                                         [--out DIR]
 
 The exact log is generated once, its noise drawn anew; each draw is identified without a guess, six parameters free.
 `right`: the log states its noise levels. `wrong`: it states three times the position's, a fifth of pressure a's and
