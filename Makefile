@@ -13,10 +13,10 @@ demo: .venv/installed
 	$(PY) problems/rig_demo.py --out out
 
 test: .venv/installed lint
-	$(PY) -m pytest --cov --cov-report=term
+	$(PY) -m pytest -n 2 --cov --cov-report=term
 
 test-slow: .venv/installed
-	$(PY) -m pytest -m slow
+	$(PY) -m pytest -n 2 -m slow
 
 lint: .venv/installed
 	$(PY) -m ruff format --check .

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,6 +21,7 @@ from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.parameters import ParameterSet
 from pneuopt.plotting import (
     Response,
+    friction_force,
     has_friction_map,
     plot_bode,
     plot_correlation,
@@ -236,6 +238,30 @@ def test_steps_show_band_reference_and_command() -> None:
         plot_steps([])
 
 
+def test_friction_along_a_run_is_what_the_balance_of_forces_leaves() -> None:
+    drive, t = PneumaticDrive(friction=LuGre()), np.linspace(0, 1, 400)
+    p = drive.parameters
+    speed, bristle = 0.1 * np.sin(9 * t), 3e-4 * np.sin(5 * t)
+    rest = drive.rest(p)
+    states = {n: np.full(len(t), x) for n, x in rest.states.items()} | {"speed": speed, "friction.bristle": bristle}
+    run = Trajectory(t, {**states, "valve_voltage": 0 * t})
+    g = LuGre().force
+    z = {q.name: ca.SX.sym(q.name) for q in LuGre().states}
+    v, values = ca.SX.sym("v"), {n: ca.SX(q.value) for n, q in LuGre().parameters.items()}
+    force = ca.Function("force", [v, *z.values()], [g(v, z, {}, values).value])
+    assert friction_force(drive.system(), run, p) == pytest.approx(np.array(force(speed, bristle)).ravel(), abs=0.02)  # end stops
+
+
+def test_steps_show_what_goes_on_inside_where_it_is_known() -> None:
+    t = np.linspace(0, 1, 101)
+    run = Trajectory(t, {"speed": t, "control": t, "valve.spool": 0.1 * t, "friction.force": 40 * t})
+    before = run.with_columns({"friction.force": 20 * t})
+    figure = plot_steps([Response(run, Step(1.0, horizon=1.0), "speed", ("m/s", "V"), before)])
+    assert [a.get_ylabel() for a in figure.axes] == ["speed [m/s]", "command [V]", "valve [%]", "friction [N]"]
+    assert np.asarray(figure.axes[2].lines[-1].get_ydata())[-1] == pytest.approx(10.0)
+    assert [np.asarray(q.get_ydata())[-1] for q in figure.axes[3].lines] == [20, 40]
+
+
 def test_under_dither_the_average_is_drawn_that_the_metrics_read() -> None:
     t = np.linspace(0, 1, 1001)
     run = Trajectory(t, {"speed": 0.2 + 0.05 * np.sin(2 * np.pi * 50 * t), "control": t})
@@ -250,7 +276,7 @@ def test_bode_marks_the_margins(gain: float) -> None:
     A, B, C, D = TRIPLE, np.array([[0.0], [0.0], [gain]]), np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1))
     loop = Linearisation(A, B, C, D, ("x", "v", "a"), ("u",), ("x",))
     m, figure = margins(loop), plot_bode(loop)
-    top, bottom = figure.axes
+    top, bottom, peaks = figure.axes
     labels = [q.get_text() for q in figure.legends[0].get_texts()]
     assert labels == [
         f"gain margin {20 * np.log10(m.gain_margin):.1f} dB at {m.phase_crossover:.3g} rad/s",
@@ -261,13 +287,23 @@ def test_bode_marks_the_margins(gain: float) -> None:
     assert ends[1] - ends[0] == pytest.approx(m.phase_margin, abs=0.05)
     assert line(top, labels[0])[1][1] == pytest.approx(-20 * np.log10(m.gain_margin))
     assert ("UNSTABLE" in top.get_title()) == (gain > 2)
-    assert texts(bottom).startswith("frequency [rad/s]|phase [deg]")
+    assert texts(peaks).startswith("frequency [rad/s]|")
+    assert np.max(peaks.lines[0].get_ydata()) == pytest.approx(m.max_sensitivity, rel=1e-3)
+    assert np.max(peaks.lines[1].get_ydata()) == pytest.approx(m.max_complementary_sensitivity, rel=1e-3)
+
+
+def test_bode_shows_the_loop_before_in_grey() -> None:
+    figure = plot_bode(lag(5.0), lag(0.5))
+    top = figure.axes[0]
+    assert [q.get_label() for q in top.lines[:2]] == ["before", "tuned"]
+    earlier, later = (np.asarray(q.get_ydata()) for q in top.lines[:2])
+    assert later - earlier == pytest.approx(20.0)  # ten times the gain
 
 
 def test_a_loop_without_crossings_has_no_marks() -> None:
     figure = plot_bode(lag(0.5))
     assert figure.legends == []
-    assert "Ms = 1" in figure.axes[0].get_title()
+    assert "Ms = 1," in figure.axes[0].get_title()
 
 
 def study(masses: Sequence[float], pressures: Sequence[float], errors: Mapping[int, str] | None = None) -> pd.DataFrame:

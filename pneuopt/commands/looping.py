@@ -23,16 +23,19 @@ from pneuopt.commands.shared import (
     read_loop,
     write_csv,
 )
-from pneuopt.console import progress, screen, show_gains, show_metrics, show_rejected, show_status
+from pneuopt.console import progress, screen, show_gains, show_metrics, show_rejected, show_status, show_validation
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.errors import ConvergenceError, InputError, require
+from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.nlp.status import Code
 from pneuopt.output import check_outputs, records
 from pneuopt.parameters import ParameterSet
-from pneuopt.plotting import Response, plot_bode, plot_steps
+from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
+from pneuopt.system import Linearisation
 from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult, tune
+from pneuopt.tuning.candidates import cut
 from pneuopt.tuningfile import Tuning, write_tuned
 
 if TYPE_CHECKING:
@@ -59,11 +62,14 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
             progress=tell,
         )
     result = replace(result, provenance={**result.provenance, **hashes(fit, tuning)})
-    console = screen()
+    console, validation = screen(), None
     show_status(console, result.status)
     if result.status.converged:
         show_gains(console, parameters, result.parameters)
         show_metrics(console, result.certified, asked.loop, before=_before(asked, parameters), limits=asked.subject_to)
+        validation = _validation(asked, parameters, result)
+        if validation is not None:
+            show_validation(console, validation, asked.loop)
     else:
         word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
         show_rejected(console, tuning, result.stats, parameters, word)
@@ -77,7 +83,8 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     if outputs.plot is not None:
         before_gains = parameters if result.status.converged else None
         writers |= figure_writers(outputs.plot, _loop_figures(asked, result.parameters, before_gains))
-    return finish(outputs, writers, _tuning_tables(result) | background(result), result.status)
+    tables = _tuning_tables(result) | ({} if validation is None else {"validation": records(validation.summary)})
+    return finish(outputs, writers, tables | background(result), result.status)
 
 
 def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
@@ -107,6 +114,21 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     return finish(outputs, writers, tables, None)
 
 
+def _validation(asked: Tuning, parameters: ParameterSet, result: TuningResult) -> DesignValidation | None:
+    """Fresh plants from the boxes of the scenarios; None without scenarios."""
+    fresh = asked.fresh(parameters)
+    if not fresh:
+        return None
+    return validate_design(
+        asked.loop,
+        asked.references,
+        result.parameters,
+        minimise=asked.minimise,
+        subject_to=asked.subject_to,
+        scenarios=fresh,
+    )
+
+
 def _before(asked: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
     """The metrics with the gains as given; None where that loop cannot be simulated."""
     try:
@@ -126,26 +148,41 @@ def _responses(asked: Tuning, parameters: ParameterSet, before: ParameterSet | N
     loop, units = asked.loop, (asked.loop.feedback.unit, asked.loop.command.unit)
     found = []
     for reference in asked.references:
-        run = respond(loop, reference, parameters)
-        earlier = None if before is None else _response_before(loop, reference, before)
+        run = _run(loop, reference, parameters)
+        earlier = None if before is None else _run_before(loop, reference, before)
         found.append(Response(run, reference, loop.feedback.name, units, earlier, loop.dither_period(parameters)))
     return found
 
 
-def _response_before(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
+def _run(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory:
+    """The response, with the friction force where the plant has one."""
+    run, plant = respond(loop, reference, parameters), loop.plant
+    if not plant.states or not has_friction_map(plant):
+        return run
+    others = {q.name: np.zeros(len(run)) for q in plant.inputs if q.name not in run}
+    whole = run.with_columns({**others, loop.command.name: run["control"]})
+    return run.with_columns({"friction.force": friction_force(plant, whole, loop.parameters | parameters)})
+
+
+def _run_before(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
     try:
-        return respond(loop, reference, parameters)
+        return _run(loop, reference, parameters)
     except (ConvergenceError, InputError):
         return None
 
 
 def _loop_figures(asked: Tuning, parameters: ParameterSet, before: ParameterSet | None) -> dict[str, "Figure"]:
-    """The steps, and the Bode plot about the state in which the first one ends."""
+    """The steps, and the Bode plot about the state in which the first one ends, before about where that one did."""
     responses = _responses(asked, parameters, before)
-    loop, run = asked.loop, responses[0].run
+    first = responses[0]
+    earlier = None if first.before is None or before is None else _cut(asked.loop, before, first.before)
+    bode = plot_bode(_cut(asked.loop, parameters, first.run), earlier)
+    return {"": plot_steps(responses, band=band_of(asked)), "bode": bode}
+
+
+def _cut(loop: ClosedLoop, parameters: ParameterSet, run: Trajectory) -> Linearisation:
     x = np.array([run[q.name][-1] for q in loop.plant.states])
-    open_loop = loop.open_loop(parameters, x, {loop.command.name: float(run["control"][-1])})
-    return {"": plot_steps(responses, band=band_of(asked)), "bode": plot_bode(open_loop)}
+    return cut(loop, parameters, x, float(run["control"][-1]))
 
 
 def numbered(path: Path, count: int) -> list[Path]:

@@ -3,16 +3,18 @@
 No window is opened and no global state is touched: each function returns a `Figure`, `save_figure` writes it.
 """
 
+from pneuopt.plotting.bode import plot_bode
 from pneuopt.plotting.canvas import check_figure_path, save_figure
 from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
 from pneuopt.plotting.fits import plot_fit, plot_prediction
-from pneuopt.plotting.friction_map import has_friction_map, plot_friction
-from pneuopt.plotting.loops import Response, plot_bode, plot_steps
+from pneuopt.plotting.friction_map import friction_force, has_friction_map, plot_friction
+from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
 
 __all__ = [
     "Response",
     "check_figure_path",
+    "friction_force",
     "has_friction_map",
     "plot_bode",
     "plot_correlation",

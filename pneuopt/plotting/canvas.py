@@ -60,7 +60,7 @@ def axes_grid(
     return figure, [list(row) for row in grid]
 
 
-def legend_above(figure: "Figure", *sources: "Axes") -> None:
+def legend_above(figure: "Figure", *sources: "Axes", columns: int = 4) -> None:
     """One legend for all axes, outside of them: it hides nothing."""
     from matplotlib.lines import Line2D
 
@@ -68,7 +68,7 @@ def legend_above(figure: "Figure", *sources: "Axes") -> None:
     if not pairs:
         return
     handles, labels = zip(*pairs, strict=True)
-    legend = figure.legend(handles, labels, loc="outside upper center", ncols=min(4, len(labels)), frameon=False)
+    legend = figure.legend(handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), frameon=False)
     for handle in legend.legend_handles:
         if isinstance(handle, Line2D):  # a cloud's faint dots would not be seen
             handle.set(alpha=1.0, markersize=5)

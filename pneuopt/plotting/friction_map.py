@@ -80,6 +80,24 @@ def has_friction_map(system: System) -> bool:
     return imposed or ({"position", "speed"} <= set(states) and INERTIA in system.parameters)
 
 
+def friction_force(system: System, run: Trajectory, parameters: ParameterSet) -> Array:
+    """What friction takes from the mass along a simulated run, shape (n,) [N].
+
+    Parameters
+    ----------
+    system : System
+        With a friction map, and a mass.
+    run : Trajectory
+        Its states and inputs.
+    parameters : ParameterSet
+    """
+    seen = {n: run[n] for n in names(system.states)}
+    idle = {n: np.zeros(len(run)) for n in seen if n == "speed" or n.startswith("friction.")}
+    inputs = {n: run[n] for n in names(system.inputs)}
+    moves, free = (_rates(system, parameters, x, inputs)["speed"] for x in (seen, {**seen, **idle}))
+    return np.asarray(parameters.value(INERTIA) * (free - moves))
+
+
 def _imposed(experiment: Experiment) -> tuple[Array, Array]:
     return experiment.trajectory["speed"], experiment.trajectory["force"]
 

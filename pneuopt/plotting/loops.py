@@ -1,6 +1,5 @@
-"""Closed loops: step responses with reference, band and command; the Bode plot with its margins."""
+"""Step responses of closed loops, with reference, band and command, and what goes on inside the drive."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -8,11 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.margins import frequency_grid, frequency_response, margins
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
-from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, RED, axes_grid, legend_above, shown_of
-from pneuopt.system import Linearisation
+from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, axes_grid, legend_above, shown_of
 from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
@@ -20,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+INSIDE = {"valve.spool": ("valve [%]", 100.0), "friction.force": ("friction [N]", 1.0)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +27,7 @@ class Response:
     Attributes
     ----------
     run : Trajectory
-        With the measured signal and "control".
+        With the measured signal and "control"; "valve.spool" [1] and "friction.force" [N] are drawn where it has them.
     reference : Step
     measured : str
         Column of the signal that follows the reference.
@@ -50,7 +48,7 @@ class Response:
 
 
 def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure":
-    """Step responses: the measured signal with the reference and its band, below it the command; a column a step.
+    """Step responses: signal, reference and band, command, valve and friction below each other.
 
     Parameters
     ----------
@@ -64,60 +62,19 @@ def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure"
     """
     require(len(responses) > 0, "no response to plot")
     shown = responses[:MOST_COLUMNS]
-    figure, grid = axes_grid(2, len(shown), [2.6, 1.4], sharex="col")
-    for (top, bottom), response in zip(zip(*grid, strict=True), shown, strict=True):
+    inside = [n for n in INSIDE if all(n in response.run for response in shown)]
+    figure, grid = axes_grid(2 + len(inside), len(shown), [2.6, 1.4, *(1.2 for _ in inside)], sharex="col")
+    for (top, *others), response in zip(zip(*grid, strict=True), shown, strict=True):
         _follow(top, response, band)
-        _command(bottom, response)
+        _draw(others[0], response, "control", f"command [{response.units[1]}]", 1.0)
+        for axes, name in zip(others[1:], inside, strict=True):
+            _draw(axes, response, name, *INSIDE[name])
+        others[-1].set_xlabel("time [s]")
     for row in grid:
         for axes in row[1:]:
             axes.set_ylabel("")
     legend_above(figure, grid[0][0])
     shown_of(figure, len(shown), len(responses), "steps")
-    return figure
-
-
-def plot_bode(open_loop: Linearisation) -> "Figure":
-    """Gain and phase of an open loop, the crossovers and margins marked.
-
-    Parameters
-    ----------
-    open_loop : Linearisation
-        Of `ClosedLoop.open_loop`.
-
-    Returns
-    -------
-    Figure
-    """
-    from matplotlib.ticker import MultipleLocator
-
-    m = margins(open_loop)
-    omega = _shown_frequencies(open_loop, [m.gain_crossover, m.phase_crossover, m.max_sensitivity_frequency])
-    L = frequency_response(open_loop, omega)
-    phase = np.degrees(np.unwrap(np.angle(L)))
-    phase -= 360 * round((phase[0] + 90) / 360)
-    figure, ((top,), (bottom,)) = axes_grid(2, 1, [2.2, 2.2], sharex="col", width=7.0)
-    top.semilogx(omega, 20 * np.log10(np.abs(L)), color=BLUE)
-    bottom.semilogx(omega, phase, color=BLUE)
-    top.axhline(0, color=GREY, lw=0.8)
-    if math.isfinite(m.gain_crossover):
-        at = float(np.interp(m.gain_crossover, omega, phase))
-        _mark(top, bottom, m.gain_crossover, ORANGE)
-        foot = 360 * round((at + 180 - m.phase_margin) / 360) - 180
-        text = f"phase margin {m.phase_margin:.1f}° at {m.gain_crossover:.3g} rad/s"
-        bottom.plot([m.gain_crossover] * 2, [foot, at], color=ORANGE, lw=2.5, label=text)
-    if math.isfinite(m.phase_crossover):
-        _mark(top, bottom, m.phase_crossover, RED)
-        decibel = -20 * math.log10(m.gain_margin)
-        text = f"gain margin {-decibel:.1f} dB at {m.phase_crossover:.3g} rad/s"
-        top.plot([m.phase_crossover] * 2, [0, decibel], color=RED, lw=2.5, label=text)
-    for level in (-180 + 360 * k for k in (-2, -1, 0, 1) if np.min(phase) - 45 < -180 + 360 * k < np.max(phase) + 45):
-        bottom.axhline(level, color=GREY, lw=0.8)
-    bottom.yaxis.set_major_locator(MultipleLocator(45))
-    top.set(ylabel="gain [dB]")
-    bottom.set(xlabel="frequency [rad/s]", ylabel="phase [deg]")
-    stable = "" if m.stable else "  -  the closed loop is UNSTABLE"
-    top.set_title(f"maximum sensitivity Ms = {m.max_sensitivity:.4g}{stable}", fontsize=9)
-    legend_above(figure, top, bottom)
     return figure
 
 
@@ -149,13 +106,15 @@ def _follow(axes: "Axes", response: Response, band: float) -> None:
     _keep_in_view(axes, signal, ends, ends if before is None else before[response.measured])
 
 
-def _command(axes: "Axes", response: Response) -> None:
-    if response.before is not None:
-        axes.plot(response.before.t, response.before["control"], color=GREY, lw=0.8)
-    axes.plot(response.run.t, response.run["control"], color=BLUE, lw=1.0)
-    axes.set(xlabel="time [s]", ylabel=f"command [{response.units[1]}]")
-    other = [0.0] if response.before is None else response.before["control"]
-    _keep_in_view(axes, response.run["control"], [0.0], other)
+def _draw(axes: "Axes", response: Response, name: str, label: str, factor: float) -> None:
+    """One more signal, with what it was before."""
+    now, before = factor * response.run[name], response.before
+    was = factor * before[name] if before is not None and name in before else None
+    if before is not None and was is not None:
+        axes.plot(before.t, was, color=GREY, lw=0.8)
+    axes.plot(response.run.t, now, color=BLUE, lw=1.0)
+    axes.set_ylabel(label)
+    _keep_in_view(axes, now, [0.0], [0.0] if was is None else was)
 
 
 def _averaged(t: Array, y: Array, response: Response) -> tuple[Array, Array]:
@@ -175,17 +134,3 @@ def _keep_in_view(axes: "Axes", y: Array, others: Sequence[float], before: Array
     high = min(max(high, float(np.max(before))), high + span / 2)
     margin = 0.08 * (high - low or 1.0)
     axes.set_ylim(low - margin, high + margin)
-
-
-def _shown_frequencies(open_loop: Linearisation, marks: Sequence[float]) -> Array:
-    """The grid of all features, cut to one and a half decades around the crossovers."""
-    omega = frequency_grid(open_loop)
-    finite = [w for w in marks if math.isfinite(w) and w > 0]
-    if not finite:
-        return omega
-    return omega[(omega >= min(finite) / 30) & (omega <= max(finite) * 30)]
-
-
-def _mark(top: "Axes", bottom: "Axes", omega: float, color: str) -> None:
-    for axes in (top, bottom):
-        axes.axvline(omega, color=color, lw=0.8, ls=":")
