@@ -11,8 +11,13 @@ The concept map, in the order in which data flow:
     validate(system, logs, fitted)    -> how well a held-out log is predicted, and what is left in the residuals
     ClosedLoop(system, PID, Dither)   -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
+    validate_design(loop, ...)        -> a design on fresh plants: worst, 95th percentile, violations
+    judge_dither(loop, steps, tuned)  -> whether the dither is useful, useless or harmful, and why, in numbers
+    find_limit_cycle(t, speed)        -> hunting or crawl in a response or a log: amplitude, frequency, share of standstill
     evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser
+    take_over(loop, x, old, new)      -> the state from which a running loop goes on with new gains, without a bump
     record(Rig(loop, sensors), ...)   -> the log of a rig with stick-slip, hysteresis, sensors; and the truth
+    pareto_front(loop, steps, ...)    -> what one requirement costs in terms of another: a row a certified design
     grid, sweep(fn, parameters, cases)-> a study: any function over named cases, in processes, as a table
 
 Names are loaded when first used; importing the package costs nothing.
@@ -47,9 +52,24 @@ _HOME = {
     "pneuopt.models.cylinder": ("Cylinder",),
     "pneuopt.models.pneumatic_drive": ("PneumaticDrive",),
     "pneuopt.control.pid": ("PID",),
-    "pneuopt.control.dither": ("Dither",),
+    "pneuopt.control.dither": ("Dither", "Waveform"),
+    "pneuopt.control.limit_cycle": ("LimitCycle", "find_limit_cycle"),
+    "pneuopt.dithering": ("DitherVerdict", "dither_effect", "judge_dither"),
+    "pneuopt.control.feedforward": ("Feedforward",),
+    "pneuopt.control.forms": (
+        "Form",
+        "ParallelForm",
+        "SeriesForm",
+        "StandardForm",
+        "proportional_band",
+        "proportional_gain",
+        "to_parallel",
+        "to_series",
+        "to_standard",
+    ),
+    "pneuopt.control.take_over": ("take_over",),
     "pneuopt.control.reference": ("Step",),
-    "pneuopt.control.sensor": ("SensorLag",),
+    "pneuopt.control.sensor": ("Encoder", "SensorLag"),
     "pneuopt.control.loop": ("ClosedLoop",),
     "pneuopt.control.averaging": ("averaged", "mean_start", "ripple"),
     "pneuopt.control.margins": ("margins",),
@@ -58,7 +78,7 @@ _HOME = {
     "pneuopt.nlp.full_space": ("FullSpace",),
     "pneuopt.experiments": ("Experiment", "differentiate", "read_log", "resample", "split"),
     "pneuopt.simulate": ("contacts", "simulate", "simulate_stick_slip"),
-    "pneuopt.instruments": ("Actuator", "Encoder", "Sensor"),
+    "pneuopt.instruments": ("Actuator", "Sensor"),
     "pneuopt.rig": ("Rig", "record"),
     "pneuopt.identify": ("IdentificationResult", "identify", "predict", "validate"),
     "pneuopt.identifiability": ("Verdict", "identifiability"),
@@ -68,6 +88,7 @@ _HOME = {
         "IAE",
         "ISE",
         "ITAE",
+        "AirUse",
         "ControlRate",
         "GainMargin",
         "MaxComplementarySensitivity",
@@ -92,7 +113,9 @@ _HOME = {
     "pneuopt.reweighting": ("Huber", "SoftL1"),
     "pneuopt.models.sensing": ("coarse_delay", "with_sensors"),
     "pneuopt.selection": ("ModelSelection", "select_model"),
+    "pneuopt.pareto": ("pareto_front",),
     "pneuopt.study": ("grid", "sweep"),
+    "pneuopt.fresh_plants": ("DesignValidation", "validate_design"),
     "pneuopt.files": ("read_drive", "write_fit"),
     "pneuopt.tuningfile": ("read_tuning", "write_tuned"),
     "pneuopt.plotting": (
@@ -100,6 +123,7 @@ _HOME = {
         "plot_correlation",
         "plot_fit",
         "plot_friction",
+        "plot_front",
         "plot_map",
         "plot_prediction",
         "plot_residuals",

@@ -3,20 +3,36 @@
 from pneuopt.certify import evaluate, respond
 from pneuopt.comparison import LogComparison, compare_logs
 from pneuopt.control.averaging import averaged, mean_start, ripple
-from pneuopt.control.dither import Dither
+from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.forms import (
+    Form,
+    ParallelForm,
+    SeriesForm,
+    StandardForm,
+    proportional_band,
+    proportional_gain,
+    to_parallel,
+    to_series,
+    to_standard,
+)
+from pneuopt.control.limit_cycle import LimitCycle, find_limit_cycle
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import margins
 from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.control.sensor import SensorLag
+from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.control.take_over import take_over
 from pneuopt.derived import Derived, derived
+from pneuopt.dithering import DitherVerdict, dither_effect, judge_dither
 from pneuopt.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from pneuopt.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.files import read_drive, write_fit
+from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.identifiability import Verdict, identifiability
 from pneuopt.identify import IdentificationResult, identify, predict, validate
-from pneuopt.instruments import Actuator, Encoder, Sensor
+from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.chamber import Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive
@@ -39,11 +55,13 @@ from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.full_space import FullSpace
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.pareto import pareto_front
 from pneuopt.plotting import (
     plot_bode,
     plot_correlation,
     plot_fit,
     plot_friction,
+    plot_front,
     plot_map,
     plot_prediction,
     plot_residuals,
@@ -55,6 +73,7 @@ from pneuopt.requirements import (
     IAE,
     ISE,
     ITAE,
+    AirUse,
     ControlRate,
     GainMargin,
     MaxComplementarySensitivity,
@@ -90,6 +109,7 @@ __all__ = [
     "ITAE",
     "PID",
     "Actuator",
+    "AirUse",
     "Asymmetric",
     "ClosedLoop",
     "Condensed",
@@ -98,12 +118,16 @@ __all__ = [
     "Coulomb",
     "Cylinder",
     "Derived",
+    "DesignValidation",
     "DiscreteSystem",
     "Dither",
+    "DitherVerdict",
     "Encoder",
     "Experiment",
+    "Feedforward",
     "FirstOrder",
     "ForceDrive",
+    "Form",
     "FullSpace",
     "GainMargin",
     "Huber",
@@ -114,6 +138,7 @@ __all__ = [
     "Iso6358",
     "Karnopp",
     "LeastSquares",
+    "LimitCycle",
     "Load",
     "LogComparison",
     "LuGre",
@@ -123,6 +148,7 @@ __all__ = [
     "MotionDrive",
     "NoiseGain",
     "Overshoot",
+    "ParallelForm",
     "Parameter",
     "ParameterSet",
     "PeakControl",
@@ -142,9 +168,11 @@ __all__ = [
     "SecondOrder",
     "Sensor",
     "SensorLag",
+    "SeriesForm",
     "SettlingTime",
     "SoftL1",
     "Spool",
+    "StandardForm",
     "SteadyStateError",
     "Step",
     "StepEnvelope",
@@ -156,6 +184,7 @@ __all__ = [
     "TwoPhase",
     "Verdict",
     "Viscous",
+    "Waveform",
     "averaged",
     "coarse_delay",
     "compare_logs",
@@ -165,24 +194,31 @@ __all__ = [
     "derived",
     "differentiate",
     "discretise",
+    "dither_effect",
     "draws",
     "evaluate",
+    "find_limit_cycle",
     "friction_ladder",
     "grid",
     "identifiability",
     "identify",
+    "judge_dither",
     "margins",
     "mean_start",
+    "pareto_front",
     "plot_bode",
     "plot_correlation",
     "plot_fit",
     "plot_friction",
+    "plot_front",
     "plot_map",
     "plot_prediction",
     "plot_residuals",
     "plot_steps",
     "predict",
     "profile",
+    "proportional_band",
+    "proportional_gain",
     "read_drive",
     "read_log",
     "read_tuning",
@@ -198,9 +234,14 @@ __all__ = [
     "split",
     "step_metrics",
     "sweep",
+    "take_over",
+    "to_parallel",
+    "to_series",
+    "to_standard",
     "tolerances",
     "tune",
     "validate",
+    "validate_design",
     "with_sensors",
     "write_fit",
     "write_tuned",

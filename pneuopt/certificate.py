@@ -2,8 +2,9 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from math import nan
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,11 @@ from pneuopt.errors import ConvergenceError, PhysicsWarning
 from pneuopt.nlp.status import Code, Status
 from pneuopt.parameters import ParameterSet
 from pneuopt.provenance import provenance
-from pneuopt.requirements import name, read, told
+from pneuopt.requirements import AT_LEAST, Requirement, bound, most, name, read, shown, told
 from pneuopt.scenarios import Scenarios
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space
+from pneuopt.tuning.relaxation import sentence
 from pneuopt.tuning.simulator import Simulator, worst
 
 if TYPE_CHECKING:
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 GRAZING = 0.01  # relative excess of the certified over the claimed settling time
+ACTIVE = 0.02  # of a limit, the room within which it counts as reached
+RELAXED = ("asked", "needed", "share")
 SHOWN = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity")
 
 
@@ -42,19 +46,32 @@ class TuningResult:
         SteadyStateError [% of the step], PeakControl [the command's unit], MaxSensitivity, with dither Ripple [the
         measured signal's unit], and what else was asked for, as `evaluate` has it; by the search's own simulation, and
         by the independent one.
+    requirements : DataFrame
+        A row a requirement, objective or limit, at its worst over the cases: "claimed", "certified" and "allowed" as
+        the user writes them (a fraction where `Overshoot.max` is one; NaN where there is no limit), "room", what is
+        left of the limit as a fraction of it, negative where it is broken, "active", whether it holds the objective
+        back, and "case", where it is worst.
+    relaxations : DataFrame
+        Where the limits contradict each other: a row a limit with what is "asked", and what alone is "needed" for a
+        design that keeps the others (NaN where none was found), "share", how far that is from what is asked as a
+        fraction of it, and that design's gains; in a last row, "all", the share by which all limits together have to
+        give way. The independent simulation has confirmed each. Empty where the limits do not contradict each other.
     active : tuple of str
         Requirements and bounds that hold the objective back.
     status : Status
     stats : mapping of str to float
         "seconds", "deviation.SettlingTime" and so on (the largest |claimed - certified|), and the search's own:
-        "margin", "starts", "starts_converged", "starts_agreeing", "optimum" (before rounding), "simulations"; where
-        the given gains stand "rejected.pid.Kp" and so on, and "contacts" where a response ran into an end stop.
+        "margin", "starts", "starts_converged", "starts_agreeing", "optimum" (before rounding), "simulations";
+        "friction_slope[0 to 0.2]" and so on, the slope of friction with which that case's margins are read [N s/m];
+        where the given gains stand "rejected.pid.Kp" and so on, and "contacts" where a response ran into an end stop.
     provenance : mapping of str to str
     """
 
     parameters: ParameterSet
     claimed: "pd.DataFrame"
     certified: "pd.DataFrame"
+    requirements: "pd.DataFrame"
+    relaxations: "pd.DataFrame"
     active: tuple[str, ...]
     status: Status
     stats: Mapping[str, float]
@@ -110,10 +127,11 @@ class Notary:
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:
             certified, met = self._certified(parameters)
+            slopes = _slopes(certified)
             certified = certified.loc[shown]
             status = _outside(met) if met else self._verdict(found, claimed, certified)
         except ConvergenceError as error:
-            certified, met = claimed * np.nan, []
+            certified, met, slopes = claimed * np.nan, [], {}
             status = Status(Code.NOT_CERTIFIED, str(error))
         deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
         values = dict(zip(self.space.names, point.tolist(), strict=True))
@@ -123,9 +141,11 @@ class Notary:
             self.space.parameters.with_values(values) if status.converged else self.space.parameters,
             claimed,
             certified,
+            required(self.spec, claimed, certified, found.active),
+            pd.DataFrame(columns=[*RELAXED, *self.space.names], dtype=float),
             found.active,
             status,
-            {**found.stats, **deviation, **contacts, **rejected},
+            {**found.stats, **deviation, **contacts, **rejected, **slopes},
             provenance(self.method, *self.spec.weights, *self.spec.limits, *self.references, *self.scenarios.items()),
         )
 
@@ -175,6 +195,63 @@ class Notary:
         values = read({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
         k = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
         return f" at {certified.columns[k]}" if len(values) > 1 else ""
+
+
+def _slopes(certified: "pd.DataFrame") -> dict[str, float]:
+    """The slope of friction with which margins are read, a case each."""
+    rows = certified.loc[[n for n in certified.index if n == "FrictionSlope"]]
+    return {f"friction_slope[{case}]": float(v) for case, column in rows.items() for v in column}
+
+
+def required(
+    spec: Specification, claimed: "pd.DataFrame", certified: "pd.DataFrame", active: Sequence[str] = ()
+) -> "pd.DataFrame":
+    """Each requirement beside what is allowed; see `TuningResult.requirements`."""
+    import pandas as pd
+
+    limits = {name(q): q for q in spec.limits}
+    rows = {name(q): _row(limits.get(name(q), q), claimed, certified) for q in (*spec.weights, *spec.limits)}
+    frame = pd.DataFrame.from_dict(rows, orient="index")
+    frame["active"] = [n in active or room <= ACTIVE for n, room in frame["room"].items()]
+    return frame
+
+
+def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]]) -> TuningResult:
+    """The result of the design that comes closest, with what would do in place of its limits."""
+    import pandas as pd
+
+    broken = result.requirements[~(result.requirements["room"] >= 0) & result.requirements["allowed"].notna()]
+    closest = [f"{n} {row.certified:.6g} ({row.allowed:.6g} asked)" for n, row in broken.iterrows()]
+    unknown = [str(n) for n, row in result.requirements.iterrows() if np.isnan(row.certified) and np.isnan(row.allowed)]
+    told = f"no design found keeps all limits, the closest has {', '.join([*closest, *(f'no {n}' for n in unknown)])}"
+    message = f"{told}; {sentence(rows)}; or widen the gains' bounds"
+    relaxations = pd.DataFrame.from_dict(rows, orient="index")
+    return replace(result, status=Status(Code.INFEASIBLE, message), relaxations=relaxations)
+
+
+def missing(result: TuningResult) -> float:
+    """The share by which every limit would have to be wider for a result; inf where something is not reached at all."""
+    known = result.requirements
+    rooms = known["room"][known["allowed"].notna()]
+    unreached = known["certified"].isna().any() or rooms.isna().any()
+    return float("inf") if unreached else float(-rooms.min())
+
+
+def _row(requirement: Requirement, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> dict[str, Any]:
+    n = name(requirement)
+    values = [read({n: frame.loc[n].to_numpy(dtype=float)})[n] for frame in (claimed, certified)]
+    k = [int(np.argmax(np.where(np.isnan(v), np.inf, v))) for v in values]
+    claim, proof = (float(v[i]) for v, i in zip(values, k, strict=True))
+    limit, allowed = bound(requirement), most(requirement)
+    least = isinstance(requirement, AT_LEAST)
+    room = nan if limit is None else (shown(requirement, proof) * allowed - 1 if least else 1 - proof / allowed)
+    return {
+        "claimed": shown(requirement, claim),
+        "certified": shown(requirement, proof),
+        "allowed": nan if limit is None else limit,
+        "room": room,
+        "case": str(certified.columns[k[1]]),
+    }
 
 
 def _outside(met: Sequence[str]) -> Status:

@@ -1,11 +1,16 @@
 """`evaluate`: what a loop's gains are worth, by a simulation that shares nothing with the search; or on a rig."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import inf, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pneuopt.control.consumption import consumed
+from pneuopt.control.disturbance import disturbed
+from pneuopt.control.limit_cycle import LEAST, SETTLED, find_limit_cycle
+from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import margins, noise_gain
 from pneuopt.control.metrics import Envelope
@@ -17,12 +22,13 @@ from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.simulate import simulate
 from pneuopt.system import Array
 from pneuopt.trajectories import Trajectory
-from pneuopt.tuning.candidates import cut, filtered, inputs, measure, spacing
+from pneuopt.tuning.candidates import cut, inputs, measure, spacing
 from pneuopt.tuning.cases import Case, cases
 
 if TYPE_CHECKING:
     import pandas as pd
 
+HUNTING = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
 FINE = 4  # points of the record a sample of the search's
 
 
@@ -57,10 +63,13 @@ def evaluate(
     -------
     DataFrame
         A row a metric, a column a reference ("0 to 0.25"), then one a reference and scenario
-        ("0 to 0.25 [load.mass high]"): those of `step_metrics`, then, not for a rig,
+        ("0 to 0.25 [load.mass high]"): those of `step_metrics`, LimitCycleAmplitude [measured unit],
+        LimitCycleFrequency [Hz] and StickShare where it hunts, of a pneumatic drive AirUse [l(ANR)] and ValveTravel
+        [half travels], then, not for a rig,
         MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin [deg] and NoiseGain [command's
         unit/measured unit] of the loop linearised about the state in which the response ends, with the slope that
-        friction has at that speed; infinite, and the margins NaN, where that loop is unstable.
+        friction has at that speed, of drives that have a load FrictionSlope [N s/m]; infinite, and the margins NaN,
+        where that loop is unstable.
 
     Raises
     ------
@@ -92,6 +101,7 @@ def evaluate(
     import pandas as pd
 
     steps = [references] if isinstance(references, Step) else list(references)
+    loop = _disturbed(loop, steps)
     full = _inner(loop).parameters | parameters
     every = cases(steps, scenarios, full)
     return pd.DataFrame({case.label: _certified(loop, case, full, band, envelope) for case in every})
@@ -111,8 +121,9 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     Trajectory
         Of a loop states and outputs, simulated tightly, on a grid finer than the search's; of a rig the truth.
     """
+    loop = _disturbed(loop, [reference])
     inner = _inner(loop)
-    run = inputs(inner, reference, spacing(inner, reference))
+    run = inputs(inner, reference, spacing(inner, reference, parameters))
     start = inner.initial(parameters, reference=reference.initial, start=reference.start)
     if isinstance(loop, Rig):
         return record(loop, run, parameters, initial=start).truth
@@ -126,16 +137,53 @@ def _certified(
     inner, parameters = _inner(loop), case.filled(parameters)
     response = respond(loop, case.reference, parameters)
     metrics = measure(inner, parameters, case.reference, response, band, envelope)
+    metrics |= hunting(inner, parameters, case.reference, response)
+    metrics |= consumed(inner, parameters, response, case.reference.at)
     if isinstance(loop, Rig):
         return metrics
     x = np.array([response[q.name][-1] for q in inner.plant.states])
-    return metrics | _margins(inner, parameters, x, float(response["control"][-1]))
+    metrics |= friction_slope(inner, parameters, x, float(response["control"][-1]))
+    return metrics | _margins(inner, parameters, x, float(response["control"][-1]), case.reference)
 
 
-def _margins(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> dict[str, float]:
-    open_loop = cut(loop, parameters, x, command)
-    robust, gains = margins(open_loop), filtered(loop, parameters)
-    Kp, Ki, Kd, Tf = (gains.value(f"pid.{n}") for n in ("Kp", "Ki", "Kd", "Tf"))
+def hunting(loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory) -> dict[str, float]:
+    """The limit cycle in what follows the transient, for which the step's first 40 % are taken; amplitude 0: none.
+
+    Returns
+    -------
+    dict of str to float
+        LimitCycleAmplitude [measured unit], LimitCycleFrequency [Hz] and StickShare, the share of time at a standstill.
+    """
+    signal, period = response[loop.feedback.name], loop.dither_period(parameters)
+    start = reference.at + SETTLED * (response.t[-1] - reference.at)
+    least = LEAST * abs(reference.whole)
+    found = find_limit_cycle(response.t, signal, start=start, dither_period=period, least=least)
+    values = (found.amplitude, found.frequency, found.stick_share) if found else (0.0, nan, 0.0)
+    return dict(zip(HUNTING, values, strict=True))
+
+
+def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> dict[str, float]:
+    """FrictionSlope, the static friction's derivative to speed at a plant state [N s/m], of drives that have a load.
+
+    With this slope friction is in the linearised loop at low frequencies, its own states, bristles, following; a
+    negative one makes crawl likely.
+    """
+    states, full = [q.name for q in loop.plant.states], loop.parameters | parameters
+    rubs = any(n.startswith("friction.") for n in loop.plant.parameters)
+    if not rubs or "load.mass" not in loop.plant.parameters or "speed" not in states:
+        return {}
+    A = loop.plant.linearise(x, {loop.command.name: command}, full).A
+    v, z = states.index("speed"), [k for k, n in enumerate(states) if n.startswith("friction.")]
+    followed = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
+    return {"FrictionSlope": float(-full.value("load.mass") * (A[v, v] - followed))}
+
+
+def _margins(
+    loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step
+) -> dict[str, float]:
+    open_loop = cut(loop, parameters, x, command, reference)
+    robust = margins(open_loop)
+    Kp, Ki, Kd, Tf = linear_gains(loop, loop.numbers(parameters)).full().ravel().tolist()
     found = {
         "MaxSensitivity": robust.max_sensitivity,
         "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
@@ -144,6 +192,11 @@ def _margins(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: floa
         "NoiseGain": noise_gain(open_loop, (Kp, Ki, Kd, Tf)),
     }
     return found if robust.stable else {n: nan if n.endswith("Margin") else inf for n in found}
+
+
+def _disturbed(loop: ClosedLoop | Rig, references: Sequence[Step]) -> ClosedLoop | Rig:
+    inner = disturbed(_inner(loop), references)
+    return replace(loop, model=inner) if isinstance(loop, Rig) else inner
 
 
 def _inner(loop: ClosedLoop | Rig) -> ClosedLoop:

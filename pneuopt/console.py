@@ -13,8 +13,11 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
+from pneuopt.certify import HUNTING
+from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import ParallelForm, to_standard
+from pneuopt.dithering import DitherVerdict, Usefulness
+from pneuopt.fresh_plants import DesignValidation
 from pneuopt.identifiability import Verdict
 from pneuopt.nlp.least_squares import Progress as Tell
 from pneuopt.nlp.status import Status
@@ -131,7 +134,7 @@ def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> N
         mark = "at its bound" if p.value in (p.lower, p.upper) else ""
         table.add_row(n, write_value(before.value(n), unit), write_value(p.value, unit), bounds, mark)
     console.print(table)
-    console.print(_standard_form(after), soft_wrap=True)
+    console.print(_other_form(after), soft_wrap=True)
 
 
 def show_rejected(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet, word: str) -> None:
@@ -181,12 +184,72 @@ def show_metrics(
     several = len(metrics.columns) > MOST_REFERENCES
     columns = [f"worst of {len(metrics.columns)}"] if several else [f"{c} {loop.feedback.unit}" for c in metrics]
     table = _table(title, *columns, *(["limit"] if allowed else []), "unit")
-    for metric in (m for m in units if m in metrics.index and (m != "Ripple" or loop.dither)):
+    for metric in (m for m in units if m in metrics.index and _tells(m, metrics, loop)):
         now, was = (_row(frame, metric, several) for frame in (metrics, before))
         cells = [_metric(metric, v) + (f" (was {_metric(metric, was[k])})" if was else "") for k, v in enumerate(now)]
         limit = [allowed.get(metric, "")] if allowed else []
         table.add_row(metric, *cells, *limit, units[metric])
     console.print(table)
+
+
+def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[str], loop: ClosedLoop) -> None:
+    """What is left of each limit, and what holds the design back.
+
+    Parameters
+    ----------
+    console : Console
+    table : DataFrame
+        Of a `TuningResult`, "requirements".
+    active : sequence of str
+        Likewise.
+    loop : ClosedLoop
+        Gives the units.
+    """
+    units, grid = metric_units(loop), _table("requirement", "claimed", "certified", "limit", "room", "", "unit")
+    for row in table.reset_index(names="requirement").to_dict(orient="records"):
+        metric = str(row["requirement"])
+        values = [100 * row[n] if metric in PERCENT else row[n] for n in ("claimed", "certified", "allowed")]
+        figures = [_metric(metric, v) for v in values[:2]] + [_figure(values[2], 4)]
+        room = "-" if math.isnan(row["room"]) else f"{100 * row['room']:.3g} %"
+        grid.add_row(metric, *figures, room, "active" if row["active"] else "", units[metric])
+    console.print(grid)
+    others = [n for n in active if n not in table.index]
+    if others:
+        console.print(f"also held back by: {', '.join(others)}", soft_wrap=True)
+
+
+def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
+    """What limits that contradict each other could give way to; nothing where there is no such table."""
+    if table.empty:
+        return
+    grid = _table("relaxed alone", "asked", "would do", "by")
+    for row in table.reset_index(names="limit").to_dict(orient="records"):
+        share = "-" if math.isnan(row["share"]) else f"{100 * row['share']:.3g} %"
+        needed = "none found" if row["limit"] != "all" and math.isnan(row["needed"]) else _figure(row["needed"], 4)
+        grid.add_row("all together" if row["limit"] == "all" else row["limit"], _figure(row["asked"], 4), needed, share)
+    console.print(grid)
+
+
+def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop) -> None:
+    """A requirement a row: what it comes to on fresh plants, and how many break its limit."""
+    units = metric_units(loop)
+    console.print(f"validated on {len(found.plants)} fresh plants, the worst of each requirement certified")
+    table = _table("", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
+    for row in found.summary.reset_index(names="metric").to_dict(orient="records"):
+        metric = str(row["metric"])
+        figures = [_metric(metric, row[n]) for n in ("median", "p95", "worst", "certified")]
+        limit = "" if math.isnan(row["limit"]) else _figure(row["limit"], 4)
+        table.add_row(metric, *figures, limit, str(row["violations"]), units[metric])
+    console.print(table)
+
+
+def show_dither(console: Console, verdict: DitherVerdict) -> None:
+    """Whether a dither is worth having, and why, a sentence a line."""
+    colours = {Usefulness.USEFUL: "bold green", Usefulness.HARMFUL: "bold red", Usefulness.USELESS: "bold yellow"}
+    head, *reasons = str(verdict).splitlines()
+    console.print(Text(head, style=colours[verdict.usefulness]), soft_wrap=True)
+    for reason in reasons:
+        console.print(reason, soft_wrap=True)
 
 
 def show_cases(console: Console, table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> None:
@@ -231,10 +294,16 @@ def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
         "PeakControl": loop.command.unit,
         "ControlRate": f"{loop.command.unit}/s",
         "Ripple": loop.feedback.unit,
+        "LimitCycleAmplitude": loop.feedback.unit,
+        "LimitCycleFrequency": "Hz",
+        "StickShare": "1",
+        "AirUse": "l(ANR)",
+        "ValveTravel": "half travels",
         "MaxSensitivity": "",
         "MaxComplementarySensitivity": "",
         "GainMargin": "",
         "PhaseMargin": "deg",
+        "FrictionSlope": "N*s/m",
         "NoiseGain": f"{loop.command.unit}/({loop.feedback.unit})",
     }
 
@@ -264,6 +333,13 @@ def _show_many(console: Console, fit: "pd.DataFrame") -> None:
     console.print(table)
 
 
+def _tells(metric: str, metrics: "pd.DataFrame", loop: ClosedLoop) -> bool:
+    """Ripple only under dither, a limit cycle only where there is one."""
+    if metric == "Ripple":
+        return loop.dither is not None
+    return metric not in HUNTING or bool((metrics.loc[HUNTING[0]] > 0).any())
+
+
 def _row(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float]:
     if frame is None or metric not in frame.index:
         return []
@@ -273,8 +349,14 @@ def _row(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float
     return [math.nan if unknown else worst(values)] if several else values
 
 
-def _standard_form(parameters: ParameterSet) -> str:
-    gains = ParallelForm(*(parameters.value(f"pid.{n}") for n in ("Kp", "Ki", "Kd", "Tf")))
+def _other_form(parameters: ParameterSet) -> str:
+    given = next(f for f in Form if all(f"pid.{n}" in parameters for n in f.gains))
+    own = [parameters.value(f"pid.{n}") for n in given.gains]
+    if given is not Form.PARALLEL:
+        same = to_parallel(StandardForm(*own) if given is Form.STANDARD else SeriesForm(*own))
+        derivative = f"Kd {same.Kd:.4g}, Tf {same.Tf:.4g} s" if same.Kd else "no derivative"
+        return f"parallel form: Kp {same.Kp:.4g}, Ki {same.Ki:.4g}, {derivative}"
+    gains = ParallelForm(*own)
     if gains.Kp == 0:
         return "no standard form: Kp is zero"
     form = to_standard(gains)
@@ -288,6 +370,8 @@ def _table(*columns: str) -> Table:
     for column in columns:
         text = column in (
             "parameter",
+            "requirement",
+            "relaxed alone",
             "model",
             "contains",
             "log",

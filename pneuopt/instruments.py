@@ -1,4 +1,4 @@
-"""What stands between a plant and its controller on a real rig: `Sensor`, `Actuator`, `Encoder`."""
+"""What stands between a plant and its controller on a real rig: `Sensor`, `Actuator`; and `control.sensor.Encoder`."""
 
 from dataclasses import dataclass
 from math import inf
@@ -84,22 +84,3 @@ class Actuator:
     def passed(self, value: float) -> float:
         """What is left beyond the dead zone [unit of the command]."""
         return value - min(max(value, -self.dead_zone), self.dead_zone)
-
-
-@dataclass(frozen=True)
-class Encoder:
-    """A speed from a position's readings: difference a sample, then a first-order low-pass; it starts true.
-
-    Parameters
-    ----------
-    position : str
-        The channel that is differentiated.
-    filter_time : float
-        Time constant of the low-pass [s].
-    """
-
-    position: str = "position"
-    filter_time: float = 5e-3
-
-    def __post_init__(self) -> None:
-        require(0 <= self.filter_time < inf, f"Encoder: filter_time must not be negative, got {self.filter_time:g} s")

@@ -213,6 +213,22 @@ class ControlRate:
 
 
 @dataclass(frozen=True)
+class AirUse:
+    """What a pneumatic drive draws from its supply, from the step to the end of the horizon [l(ANR), ISO 8778].
+
+    Parameters
+    ----------
+    max : float, optional
+        [l(ANR)]
+    """
+
+    max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_limit(self, 0.0)
+
+
+@dataclass(frozen=True)
 class MaxSensitivity:
     """``Ms = max |1/(1 + L(jw))|``, the inverse of the Nyquist curve's distance from -1; 1.2 is careful, 2 is bold.
 
@@ -303,6 +319,7 @@ Requirement = (
     | StepEnvelope
     | PeakControl
     | ControlRate
+    | AirUse
     | Robustness
 )
 ROBUSTNESS = (MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin, NoiseGain)
@@ -325,9 +342,20 @@ def told(requirement: Requirement, value: float) -> tuple[str, str]:
     >>> told(GainMargin(min=2.0), 1 / 1.8), told(Overshoot(max=0.05), 0.06)
     (('1.8', 'at least 2'), ('0.06', 'allowed 0.05'))
     """
+    limit = f"at least {requirement.min:.6g}" if isinstance(requirement, AT_LEAST) else f"allowed {requirement.max:.6g}"
+    return f"{shown(requirement, value):.6g}", limit
+
+
+def shown(requirement: Requirement, value: float) -> float:
+    """A value as `read` gives it, as the user writes it: a margin itself."""
     if isinstance(requirement, AT_LEAST):
-        return f"{1 / value if value else inf:.6g}", f"at least {requirement.min:.6g}"
-    return f"{value:.6g}", f"allowed {requirement.max:.6g}"
+        return 1 / value if value else inf
+    return value
+
+
+def bound(requirement: Requirement) -> float | None:
+    """The limit as the user writes it, `max` or `min`."""
+    return requirement.min if isinstance(requirement, AT_LEAST) else requirement.max
 
 
 def name(requirement: Requirement) -> str:

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.sensor import Encoder
 from pneuopt.errors import ModelError, check_known, require
 from pneuopt.experiments import CHANNELS, Experiment
-from pneuopt.instruments import Actuator, Encoder, Sensor
+from pneuopt.instruments import Actuator, Sensor
 from pneuopt.integration import Run
 from pneuopt.parameters import ParameterSet, Quantity
 from pneuopt.simulate import contacts, first_state, held_inputs, new_run, warn_of
@@ -41,7 +42,8 @@ class Rig:
         By the plant's output: what is measured, and logged.
     actuator : Actuator
     encoder : Encoder
-        Where a speed loop gets its speed from, unless there is a sensor for it.
+        Where a speed loop gets its speed from, unless there is a sensor for it: from that of the position, whose
+        readings it rounds to its own resolution.
     actuated : str, optional
         Of a plant alone: the input that the actuator drives; by default its only one.
 
@@ -265,12 +267,13 @@ class _Controller:
         wanted, source = self._loop.feedback.name, self._rig.feedback
         if source == wanted:
             return readings[wanted]
-        before, self._position = self._position, readings[str(source)]
+        counts = Sensor(resolution=self._rig.encoder.resolution)
+        before, self._position = self._position, counts.reading(readings[str(source)], 0.0)
         if before is None:
             return self._first
         h = self._loop.pid.sample_time or 0.0
         raw = (self._position - before) / h
-        return self._seen[-1] + h / (h + self._rig.encoder.filter_time) * (raw - self._seen[-1])
+        return self._seen[-1] + h / (h + self._rig.encoder.filter) * (raw - self._seen[-1])
 
 
 def _drive(

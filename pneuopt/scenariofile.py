@@ -1,6 +1,6 @@
 """The [scenarios] of a tuning.toml: corners and samples of the plant, tolerances of the gains."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pneuopt.errors import InputError, check_known, require
@@ -9,6 +9,7 @@ from pneuopt.scenarios import Scenarios, Spread, corners, samples, tolerances
 from pneuopt.units import read_value
 
 KINDS = ("corners", "samples", "tolerances")
+FRESH = 100  # plants of each kind that a design is validated on
 _DRAWN = (("count", 20), ("seed", 0))
 
 
@@ -33,28 +34,37 @@ def read_scenarios(said: Mapping[str, Any], where: str, parameters: ParameterSet
     InputError
         The message names file, section and key.
     """
+    return {name: values for part in _parts(said, where, parameters, None) for name, values in part.items()}
+
+
+def read_fresh(said: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
+    """Plants and tolerances that `read_scenarios` has not: "fresh 1" and so on, drawn from the same boxes."""
+    drawn = (values for part in _parts(said, where, parameters, FRESH) for values in part.values())
+    return {f"fresh {number}": values for number, values in enumerate(drawn, 1)}
+
+
+def _parts(said: Mapping[str, Any], where: str, parameters: ParameterSet, fresh: int | None) -> Iterator[Scenarios]:
     check_known("kind", said, KINDS, f"{where}: [scenarios]")
-    found: dict[str, Any] = {}
     for kind, given in said.items():
         spot = f"{where}: [scenarios.{kind}]"
         require(isinstance(given, dict), f'{spot} must be a section, with "load.mass" = "30 %" in it')
-        found |= _of(kind, given, spot, parameters)
-    return found
+        yield _of(kind, given, spot, parameters, fresh)
 
 
-def _of(kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
+def _of(kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet, fresh: int | None) -> Scenarios:
     entries = dict(given)
     count, seed = (entries.pop(key, default) if kind == "samples" else 0 for key, default in _DRAWN)
     require(isinstance(count, int) and isinstance(seed, int), f"{where} count and seed are whole numbers")
     try:
         spreads = _spreads(entries, where, parameters)
-        if kind == "samples":
-            return samples(parameters, spreads, count, seed=seed)
-        if kind == "corners":
+        if kind == "corners" and fresh is None:
             return corners(parameters, spreads)
+        if kind != "tolerances":
+            return samples(parameters, spreads, fresh or count, seed=seed if fresh is None else seed + 1)
         pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
         require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
-        return tolerances(parameters, {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)})
+        shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
+        return tolerances(parameters, shares, fresh)
     except InputError as error:
         raise error if where in str(error) else InputError(f"{where} {error}") from None
 

@@ -86,14 +86,23 @@ def corners(parameters: ParameterSet, spreads: Spreads) -> Cases:
     }
 
 
-def tolerances(parameters: ParameterSet, shares: Mapping[str, float] | Mapping[Names, float]) -> Scenarios:
-    """Every combination of least and greatest factor on parameters that are tuned, or on any other.
+def tolerances(
+    parameters: ParameterSet,
+    shares: Mapping[str, float] | Mapping[Names, float],
+    count: int | None = None,
+    *,
+    seed: int = 0,
+) -> Scenarios:
+    """Every combination of least and greatest factor on parameters that are tuned, or on any other; or some between.
 
     Parameters
     ----------
     parameters : ParameterSet
     shares : mapping of str, or tuple of str, to float
         An axis each: parameters, or patterns, that move together, and by what fraction of a candidate's value.
+    count : int, optional
+        Draw so many from the box, uniformly, instead of its corners.
+    seed : int
 
     Returns
     -------
@@ -114,7 +123,8 @@ def tolerances(parameters: ParameterSet, shares: Mapping[str, float] | Mapping[N
     for axis, share in shares.items():
         require(0 < share < 1, f"{axis}: a tolerance is a fraction between 0 and 1, got {share:g}; 0.01 is +-1 %")
     units = ParameterSet({n: replace(p, value=1.0, lower=0.0, upper=2.0, log=False) for n, p in parameters.items()})
-    return {name: {n: Factor(v) for n, v in values.items()} for name, values in corners(units, shares).items()}
+    factors = corners(units, shares) if count is None else samples(units, shares, count, seed=seed)
+    return {name: {n: Factor(v) for n, v in values.items()} for name, values in factors.items()}
 
 
 def applied(parameters: ParameterSet, values: Mapping[str, float | Factor]) -> ParameterSet:

@@ -11,9 +11,11 @@ from pneuopt.requirements import (
     Bounds,
     MaxComplementarySensitivity,
     MaxSensitivity,
+    Overshoot,
     PeakControl,
     Requirement,
     SettlingTime,
+    SteadyStateError,
     StepEnvelope,
     most,
     name,
@@ -69,7 +71,7 @@ class Specification:
         """
         room: dict[type, float] = {SettlingTime: 0.0}
         room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
-        limits = tuple(_allowing(q, most(q) * (1 - room.get(type(q), margin))) for q in self.limits)
+        limits = tuple(allowing(q, most(q) * (1 - room.get(type(q), margin))) for q in self.limits)
         return replace(self, limits=limits, band=self.band * (1 - margin))
 
     def without(self, kind: Kind) -> "Specification":
@@ -128,6 +130,8 @@ def specify(
     require(len(bands) <= 1, f"settling bands differ: {sorted(bands)}; one band holds for the whole tuning")
     tubes = {q.bounds for q in (*weights, *subject_to) if isinstance(q, StepEnvelope)}
     require(len(tubes) <= 1, "two StepEnvelopes differ; join them to one")
+    for tube in tubes:
+        _check_tube(tube, (*weights, *subject_to), next(iter(bands), 0.02))
     limits: dict[str, Requirement] = {}
     for q in (*weights, *subject_to):
         if most(q) < (most(limits[name(q)]) if name(q) in limits else inf):
@@ -135,7 +139,23 @@ def specify(
     return Specification(weights, tuple(limits.values()), next(iter(bands), 0.02))
 
 
-def _allowing(requirement: Requirement, value: float) -> Requirement:
+def _check_tube(tube: Bounds, requirements: Sequence[Requirement], band: float) -> None:
+    """Refuse an envelope in which no response can be that does what else is asked for."""
+    start, (last, low, up) = tube[0], tube[-1]
+    begins = start[0] > 0 or start[1] <= 0 <= start[2]
+    told = f"StepEnvelope: at the step itself the bounds are {start[1]:g} to {start[2]:g}, but the response is at 0"
+    require(begins, f"{told}; let them include 0 there, or begin later")
+    for q in requirements:
+        near = band if isinstance(q, SettlingTime) else q.max if isinstance(q, SteadyStateError) else None
+        told = f"StepEnvelope: from {last:g} s on the bounds are {low:g} to {up:g}, {name(q)} asks for 1 to within {near}"
+        require(near is None or (low <= 1 + near and up >= 1 - near), f"{told}; move the bounds, or leave one out")
+        if isinstance(q, Overshoot) and q.max is not None:
+            t, lower, _ = max(tube, key=lambda row: row[1])
+            told = f"StepEnvelope: from {t:g} s on the lower bound is {lower:g}, Overshoot allows {1 + q.max:g}"
+            require(lower <= 1 + q.max, f"{told}; lower the bound, or raise Overshoot's max")
+
+
+def allowing(requirement: Requirement, value: float) -> Requirement:
     """The same with another largest value, by copy."""
     if isinstance(requirement, AT_LEAST):
         return replace(requirement, min=1 / value)

@@ -58,6 +58,9 @@ class System:
         What a simulation of it watches.
     doubter : Doubter, optional
         What it can tell against logs.
+    meter : casadi.Function, optional
+        ``(t, x, u, p) -> (air, spool)``: mass flow from the supply [kg/s], the spool's position [half travels]; no
+        outputs, for nobody logs them.
     """
 
     states: tuple[Quantity, ...]
@@ -70,6 +73,7 @@ class System:
     checker: Checker | None = None
     guards: tuple[Guard, ...] = ()
     doubter: Doubter | None = None
+    meter: ca.Function | None = None
 
     def __repr__(self) -> str:
         return describe(self)

@@ -7,12 +7,14 @@ A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or s
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.certificate import GRAZING, Found, Notary, TuningResult
+from pneuopt.certificate import GRAZING, Found, Notary, TuningResult, missing, with_relaxations
 from pneuopt.checks import check_smooth
+from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.errors import ConvergenceError, require
@@ -24,9 +26,11 @@ from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space, Tell, span
 from pneuopt.tuning.cases import cases
 from pneuopt.tuning.condensed import Condensed, check_differentiable, condense, is_differentiable
+from pneuopt.tuning.reach import check_reach
+from pneuopt.tuning.relaxation import alone, row, together
 from pneuopt.tuning.screening import Screening, merit, screen
 from pneuopt.tuning.simulator import Simulator, each
-from pneuopt.tuning.two_phase import TwoPhase, check_exact, is_exact, is_linear, solve_two_phase
+from pneuopt.tuning.two_phase import TwoPhase, check_exact, is_exact, is_light, is_linear, solve_two_phase
 
 __all__ = ["TuningResult", "tune"]
 Array = NDArray[np.float64]
@@ -37,6 +41,8 @@ ROUNDS = 3  # of looking around for printed gains that lose next to nothing
 SLACK = 1e-4  # by which a search may end on the wrong side of a limit; the certificate decides
 PEAKS_EXACT, PEAKS_SCREENED = 1 / 300, 1 / 5  # of the margin, for peak control and sensitivity
 FEW_GAINS = 6  # up to which one plant is tuned as well without gradients; with 8 on T32 it takes twice the time
+CONTRADICTED = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)  # limits may be why
+CLOSE = 0.002  # margin of the search for how far a limit has to give way: what it finds shall be the least
 UNFELT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # by a linear loop's average
 
 
@@ -61,7 +67,8 @@ def tune(
     references : Step or sequence of Step
         Each from rest, or from steady motion, and with a label of its own; the worst counts.
     parameters : ParameterSet
-        Of plant, controller and dither. The free ones ("pid.*", "dither.*") are tuned and need two finite bounds each.
+        Of plant, controller and dither. The free ones ("pid.*", "dither.*", "feedforward.*") are tuned and need two
+        finite bounds each.
     minimise : Requirement, or mapping of Requirement to weight
     subject_to : sequence of Requirement
         Each with its bound, `max` or `min`.
@@ -69,8 +76,9 @@ def tune(
         Plants beside the nominal one, or tolerances of the gains: of `corners`, `samples`, `draws`, `tolerances`, or
         several of them joined with ``|``. The worst over references and scenarios counts.
     method : TwoPhase, Screening or Condensed, optional
-        By default the first for one linear plant with a continuous controller, if it has equations for all that is
-        asked for; else the last for scenarios or many gains where all is differentiable, and the second.
+        By default the first for one linear plant with a continuous controller that no clip can hold back, if it has
+        equations for all that is asked for; else, or where that fails, the last for scenarios or many gains where all
+        is differentiable, and the second.
     throw : bool
         Raise if nothing could be certified; otherwise the result says so in its status.
     progress : callable, optional
@@ -102,28 +110,55 @@ def tune(
     (True, True)
     """
     begun = time.perf_counter()
-    check_smooth(loop.plant)
-    spec, steps = specify(minimise, subject_to), [references] if isinstance(references, Step) else list(references)
-    spec = spec.without(PeakControl) if _clip(loop, parameters) <= spec.limit(PeakControl) else spec
-    require(len(steps) > 0, "no reference to tune for; give a Step")
-    space = span(loop, parameters)
-    cases(steps, scenarios, space.parameters, space.names)
-    method = _checked(method, loop, scenarios, space, spec)
-    unfelt = tuple(n for n in space.names if n in UNFELT) if isinstance(method, TwoPhase) else ()
-    felt = Space(space.parameters, tuple(n for n in space.names if n not in unfelt))
-    require(len(felt.names) > 0, f"{', '.join(unfelt)}: without effect on a linear loop; free a gain as well")
-    notary = Notary(loop, tuple(steps), scenarios, felt, spec, method)
-    result = _Search(notary, felt, spec, method, progress or (lambda _: None)).run()
+    posed = (loop, references, parameters, minimise, subject_to, scenarios)
+    search = pose(*posed, method, progress)
+    result = search.run()
+    if method is None and isinstance(search.method, TwoPhase) and not result.status.converged:
+        search = pose(*posed, Screening(), progress)  # the exact problem keeps its band at its nodes only
+        result = search.run()
+    result = relax(search, result) if search.spec.limits and result.status.code in CONTRADICTED else result
+    felt = search.space.names
+    unfelt = [n for n in span(loop, parameters).names if n not in felt]
     note = f"; {', '.join(unfelt)} left as given: without effect on a linear loop's average" if unfelt else ""
     result = replace(
         result,
-        parameters=parameters | result.parameters.select(felt.names if result.status.converged else ()),
+        parameters=parameters | result.parameters.select(felt if result.status.converged else ()),
         status=replace(result.status, message=result.status.message + note),
         stats={**result.stats, "seconds": time.perf_counter() - begun},
     )
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status}; the given gains stand", result)
     return result
+
+
+def pose(
+    loop: ClosedLoop,
+    references: Step | Sequence[Step],
+    parameters: ParameterSet,
+    minimise: Requirement | Mapping[Requirement, float],
+    subject_to: Sequence[Requirement] = (),
+    scenarios: Scenarios = NOMINAL,
+    method: Method | None = None,
+    progress: Tell | None = None,
+) -> "Search":
+    """The search that a tuning is, everything checked; parameters and errors as for `tune`."""
+    check_smooth(loop.plant)
+    steps = [references] if isinstance(references, Step) else list(references)
+    loop = disturbed(loop, steps)
+    spec = specify(minimise, subject_to)
+    spec = spec.without(PeakControl) if _clip(loop, parameters) <= spec.limit(PeakControl) else spec
+    require(len(steps) > 0, "no reference to tune for; give a Step")
+    space = span(loop, parameters)
+    every = cases(steps, scenarios, space.parameters, space.names)
+    check_reach(loop, every, space, spec)
+    given, method = method, _checked(method, loop, scenarios, space, spec)
+    if given is None and isinstance(method, TwoPhase) and not is_light(loop, steps, space, method):
+        method = Screening()
+    unfelt = tuple(n for n in space.names if n in UNFELT) if isinstance(method, TwoPhase) else ()
+    felt = Space(space.parameters, tuple(n for n in space.names if n not in unfelt))
+    require(len(felt.names) > 0, f"{', '.join(unfelt)}: without effect on a linear loop; free a gain as well")
+    notary = Notary(loop, tuple(steps), scenarios, felt, spec, method)
+    return Search(notary, felt, spec, method, progress or (lambda _: None))
 
 
 def _checked(
@@ -140,7 +175,9 @@ def _checked(
         check_differentiable(space, spec)
     if method is not None:
         return method
-    if linear and not scenarios and is_exact(spec):
+    clip = _clip(loop, space.parameters)
+    clipped = clip < np.inf and not spec.limit(PeakControl) < clip  # designs that saturate are no less welcome
+    if linear and not clipped and not scenarios and is_exact(spec):
         return TwoPhase()
     many = bool(scenarios) or len(space.names) > FEW_GAINS
     return Condensed() if many and is_differentiable(space, spec) else Screening()
@@ -153,7 +190,7 @@ def _clip(loop: ClosedLoop, parameters: ParameterSet) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class Search:
     """One tuning: search, print, certify, and again with a wider margin where the certificate fails."""
 
     notary: Notary
@@ -162,10 +199,16 @@ class _Search:
     method: Method
     tell: Tell
 
-    def run(self) -> TuningResult:
-        loop, references = self.notary.loop, self.notary.references
-        simulator = Simulator(loop, references, self.space, self.notary.scenarios, self.spec)
-        result, start, counts = None, self.space.start, dict[str, float]()
+    def run(self, start: Array | None = None) -> TuningResult:
+        """The result, from a point other than the given gains where there is one."""
+        simulator = self.simulator
+        try:
+            if start is None:
+                self._tell_start(simulator)
+        except KeyboardInterrupt:
+            nothing = Found(self.space.start, Status(Code.INTERRUPTED), (), {"simulations": 1.0})
+            return self._cut_short(simulator, nothing)
+        result, start, counts = None, self.space.start if start is None else start, dict[str, float]()
         for attempt in range(ATTEMPTS):
             margin = min(self.method.margin * 2**attempt, 0.5)
             found = self._search(simulator, attempt, margin, start)
@@ -175,13 +218,49 @@ class _Search:
                 return self._cut_short(simulator, found)
             if not found.status.converged:
                 return result or self.notary.result(simulator, found, found.point)
-            for point in self._printed(simulator, found, margin):
-                result = self.notary.result(simulator, found, point)
-                if result.status.converged or "contacts" in result.stats:
-                    return result
+            result = self.certified(found, margin)
+            if result.status.converged or "contacts" in result.stats:
+                return result
             start = found.point
         assert result is not None
         return result
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """Of all cases, that reads what is asked for."""
+        notary = self.notary
+        return Simulator(notary.loop, notary.references, self.space, notary.scenarios, self.spec)
+
+    def _tell_start(self, simulator: Simulator) -> None:
+        """Say where the given gains are no good: a search copes with that, but one may be mistyped."""
+        times = [row["SettlingTime"] for row in simulator.table(self.space.start, self.spec)]
+        bad = [k for k, t in enumerate(times) if not np.isfinite(t)]
+        if bad:
+            word = "runs away" if np.isinf(times[bad[0]]) else "never settles"
+            where = f"{simulator.cases[bad[0]].label}, {len(bad)} of {len(times)} cases"
+            self.tell(f"with the given gains the loop {word} at {where}; searching on")
+
+    def certified(self, found: Found, margin: float) -> TuningResult:
+        """What was found, as printed: the first of several roundings whose certificate holds, or the last."""
+        result = None
+        for point in self._printed(self.simulator, found, margin):
+            result = self.notary.result(self.simulator, found, point)
+            if result.status.converged or "contacts" in result.stats:
+                break
+        assert result is not None
+        return result
+
+    def judged(self, point: Array) -> TuningResult:
+        """A point as printed, with its certificate."""
+        printed = self.space.printed(point, self.method.digits) if self.method.digits else point
+        found = Found(printed, Status(Code.CONVERGED), (), {"optimum": np.inf})
+        return self.notary.result(self.simulator, found, printed)
+
+    def asking(self, spec: Specification, method: Method) -> "Search":
+        """The same for another specification, of the same kinds, on the same simulator."""
+        other = replace(self, notary=replace(self.notary, spec=spec, method=method), spec=spec, method=method)
+        vars(other)["simulator"] = self.simulator
+        return other
 
     def _cut_short(self, simulator: Simulator, found: Found) -> TuningResult:
         """The best so far, as printed, with its certificate; not handed out, for nobody has chosen it."""
@@ -203,7 +282,7 @@ class _Search:
         method = self.method if attempt == 0 else replace(self.method, starts=1)
         space = Space(self.space.filled(start), self.space.names)
         optima = solve_two_phase(
-            self.notary.loop, self.notary.references, space, self._tightened(margin), method, self.tell
+            self.notary.loop, self.notary.references, space, self.tightened(margin), method, self.tell
         )
         best, values = optima.best, optima.best.parameters
         stats = {
@@ -216,7 +295,7 @@ class _Search:
         point = np.array([values.value(n) for n in self.space.names])
         return Found(point, best.status, tuple(best.multipliers), stats)
 
-    def _tightened(self, margin: float) -> Specification:
+    def tightened(self, margin: float) -> Specification:
         """An exact problem needs next to no room on peaks; a screening's coarser simulation needs some."""
         return self.spec.tightened(
             margin, margin * (PEAKS_EXACT if isinstance(self.method, TwoPhase) else PEAKS_SCREENED)
@@ -224,7 +303,7 @@ class _Search:
 
     def _screen(self, simulator: Simulator, margin: float, start: Array) -> Found:
         assert not isinstance(self.method, TwoPhase)
-        spec = self._tightened(margin)
+        spec = self.tightened(margin)
         arguments = (simulator, self.notary.references, self.space, spec)
         if isinstance(self.method, Condensed):
             found = condense(*arguments, self.method, start, self.tell)
@@ -237,7 +316,7 @@ class _Search:
 
     def _printed(self, simulator: Simulator, found: Found, margin: float) -> Iterator[Array]:
         """The gains as printed; where those break a limit or lose too much, what a last place more or less mends."""
-        digits, spec, tried = self.method.digits, self._tightened(margin / 2), list[list[float]]()
+        digits, spec, tried = self.method.digits, self.tightened(margin / 2), list[list[float]]()
         if digits is None:
             yield found.point
             return
@@ -257,6 +336,52 @@ class _Search:
                 break
         if not tried:
             yield nearest
+
+
+def relax(search: Search, result: TuningResult) -> TuningResult:
+    """Say how far the limits have to give way, each alone and all together.
+
+    Where it turns out that a design keeps them all, which a search with its margins can miss, that is the answer.
+    """
+    spec, points, rows = search.spec, [ended_in(result, search.space)], dict[str, dict[str, float]]()
+    method = brief(search.method, CLOSE)
+    for q in spec.limits:
+        search.tell(f"how far {name(q)} would have to give way alone")
+        found = search.asking(alone(spec, q, search.notary.references), method).run(points[0])
+        if found.status.code is Code.INTERRUPTED:
+            return result
+        points.append(ended_in(found, search.space))
+        value = float(found.requirements["certified"][name(q)]) if found.status.converged else np.nan
+        rows[name(q)] = row(q, value, points[-1], search.space.names)
+        if rows[name(q)]["share"] <= 0:
+            return _kept(search, points[-1])
+    search.tell("how far all limits would have to give way together")
+    inside = spec.with_band(spec.band * (1 - search.method.margin))
+    shared = together(search.simulator, search.space, inside, points)
+    judged = min((search.judged(point) for point in (shared, *points)), key=missing)
+    if judged.status.converged:
+        return _kept(search, ended_in(judged, search.space))
+    if len(rows) > 1:
+        rows["all"] = row(None, missing(judged), ended_in(judged, search.space), search.space.names)
+    return with_relaxations(replace(judged, stats={**result.stats, **judged.stats}), rows)
+
+
+def brief(method: Method, margin: float) -> TwoPhase | Screening:
+    """A short search from a point that is close."""
+    if isinstance(method, TwoPhase):
+        return replace(method, starts=2, margin=margin, solver=replace(method.solver, max_iterations=150))
+    return Screening(24, 8, (), 200, margin, digits=method.digits)
+
+
+def _kept(search: Search, point: Array) -> TuningResult:
+    """The best from a design that keeps all limits; or that design, where the margins leave no room for a search."""
+    found = search.run(point)
+    return found if found.status.converged else search.judged(point)
+
+
+def ended_in(result: TuningResult, space: Space) -> Array:
+    """The point that a search ended in, whether it was handed out or not."""
+    return np.array([result.stats.get(f"rejected.{n}", result.parameters.value(n)) for n in space.names])
 
 
 def _screened(spec: Specification, values: Mapping[str, float]) -> Status:

@@ -5,46 +5,34 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 import tomlkit
 
-from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID, StandardForm, to_parallel
 from pneuopt.control.reference import Step
-from pneuopt.control.sensor import SensorLag
-from pneuopt.errors import InputError, check_known, require
+from pneuopt.errors import UnitError, check_known, require
+from pneuopt.loopfile import SECTIONS, TUNABLE, checked, read_loop, value_of
 from pneuopt.nlp.status import Status
 from pneuopt.output import plain, write_text
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.parameters import ParameterSet
 from pneuopt.requirements import AT_LEAST, KINDS, Bounds, Requirement
-from pneuopt.scenariofile import read_scenarios
+from pneuopt.scenariofile import read_fresh, read_scenarios
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.specification import specify
 from pneuopt.system import System
 from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.units import read_value, write_value
+from pneuopt.units import read_value
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Sections = Mapping[str, Any]
-T = TypeVar("T")
 
 RESULTS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
-_SECTIONS = ("loop", "sensor", "pid", "dither", "reference", "minimise", "limits", "scenarios")
-_STRUCTURE: Mapping[str, tuple[str, ...]] = {
-    "loop": ("measured", "actuated"),
-    "pid": ("form", "sample_time", "limits"),
-    "dither": ("waveform", "analogue"),
-}
-_GAINS: Mapping[str, tuple[str, ...]] = {
-    "parallel": ("Kp", "Ki", "Kd", "Tf", "b", "c", "Tt"),
-    "standard": ("Kp", "Ti", "Td", "N", "b", "c", "Tt"),
-}
+_SECTIONS = (*SECTIONS, "reference", "minimise", "limits", "scenarios")
 _REQUIREMENTS = {re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in KINDS}
 _OWN: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
@@ -58,12 +46,14 @@ class Tuning:
     loop : ClosedLoop
     references : tuple of Step
     parameters : ParameterSet
-        "pid.*", "dither.*" and "sensor.lag", the free ones within finite bounds.
+        "pid.*", "dither.*", "sensor.*" and "feedforward.*", the free ones within finite bounds.
     minimise : mapping of Requirement to float
         Weights; empty where the file only describes a loop.
     subject_to : tuple of Requirement
     scenarios : callable
         Of the nominal parameters: the plants and tolerances beside them.
+    fresh : callable
+        Likewise: others from the same boxes, to validate a design on.
     """
 
     loop: ClosedLoop
@@ -72,6 +62,7 @@ class Tuning:
     minimise: Mapping[Requirement, float]
     subject_to: tuple[Requirement, ...]
     scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NOMINAL
+    fresh: Callable[[ParameterSet], Scenarios] = lambda _: NOMINAL
 
 
 class Tuned(Protocol):
@@ -118,16 +109,15 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     """
     said = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in RESULTS}
     check_known("section", said, _SECTIONS, str(path))
-    for name in ("loop", "sensor", "pid", "dither", "minimise", "limits", "scenarios"):
+    for name in (n for n in _SECTIONS if n != "reference"):
         require(isinstance(said.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
     require("pid" in said, f"{path}: no controller; add a section [pid]")
-    loop = _loop(said, plant, path)
+    loop, parameters = read_loop(said, plant, path)
     minimise, subject_to = _minimise(said, path), _limits(said, loop, path)
     if minimise:
-        _checked(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
-    parameters = _parameters(said, loop, path)
-    scenarios = partial(read_scenarios, said.get("scenarios", {}), str(path))
-    return Tuning(loop, _references(said, loop, path), parameters, minimise, subject_to, scenarios)
+        checked(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
+    drawn = [partial(read, said.get("scenarios", {}), str(path)) for read in (read_scenarios, read_fresh)]
+    return Tuning(loop, _references(said, loop, path), parameters, minimise, subject_to, *drawn)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: Tuned) -> None:
@@ -162,100 +152,6 @@ def write_tuned(path: str | Path, source: str | Path, result: Tuned) -> None:
     write_text(path, tomlkit.dumps(document))
 
 
-def _loop(said: Sections, plant: System, path: str | Path) -> ClosedLoop:
-    wiring, pid, dither = (said.get(name, {}) for name in ("loop", "pid", "dither"))
-    check_known("key", wiring, _STRUCTURE["loop"], f"{path}: [loop]")
-    for key, signal in wiring.items():
-        require(isinstance(signal, str), f"{path}: [loop] {key} must be a signal's name, got {signal!r}")
-    sample_time = _value(pid, "sample_time", "s", f"{path}: [pid]") if "sample_time" in pid else None
-    controller = _checked(lambda: PID(sample_time, limits="limits" in pid), f"{path}: [pid]")
-    oscillation = _dither(dither, f"{path}: [dither]") if "dither" in said else None
-    sensor = _sensor(said["sensor"], f"{path}: [sensor]") if "sensor" in said else None
-    return _checked(lambda: ClosedLoop(plant, controller, oscillation, **wiring, sensor=sensor), str(path))
-
-
-def _sensor(said: Mapping[str, Any], where: str) -> SensorLag:
-    check_known("key", said, ("lag",), where)
-    require("lag" in said, f'{where} says no lag; write lag = "5 ms"')
-    lag = _value(said, "lag", "s", where)
-    return _checked(lambda: SensorLag(lag), where)
-
-
-def _dither(said: Mapping[str, Any], where: str) -> Dither:
-    check_known("waveform", [str(said.get("waveform", "sine"))], ("sine",), where)
-    require(isinstance(said.get("analogue", False), bool), f"{where} analogue must be true or false")
-    require("frequency" in said, f'{where} says no frequency; write frequency = "160 Hz"')
-    given = read_parameter(said["frequency"], Parameter(1.0, "Hz"), f"{where} frequency")
-    return _checked(lambda: Dither(given.value, said.get("analogue", False)), where)
-
-
-def _parameters(said: Sections, loop: ClosedLoop, path: str | Path) -> ParameterSet:
-    own = loop.parameters.select(n for n in loop.parameters if n.startswith(("pid.", "dither.", "sensor.")))
-    form = said["pid"].get("form", "parallel")
-    check_known("form", [str(form)], _GAINS, f"{path}: [pid]")
-    read = _standard(said["pid"], own, path) if form == "standard" else _entries(said, "pid", own, path)
-    read |= _entries(said, "dither", own, path)
-    read |= _clip(said["pid"], own, f"{path}: [pid] limits")
-    for name in (n for n, p in read.items() if p.free):
-        section, _, key = name.partition(".")
-        finite = abs(read[name].lower) < float("inf") and abs(read[name].upper) < float("inf")
-        require(finite, f"{path}: [{section}] {key} is free, so it needs both bounds: lower and upper")
-    parameters = own | ParameterSet(read)
-    _checked(lambda: loop.check(parameters), str(path))
-    return parameters
-
-
-def _entries(said: Sections, section: str, own: ParameterSet, path: str | Path) -> dict[str, Parameter]:
-    entries, where = said.get(section, {}), f"{path}: [{section}]"
-    keys = [n.removeprefix(f"{section}.") for n in own if n.startswith(f"{section}.")]
-    if section == "pid":
-        _check_gains(entries, "parallel", where)
-        keys = [k for k in keys if k in _GAINS["parallel"]]
-    check_known("key", entries, (*_STRUCTURE[section], *keys), where)
-    names = {k: f"{section}.{k}" for k in keys if k in entries}
-    return {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
-
-
-def _check_gains(entries: Mapping[str, Any], form: str, where: str) -> None:
-    other = _GAINS["standard" if form == "parallel" else "parallel"]
-    for key in entries:
-        foreign = key in other and key not in _GAINS[form]
-        require(not foreign, f"{where} {key} does not belong to the {form} form, which has {', '.join(_GAINS[form])}")
-    require("Kp" in entries, f"{where} says no gain; write at least Kp")
-    require("Tt" not in entries or "limits" in entries, f"{where} Tt unwinds the integral at limits; write limits, too")
-
-
-def _standard(entries: Mapping[str, Any], own: ParameterSet, path: str | Path) -> dict[str, Parameter]:
-    """Gains of the ISA form as those of the parallel form, which is what is tuned: values only."""
-    where = f"{path}: [pid]"
-    _check_gains(entries, "standard", where)
-    check_known("key", entries, (*_STRUCTURE["pid"], *_GAINS["standard"]), where)
-    units = {"Kp": own["pid.Kp"].unit, "Ti": "s", "Td": "s", "N": "1"}
-    tables = [k for k in units if isinstance(entries.get(k), dict)]
-    given = {k: _value(entries, k, unit, where) for k, unit in units.items() if k in entries and k not in tables}
-    remedy = 'tune in form = "parallel": Kp, Ki = Kp/Ti, Kd = Kp Td, Tf = Td/N'
-    require(not tables, f"{where} {', '.join(tables)}: the standard form takes values only; {remedy}")
-    gains = _checked(lambda: to_parallel(StandardForm(**given)), where)
-    found = {f"pid.{k}": replace(own[f"pid.{k}"], value=getattr(gains, k)) for k in ("Kp", "Ki", "Kd")}
-    if gains.Kd:
-        found["pid.Tf"] = _checked(lambda: replace(own["pid.Tf"], value=gains.Tf), f"{where} Td/N")
-    shared = [k for k in ("b", "c", "Tt") if k in entries]
-    return found | {f"pid.{k}": read_parameter(entries[k], own[f"pid.{k}"], f"{where} {k}") for k in shared}
-
-
-def _clip(entries: Mapping[str, Any], own: ParameterSet, where: str) -> dict[str, Parameter]:
-    if "limits" not in entries:
-        return {}
-    ends, unit = entries["limits"], own["pid.lower"].unit
-    require(
-        isinstance(ends, list) and len(ends) == 2,
-        f'{where} must be a pair: ["{write_value(-5.0, unit)}", "{write_value(5.0, unit)}"]',
-    )
-    low, high = (read_value(end, unit, where=where) for end in ends)
-    require(low < high, f"{where}: {ends[0]} is not below {ends[1]}")
-    return {"pid.lower": replace(own["pid.lower"], value=low), "pid.upper": replace(own["pid.upper"], value=high)}
-
-
 def _references(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
     entries = said.get("reference", [])
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
@@ -269,16 +165,29 @@ def _references(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Ste
 
 def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
     unit, outputs = loop.feedback.unit, {q.name: q.unit for q in loop.plant.outputs}
-    units = {"step": unit.partition("(")[0], "initial": unit, "at": "s", "horizon": "s"}
-    check_known("key", entry, (*units, "start"), where)
+    difference = unit.partition("(")[0]
+    units = {"step": difference, "initial": unit, "at": "s", "horizon": "s", "scale": difference}
+    check_known("key", entry, (*units, "start", "disturbance"), where)
     start = entry.get("start", {})
     require(isinstance(start, dict), f'{where} start: write start = {{ position = "250 mm" }}')
     check_known("output", start, outputs, f"{where} start")
-    for key in ("step", "horizon"):
+    for key in ("horizon",) if "disturbance" in entry else ("step", "horizon"):
         require(key in entry, f"{where} says no {key}")
-    read = {("size" if k == "step" else k): _value(entry, k, units[k], where) for k in units if k in entry}
-    begun = {n: _value(start, n, outputs[n], f"{where} start") for n in start}
-    return _checked(lambda: Step(start=begun, **read), where)
+    read = {("size" if k == "step" else k): value_of(entry, k, units[k], where) for k in units if k in entry}
+    pushed = _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")
+    begun = {n: value_of(start, n, outputs[n], f"{where} start") for n in start}
+    known: dict[str, Any] = {"size": 0.0, **read, "start": begun, "disturbance": pushed}
+    return checked(lambda: Step(**known), where)
+
+
+def _disturbance(said: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
+    """By how much parameters and inputs of the plant change."""
+    require(isinstance(said, dict), f'{where}: write disturbance = {{ "load.force" = "50 N" }}')
+    flat = {f"{n}.{m}": v for n, e in said.items() if isinstance(e, dict) for m, v in e.items()}
+    flat |= {n: v for n, v in said.items() if not isinstance(v, dict)}
+    units = {q.name: q.unit for q in loop.plant.inputs} | {n: p.unit for n, p in loop.plant.parameters.items()}
+    check_known("parameter or input of the plant", flat, units, where)
+    return {n: value_of(flat, n, units[n].partition("(")[0], where) for n in flat}
 
 
 def _minimise(said: Sections, path: str | Path) -> dict[Requirement, float]:
@@ -289,7 +198,7 @@ def _minimise(said: Sections, path: str | Path) -> dict[Requirement, float]:
         spot = f"{where} {key}"
         require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
         check_known("key", entry, ("weight", *_own(key)), spot)
-        weight = _value(entry, "weight", "1", spot) if "weight" in entry else 1.0
+        weight = value_of(entry, "weight", "1", spot) if "weight" in entry else 1.0
         require(0 < weight < float("inf"), f"{spot}: weight must be positive, got {weight:g}")
         weights[_requirement(key, entry, {"max": None} if key == "step_envelope" else {}, spot)] = weight
     return weights
@@ -306,7 +215,7 @@ def _limits(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Require
         check_known("key", entry, (bound, *_own(key)), spot)
         require(bound in entry or key == "step_envelope", f"{spot} says no {bound}")
         at = f"{spot} {bound}" if entry is given else spot
-        limit = {bound: read_value(entry[bound], units.get(key, "1"), where=at)} if bound in entry else {}
+        limit = {bound: _bound(key, entry[bound], units.get(key, "1"), at)} if bound in entry else {}
         found.append(_requirement(key, entry, limit, spot))
     return tuple(found)
 
@@ -318,6 +227,7 @@ def _units(loop: ClosedLoop) -> dict[str, str]:
     return times | {
         "itae": "s^2",
         "ripple": measured,
+        "air_use": "l",
         "peak_control": command,
         "control_rate": f"{command}/s",
         "phase_margin": "deg",
@@ -325,13 +235,21 @@ def _units(loop: ClosedLoop) -> dict[str, str]:
     }
 
 
+def _bound(key: str, given: Any, unit: str, where: str) -> float:
+    if key == "air_use":
+        normal = isinstance(given, str) and given.strip().endswith("(ANR)")
+        require(normal, f'{where}: {given!r}: air is counted at 20 degC and 100 kPa (ANR): "2 l(ANR)"', UnitError)
+        given = given.strip().removesuffix("(ANR)")
+    return read_value(given, unit, where=where)
+
+
 def _requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], where: str) -> Requirement:
     own: dict[str, Any] = dict(limit)
     if key == "step_envelope":
         own["bounds"] = _bounds(entry.get("bounds"), f"{where} bounds")
     elif "band" in entry:
-        own["band"] = _value(entry, "band", "1", where)
-    return _checked(lambda: _REQUIREMENTS[key](**own), where)
+        own["band"] = value_of(entry, "band", "1", where)
+    return checked(lambda: _REQUIREMENTS[key](**own), where)
 
 
 def _bounds(said: Any, where: str) -> Bounds:
@@ -349,21 +267,9 @@ def _own(key: str) -> tuple[str, ...]:
 
 
 def _fill(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
-    for section in ("pid", "dither"):
+    for section in TUNABLE:
         for key, entry in document.unwrap().get(section, {}).items():
             if isinstance(entry, dict) and entry.get("free", False):
                 found = tuned[f"{section}.{key}"]
                 given = read_parameter(entry, replace(found, free=True), f"{source}: [{section}] {key}")
                 write_parameter(document, f"{section}.{key}", replace(given, value=found.value), given)
-
-
-def _value(entries: Mapping[str, Any], key: str, unit: str, where: str) -> float:
-    return read_value(entries[key], unit, where=f"{where} {key}")
-
-
-def _checked(make: Callable[[], T], where: str) -> T:
-    """Say where, when what was read does not fit together."""
-    try:
-        return make()
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None

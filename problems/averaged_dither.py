@@ -6,13 +6,16 @@ The pneumatic tuning benchmark T32 (dead zone 3 %, LuGre friction) under a conti
 dither of 1000, 628 and 200 rad/s; so does the 32 mm catalogue set, whose stroke is shorter and gas stiffer. `averaged`
 is compared with the resolved response, averaged over whole periods, and with a model that ignores the dither.
 
+Rows triangle.*: T32 under a triangle. Over frequency (figure averaged_error) the error falls from 13 % of the step at
+126 rad/s, 20 Hz, to 0.6 % at 1000; once under way, after 0.1 s, from 11 % to 0.02 %.
+
 It holds where the dither is fast and its ripple small: on S32 at 200 rad/s, where the piston swings by 36 mm/s and the
 ripple changes as it leaves the cover, the first 0.1 s are further off than with no dither in the model at all.
 """
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 from typing import TYPE_CHECKING
 
@@ -30,8 +33,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 DRIVES = {"T32": t32, "S32": s32}
-CASES = [("T32", 1000.0, 2.0), ("T32", 628.0, 2.0), ("T32", 200.0, 2.0), ("S32", 1000.0, 2.0), ("S32", 200.0, 1.0)]
-BOUNDS = {"T32.1000": "<= 1", "T32.628": "<= 2", "T32.200": "<= 10", "S32.1000": "<= 5"}  # [%]
+SWEEP = (1000.0, 628.0, 400.0, 200.0, 126.0)  # [rad/s]
+CASES = [("T32", rate, 2.0) for rate in SWEEP] + [("S32", 1000.0, 2.0), ("S32", 200.0, 1.0)]
+BOUNDS = {"T32.1000": "<= 1", "T32.628": "<= 2", "T32.200": "<= 10", "S32.1000": "<= 5", "triangle.628": "<= 2"}  # [%]
 GAINS = {"pid.Kp": 2.0, "pid.Ki": 20.0, "pid.Kd": 0.1, "pid.Tf": 0.01, "cylinder.start": 0.1}
 STEP, HORIZON = 0.2, 0.6  # [m/s], [s]
 POINTS = 40  # a period, of the resolved run; its own steps are finer
@@ -58,12 +62,13 @@ class Run:
 
 
 def run() -> list[Run]:
-    return [_case(*case) for case in CASES]
+    triangle = replace(_case("T32", 628.0, 2.0, po.Waveform.TRIANGLE), name="triangle.628")
+    return [*(_case(*case) for case in CASES), triangle]
 
 
-def _case(drive_name: str, rate: float, volts: float) -> Run:
+def _case(drive_name: str, rate: float, volts: float, shape: po.Waveform = po.Waveform.SINE) -> Run:
     drive, values = DRIVES[drive_name]()
-    loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(frequency=rate / (2 * pi)))
+    loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(rate / (2 * pi), waveform=shape))
     p = (loop.parameters | values).with_values({**GAINS, "dither.amplitude": volts})
     periods = int(HORIZON * rate / (2 * pi))
     t = np.arange(periods * POINTS + 1) * 2 * pi / rate / POINTS
@@ -127,7 +132,7 @@ def _late(r: Run) -> float:
 def figure(runs: list[Run]) -> "Figure":
     import matplotlib.pyplot as plt
 
-    shown = [r for r in runs if r.name.startswith("T32")]
+    shown = [r for r in runs if r.name in ("T32.1000", "T32.628", "T32.200")]
     drawn, axes = plt.subplots(len(shown), 1, figsize=(8, 8), sharex=True, layout="constrained")
     for axis, r in zip(axes, shown, strict=True):
         axis.plot(r.t, r.raw, color="0.8", linewidth=0.8, label="resolved")
@@ -146,7 +151,29 @@ def figure(runs: list[Run]) -> "Figure":
     return drawn
 
 
+def over_frequency(runs: list[Run]) -> "Figure":
+    """The error of the averaged model, and of one that ignores the dither, over the dither's frequency."""
+    import matplotlib.pyplot as plt
+
+    drawn, axis = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
+    shown = {f"T32.{rate:.0f}": rate for rate in SWEEP}
+    swept = [(shown[r.name], r) for r in runs if r.name in shown]
+    rates = [rate for rate, _ in swept]
+    axis.loglog(rates, [r.deviation(r.ignored) for _, r in swept], "s:", color="0.4", label="dither ignored")
+    axis.loglog(rates, [r.deviation(r.averaged) for _, r in swept], "o-", color="C3", label="averaged model")
+    axis.loglog(rates, [_late(r) for _, r in swept], "o--", color="C0", label="averaged model, after 0.1 s")
+    triangle = next(r for r in runs if r.name.startswith("triangle"))
+    axis.loglog([628.0], [triangle.deviation(triangle.averaged)], "^", color="C2", label="averaged model, triangle")
+    axis.set(xlabel="frequency of 2 V of dither [rad/s]", ylabel="largest error [% of the step]")
+    axis.set_xticks(rates, [f"{rate:g}" for rate in rates])
+    axis.minorticks_off()
+    axis.legend(fontsize=8)
+    return drawn
+
+
 if __name__ == "__main__":
     options = arguments(__doc__).parse_args()
     runs = run()
-    sys.exit(finish(main(runs), options, lambda: {"averaged_dither": figure(runs)}))
+    sys.exit(
+        finish(main(runs), options, lambda: {"averaged_dither": figure(runs), "averaged_error": over_frequency(runs)})
+    )

@@ -48,7 +48,7 @@ MORE = {"pid.Tf": (5e-4, 0.05), "pid.b": (0.0, 1.5), "pid.c": (0.0, 1.5)}
 FRESH, DRAWN = 100, 32
 TIMES = (1, 3)  # the CPU time that SciPy gets, over that of condensed
 TIGHT = SPEC.tightened(MARGIN, PEAKS)
-WARM = po.Condensed(members=5, generations=(1, 0, 0, 0), iterations=(1, 1, 1, 1), polish=1)
+WARM = po.Condensed(members=5, generations=1, iterations=1, renewals=0, polish=1)
 BOUNDS = {
     "5_corners.condensed.median": "<= 0.157",
     "8_corners.condensed.median": "<= 0.075",

@@ -6,15 +6,18 @@ The paper's drive R25 behind a spool of 100 Hz, with true sticking (25/40 N, 20 
 difference is filtered over 5 ms, and a valve with 0.4 % hysteresis, under a speed controller at 1 kHz. Rows screen.*:
 where friction falls with speed faster than viscous friction rises, uniform sliding is unstable: necessary for crawl,
 not sufficient. Rows lugre.*: the smooth model under the same continuous gains hunts at 10 and 20 mm/s, not at 5 and 50.
+Rows *.cycle: amplitude and frequency of the limit cycle that `find_limit_cycle` sees in the speed alone, beside the
+events of the simulator that knows when the piston sticks (stuck, slips, frequency).
 
 Rows hand.*: a hand-tuned PI (the paper's Kp and Ki) on the rig sticks and slips from 5 to 50 mm/s: at 50 mm/s uniform
 sliding is stable, and coming_down.50, from 100 mm/s, stays there, but from rest the first break-away throws the loop
 into the cycle. Cured by pid.*, a PID tuned on the smooth Stribeck model with the lag of the encoder's filter in its
 loop: derivative action is the damper that friction lacks. Its price: the encoder's counts as spikes on the valve, a
-wait for the break-away with an overshoot then, and a sensitivity of 2.5. Cured on the average by dithered.*, the same
+wait for the break-away with an overshoot then, a sensitivity of 2.5, and a slow swing by a tenth in the hysteresis of
+the valve. Cured on the average by dithered.*, the same
 tuning with 10 Hz of dither, amplitude and offset free; its price is ripple larger than the set speed, and the piston
 still sticks once a period. Row p_alone.*: without an integral nothing winds up, and nothing moves. An integral with a
-dead band, the other usual remedy, is not in the library's PID.
+dead band, the other usual remedy: stiction_windup.py.
 """
 
 import sys
@@ -29,7 +32,8 @@ from r25 import CLIP, averaged, lagging
 from scipy import optimize
 
 import pneuopt as po
-from pneuopt.instruments import Actuator, Encoder, Sensor
+from pneuopt.control.sensor import Encoder
+from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.friction import LuGre
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 from pneuopt.rig import Recording, Rig, record
@@ -42,7 +46,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 CRAWL, CONTROLS = (0.01, 0.02), (0.005, 0.05)  # [m/s]
-SAMPLE, SECONDS, SINCE = 1e-3, 3.0, 1.0  # [s]; measured from SINCE on
+SAMPLE, SECONDS, SINCE, SMOOTH = 1e-3, 6.0, 1.0, 3.0  # [s]; measured from SINCE on, of the smooth model from SMOOTH on
+LEAST = 0.05  # of the set speed: amplitude of a limit cycle that counts
 FASTER, UNTIL = 0.1, 1.0  # [m/s], [s] before coming down to 50 mm/s, measured SINCE later
 TOLERANCE = 1e-6  # of a step: 1e-8 gives the same verdicts and takes a third longer
 FREQUENCY = 10.0  # [Hz] of the dither: faster, a valve within its 5 V moves too little (paper_dither.py)
@@ -63,6 +68,9 @@ BOUNDS = {
     "dithered.10.averaged": "<= 0.05", "dithered.20.averaged": "<= 0.05",
     "dithered.10.ripple": ">= 10", "dithered.20.ripple": ">= 20", "pid.10.ripple": "<= 5", "pid.20.ripple": "<= 5",
     "p_alone.10.stuck": ">= 0.99",
+    "hand.10.cycle": ">= 5", "hand.20.cycle": ">= 5", "pid.10.cycle": "<= 0", "pid.20.cycle": "<= 0",
+    "lugre.10.cycle": ">= 5", "lugre.20.cycle": ">= 5", "lugre.5.cycle": "<= 0", "lugre.50.cycle": "<= 0",
+    "coming_down.50.cycle": "<= 0",
     "lugre.5.deviation": "<= 0.02", "lugre.10.deviation": ">= 0.5", "lugre.20.deviation": ">= 0.5",
     "lugre.50.deviation": "<= 0.02",
 }  # fmt: skip
@@ -70,11 +78,11 @@ BOUNDS = {
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """The designs, the rig's recordings by design and speed [m/s], the smooth model's deviations, the seconds."""
+    """The designs, the rig's recordings by design and speed [m/s], the smooth model's responses, the seconds."""
 
     designs: Mapping[str, po.TuningResult]
     runs: Mapping[tuple[str, float], Recording]
-    lugre: Mapping[float, float]
+    lugre: Mapping[float, po.Trajectory]
     seconds: float
 
 
@@ -92,7 +100,10 @@ def run() -> Job:
 
 def main(job: Job) -> "DataFrame":
     claims = [*screen()]
-    claims += [Claim(f"lugre.{1e3 * v:g}.deviation", deviation, "1") for v, deviation in job.lugre.items()]
+    for v, smooth in job.lugre.items():
+        late = smooth["speed"][smooth.t >= SMOOTH]
+        claims.append(Claim(f"lugre.{1e3 * v:g}.deviation", float(late.std()) / v))
+        claims += cycle(f"lugre.{1e3 * v:g}", smooth, v, SMOOTH, dithered=False)
     for (name, v), recording in job.runs.items():
         claims += measured(f"{name}.{1e3 * v:g}", recording, v, SINCE + UNTIL * (name == "coming_down"))
     for name, found in job.designs.items():
@@ -132,21 +143,20 @@ def on_the_rig(values: Mapping[str, float], v: float, before: float | None = Non
     """From rest at mid stroke to a set speed, at once or by way of another."""
     drive, p = lagging(po.Karnopp(po.Stribeck()))
     loop = controlled(drive.system(), dither="dither.amplitude" in values)
-    rig = Rig(loop, {"position": Sensor(resolution=RESOLUTION)}, Actuator(hysteresis=0.04), Encoder(filter_time=FILTER))
+    rig = Rig(loop, {"position": Sensor(resolution=RESOLUTION)}, Actuator(hysteresis=0.04), Encoder(filter=FILTER))
     t = np.arange(round(SECONDS / SAMPLE) + 1) * SAMPLE
     reference = np.where(t < UNTIL, v if before is None else before, v)
     given = (loop.parameters | p).with_values(values)
     return record(rig, po.Trajectory(t, {"reference": reference}), given, rtol=TOLERANCE)
 
 
-def on_the_smooth_model(v: float) -> float:
-    """The hand-tuned PI, continuous and with ideal sensing, under LuGre friction: deviation over the set speed."""
+def on_the_smooth_model(v: float) -> po.Trajectory:
+    """The hand-tuned PI, continuous and with ideal sensing, under LuGre friction."""
     drive, p = lagging(LuGre())
     loop = po.ClosedLoop(drive.system(), po.PID(), measured="speed")
     t = np.linspace(0, 6, 3001)
     step = po.Trajectory(t, {"reference": np.full(len(t), v)})
-    speed = po.simulate(loop, step, (loop.parameters | p).with_values(HAND), rtol=1e-8)["speed"]
-    return float(speed[t >= 3].std()) / v
+    return po.simulate(loop, step, (loop.parameters | p).with_values(HAND), rtol=1e-8)
 
 
 def screen() -> list[Claim]:
@@ -174,6 +184,7 @@ def measured(name: str, recording: Recording, v: float, since: float) -> list[Cl
     slips = np.array([e.t for e in recording.events if e.kind is EventKind.BREAK_AWAY and e.t >= since])
     smooth = averaged(truth.t, truth["speed"], 1 / FREQUENCY)[late & (truth.t <= SECONDS - 1 / FREQUENCY)]
     rows = [Claim(f"{name}.stuck", float(truth["stuck"][late].mean()))]
+    rows += cycle(name, truth, v, since, "dither" in name)
     if len(slips) > 1:
         rows.append(Claim(f"{name}.slips", len(slips) / (SECONDS - since), "1/s"))
         rows.append(Claim(f"{name}.frequency", (len(slips) - 1) / float(slips[-1] - slips[0]), "Hz"))
@@ -184,6 +195,19 @@ def measured(name: str, recording: Recording, v: float, since: float) -> list[Cl
         Claim(f"{name}.peak", 1e3 * float(speed.max()), "mm/s"),
         Claim(f"{name}.ripple", 1e3 * float(np.ptp(speed)), "mm/s"),
         Claim(f"{name}.control", float(np.ptp(control)), "V"),
+    ]
+
+
+def cycle(name: str, run_: po.Trajectory, v: float, since: float, dithered: bool) -> list[Claim]:
+    """The limit cycle in the speed, as `find_limit_cycle` sees it without knowing of sticking: amplitude 0 is none."""
+    period = 1 / FREQUENCY if dithered else None
+    found = po.find_limit_cycle(run_.t, run_["speed"], start=since, dither_period=period, least=LEAST * v)
+    if found is None:
+        return [Claim(f"{name}.cycle", 0.0, "mm/s")]
+    return [
+        Claim(f"{name}.cycle", 1e3 * found.amplitude, "mm/s"),
+        Claim(f"{name}.cycle_frequency", found.frequency, "Hz"),
+        Claim(f"{name}.cycle_still", found.stick_share),
     ]
 
 

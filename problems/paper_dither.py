@@ -4,7 +4,8 @@ Per volt of command, by AD linearisation of R25: the force on a stuck piston, sp
 volts needed for 40 N (its static friction) and for a speed of 40 mm/s (twice the Stribeck velocity, where dither on the
 speed would make friction monotone). The valve has 5 V. Then by simulation: the change that the paper's chatter makes;
 a lap that 1 V and 4 V open on average, which costs gain and overshoot; and hunting at 10 mm/s, which 4 V at 1000 rad/s
-do not end, and 10 Hz does, for the average.
+do not end, and 10 Hz does, for the average. Rows verdict.*: what `judge_dither` says of the paper's chatter with the
+paper's PID, 1 useful, 0 useless, -1 harmful, and of 4 V at the same frequency.
 """
 
 from dataclasses import dataclass, replace
@@ -13,8 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from claims import Claim
-from r25 import CLIP, TRANSDUCER, Case, averaged, lagging, linearised, simulated
+from r25 import CLIP, PAPERS_PID, TRANSDUCER, Case, averaged, lagging, linearised, simulated
 
+import pneuopt as po
+from pneuopt.dithering import Usefulness
 from pneuopt.models.catalog import r25
 from pneuopt.models.friction import Viscous
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid
@@ -32,6 +35,7 @@ TABLE = {  # of PHYSICS section 4: |F| [N/V], |v| [mm/s/V], |y| [um/V], volts fo
     628.0: (1.21, 0.16, 0.26, 33.0, 248.0),
     1000.0: (0.76, 0.064, 0.064, 52.0, 630.0),
 }
+SCORES = {Usefulness.USEFUL: 1.0, Usefulness.USELESS: 0.0, Usefulness.HARMFUL: -1.0}
 HUNTING, LATE = Case(0.2, pid=True, lugre=True, seconds=6.0), 3.0  # 10 mm/s; [s] from which it is measured
 
 
@@ -50,7 +54,7 @@ class Moved:
 
 
 def claims() -> list[Claim]:
-    return [*_table(), *_papers_chatter(), *_opened_lap(), *_hunting()]
+    return [*_table(), *_papers_chatter(), *_opened_lap(), *_hunting(), *_verdicts()]
 
 
 def moved(found: Linearisation, omega: float, mass: float) -> Moved:
@@ -128,6 +132,23 @@ def _hunting() -> list[Claim]:
         rows.append(Claim(f"hunting.{name}.deviation", float(smooth[late].std()) / target, "1", None, bound))
         slow, ripple = frequency != AT, 1e3 * float(np.ptp((speed - smooth)[late]))
         rows.append(Claim(f"hunting.{name}.ripple", ripple, "mm/s", 19 if slow else None, "19 +- 1.5" * slow))
+    return rows
+
+
+def _verdicts() -> list[Claim]:
+    """On the paper's step of 1 V under LuGre friction, the same gains with and without."""
+    drive, p = r25(lugre=True)
+    loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(AT / (2 * pi)), measured="speed")
+    gains = {f"pid.{n}": v if n == "Tf" else TRANSDUCER * v for n, v in PAPERS_PID.items()}
+    given = (loop.parameters | p).with_values({**gains, "pid.lower": -CLIP, "pid.upper": CLIP})
+    rows = []
+    for name, volts in {"paper": PAPERS, "4V": 4.0}.items():
+        found = po.judge_dither(loop, po.Step(1 / TRANSDUCER), given.with_values({"dither.amplitude": volts}))
+        bound = "0 +- 0" if name == "paper" else ""
+        rows.append(Claim(f"verdict.{name}", SCORES[found.usefulness], "1", None, bound))
+        rows.append(Claim(f"verdict.{name}.force", found.effect.force, "N", STATIC))
+        before, after = (float(found.table[c]["Overshoot"]) for c in ("without", "with"))
+        rows.append(Claim(f"verdict.{name}.overshoot", after, "%", before))
     return rows
 
 

@@ -29,10 +29,11 @@ from scipy import optimize, signal
 
 from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
+from pneuopt.control.forms import ParallelForm
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import Margins, frequency_response, margins
 from pneuopt.control.metrics import About, step_metrics
-from pneuopt.control.pid import PID, ParallelForm
+from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.models.paper2015 import PRINTED, paper_plant
 from pneuopt.parameters import ParameterSet

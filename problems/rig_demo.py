@@ -133,7 +133,7 @@ def the_rig() -> po.Rig:
     """That loop behind the hardware that it was logged with."""
     pressure = po.Sensor(RIG["pressure_lag"], RIG["pressure_noise"], RIG["pressure_resolution"])
     sensors = {"position": po.Sensor(resolution=RIG["position_resolution"]), "pressure_a": pressure}
-    actuator, encoder = po.Actuator(RIG["valve_hysteresis"]), po.Encoder(filter_time=RIG["speed_filter"])
+    actuator, encoder = po.Actuator(RIG["valve_hysteresis"]), po.Encoder(filter=RIG["speed_filter"])
     return po.Rig(rig_loop(), sensors | {"pressure_b": pressure}, actuator, encoder)
 
 

@@ -85,7 +85,7 @@ def loops() -> tuple[po.ClosedLoop, po.Rig, po.ParameterSet]:
         po.ClosedLoop(sticking.system(), pid, dither),
         {"position": po.Sensor(resolution=COUNT)},
         po.Actuator(hysteresis=HYSTERESIS),
-        po.Encoder(filter_time=FILTER),
+        po.Encoder(filter=FILTER),
     )
     own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*", "sensor.*"))
     return loop, rig, (hardware.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)

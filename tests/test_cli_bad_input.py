@@ -33,6 +33,8 @@ def cut(folder: Path) -> None:
 
 IDENTIFY = "identify drive.toml run_01.csv -o fit.toml --json fit.json --plot fit.png"
 TUNE = "tune drive.toml tuning.toml -o tuned.toml --json tuned.json --plot tuned.png"
+KP = 'Kp = { value = "100 N*s/m", lower = "10 N*s/m", upper = "600 N*s/m", free = true }   # by hand\nKi = "4000 N/m"'
+TUBE = 'step_envelope = { bounds = [["0 s", "-10 %", "150 %"], ["0.1 s", "50 %", "80 %"]] }'
 SMOOTHING = 'smoothing = "5 mm/s"\n'
 PRESSURE = 'pressure_dependent = true\n[ambient]\npressure = "1 bar"\n'
 BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
@@ -102,6 +104,31 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
         TUNE,
         edit("tuning.toml", '[minimise]\nsettling_time = { band = "5 %" }\n', ""),
         "tuning.toml: says nothing to minimise",
+    ),
+    "limit after the record": (
+        TUNE,
+        edit("tuning.toml", 'overshoot = "10 %"', 'settling_time = { band = "5 %", max = "2 s" }'),
+        "SettlingTime: max 2 s is more than 0.3 s after the step can show (reference 0 to 0.2); lengthen its horizon to",
+    ),
+    "tube without the reference": (
+        TUNE,
+        edit("tuning.toml", "[limits]", f"[limits]\n{TUBE}"),
+        "tuning.toml: [minimise] and [limits]: StepEnvelope: from 0.1 s on the bounds are 0.5 to 0.8, SettlingTime asks",
+    ),
+    "force beyond the clip": (
+        TUNE,
+        edit("tuning.toml", '"-200 N", "200 N"', '"-20 N", "20 N"'),
+        "reference 0 to 0.2: holding 0.19 m/s takes 41.9 N, the controller's limits are -20 and 20 N; take a smaller",
+    ),
+    "gains of the wrong sign": (
+        TUNE,
+        edit("tuning.toml", KP, 'Kp = { value = "-9 N*s/m", lower = "-60 N*s/m", upper = "-1 N*s/m", free = true }'),
+        "pid.Kp within [-60, -1]: every gain allowed has the wrong sign, for the plant's speed rises with force; turn",
+    ),
+    "disturbance of nothing": (
+        TUNE,
+        edit("tuning.toml", 'horizon = "0.3 s"', 'horizon = "0.3 s"\ndisturbance = { "load.froce" = "5 N" }'),
+        "[[reference]] 1 disturbance: unknown parameter or input of the plant 'load.froce'; did you mean 'load.force'?",
     ),
     "window": (IDENTIFY + " --window 0.001", None, "windows of 0.001 s hold 0 samples of run_01"),
     "what to simulate": ("simulate drive.toml -o x.csv", None, "give either a tuning file or --log"),

@@ -1,9 +1,11 @@
 import io
 
 import pandas as pd
+import pytest
 from rich.console import Console
 
-from pneuopt.console import metric_units, show_metrics
+from pneuopt.console import metric_units, show_gains, show_metrics
+from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.models.linear import FirstOrder
@@ -32,3 +34,22 @@ def test_metrics_stand_beside_what_is_allowed() -> None:
 def test_every_kind_of_requirement_is_shown() -> None:
     units = metric_units(ClosedLoop(FirstOrder().system(), PID()))
     assert {kind.__name__ for kind in KINDS} <= set(units)
+
+
+@pytest.mark.parametrize(
+    ("form", "values", "said"),
+    [
+        (Form.PARALLEL, {"pid.Kp": 2.0, "pid.Ki": 4.0}, "standard form: Kp 2, Ti 0.5 s, no derivative"),
+        (Form.STANDARD, {"pid.Kp": 2.0, "pid.Ti": 0.5}, "parallel form: Kp 2, Ki 4, no derivative"),
+        (
+            Form.SERIES,
+            {"pid.K": 2.0, "pid.Ti": 0.5, "pid.Td": 0.25, "pid.Tf": 0.02},
+            "parallel form: Kp 3, Ki 4, Kd 0.48, Tf 0.02 s",
+        ),
+    ],
+)
+def test_gains_are_shown_in_another_form_too(form: Form, values: dict[str, float], said: str) -> None:
+    given = ClosedLoop(FirstOrder().system(), PID(form=form)).parameters.with_values(values)
+    out = io.StringIO()
+    show_gains(Console(file=out, width=80), given, given)
+    assert said in out.getvalue()

@@ -40,7 +40,16 @@ def test_own_functions_are_exact_to_the_last_places(name: str, ulps: float) -> N
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["exp", "tanh", "fabs", "sign", "sqrt"])
+def test_the_sine_is_exact_near_and_far() -> None:
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(-a, a, 50_000) for a in (1e-3, 2.0, 300.0, 1e6, 1e9)])
+    x = np.append(x, [np.pi, -np.pi, 22.0, 355.0, 0.0, 999_999.9])
+    assert_allclose(computed(ca.sin, x), np.sin(x), rtol=0, atol=3e-16)
+    assert_allclose(computed(ca.sin, x[-6:]), np.sin(x[-6:]), rtol=1e-12)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["exp", "tanh", "fabs", "sign", "sqrt", "sin"])
 def test_edges_of_the_range(name: str) -> None:
     with np.errstate(all="ignore"):
         expected = getattr(np, name)(EDGES)

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.control.sensor import Encoder
 from pneuopt.errors import InputError, ModelError, UnknownNameError
 from pneuopt.identify import identify
-from pneuopt.instruments import Actuator, Encoder, Sensor
+from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.karnopp import Karnopp
@@ -116,7 +117,7 @@ def test_the_plant_gets_what_hysteresis_and_dead_zone_leave() -> None:
 
 def logged_loop(**pid: float) -> tuple[Recording, ParameterSet]:
     loop, p = drive_loop(Karnopp(Stribeck()), **pid)
-    rig = Rig(loop, REAL, Actuator(hysteresis=4.0, dead_zone=3.0), Encoder(filter_time=3e-3))
+    rig = Rig(loop, REAL, Actuator(hysteresis=4.0, dead_zone=3.0), Encoder(filter=3e-3))
     return record(rig, step(0.05), p, seed=4, name="rig@7"), p
 
 
@@ -162,7 +163,7 @@ def test_a_coarse_encoder_roughens_a_loop_that_is_smooth_on_paper() -> None:
     loop, p = drive_loop(Karnopp(Stribeck()), Kp=1500.0, Ki=3e4)
     p, ripple = p.with_values({"dither.amplitude": 0.0}), []
     for resolution in (1e-7, 1e-4):
-        rig = Rig(loop, {"position": Sensor(resolution=resolution)}, encoder=Encoder(filter_time=1e-3))
+        rig = Rig(loop, {"position": Sensor(resolution=resolution)}, encoder=Encoder(filter=1e-3))
         ripple.append(float(np.ptp(record(rig, step(0.05), p).truth["speed"][-200:])))
     assert ripple[0] < 1e-3
     assert ripple[1] > 0.02
@@ -216,8 +217,8 @@ def test_bad_input_is_named() -> None:
             bad({name: -1.0})
     with pytest.raises(InputError, match="Actuator: hysteresis must not be negative"):
         Actuator(hysteresis=-0.1)
-    with pytest.raises(InputError, match="Encoder: filter_time must not be negative"):
-        Encoder(filter_time=-1.0)
+    with pytest.raises(InputError, match="Encoder: filter must not be negative"):
+        Encoder(filter=-1.0)
     with pytest.raises(UnknownNameError, match=r"Rig: sensors: unknown output 'positon'; did you mean 'position'"):
         Rig(loop, {"positon": Sensor()})
     with pytest.raises(ModelError, match="the controller needs 'position', which is not measured"):

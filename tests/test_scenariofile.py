@@ -10,7 +10,7 @@ from pneuopt.cli import app
 from pneuopt.errors import InputError
 from pneuopt.models.linear import SecondOrder
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.scenariofile import read_scenarios
+from pneuopt.scenariofile import read_fresh, read_scenarios
 from pneuopt.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.tomlfile import read_toml
 from pneuopt.tuningfile import read_tuning
@@ -91,3 +91,37 @@ def test_the_commands_certify_every_scenario(tmp_path: Path, monkeypatch: pytest
     assert len(rows) == 3
     slow, fast = (rows[k]["RiseTime"] for k in (2, 1))
     assert slow > 1.3 * fast
+
+
+def test_fresh_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> None:
+    path = tmp_path / "tuning.toml"
+    text = '[scenarios.samples]\ncount = 3\n"load.mass" = "30 %"\n[scenarios.tolerances]\n"pid.Kp" = "1 %"'
+    path.write_text(text, encoding="utf-8")
+    said = read_toml(path).unwrap()["scenarios"]
+    seen, fresh = (found(said, "tuning.toml", RIG) for found in (read_scenarios, read_fresh))
+    assert len(fresh) == 200
+    masses = [v["load.mass"] for v in fresh.values() if "load.mass" in v]
+    factors = [v["pid.Kp"] for v in fresh.values() if "pid.Kp" in v]
+    assert all(isinstance(m, float) and 3.5 <= m <= 6.5 for m in masses)
+    assert all(isinstance(f, Factor) and 0.99 <= f.share <= 1.01 for f in factors)
+    assert not {v["load.mass"] for v in seen.values() if "load.mass" in v} & set(masses)
+
+
+def test_a_tuning_with_scenarios_is_validated_on_fresh_plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    drive = '[drive]\nkind = "force"\n[load]\nmass = "5 kg"\n[friction]\nmodel = "viscous"\nviscous = "40 N*s/m"'
+    gain = '{ value = "300 N*s/m", lower = "100 N*s/m", upper = "900 N*s/m", free = true }'
+    loop = f'[pid]\nsample_time = "5 ms"\nKp = {gain}\nKi = "2000 N/m"\n[[reference]]\nstep = "0.2 m/s"'
+    asked = '[minimise]\nsettling_time = { band = "5 %" }\n[limits]\novershoot = "20 %"'
+    scenarios = '[scenarios.corners]\n"load.mass" = "30 %"'
+    Path("drive.toml").write_text(drive, encoding="utf-8")
+    Path("tuning.toml").write_text(f'{loop}\nhorizon = "0.3 s"\n{asked}\n{scenarios}', encoding="utf-8")
+    result = CliRunner().invoke(app, ["tune", "drive.toml", "tuning.toml", "--json", "out.json"])
+    assert result.exit_code == 0, result.output
+    assert "validated on 100 fresh plants" in result.output
+    found = json.loads(Path("out.json").read_text(encoding="utf-8"))
+    settling, overshoot = found["validation"]
+    worst_corner = max(row["SettlingTime"] for row in found["certified"])
+    assert settling["violations"] == overshoot["violations"] == 0
+    assert 0.5 * worst_corner < settling["median"] <= settling["p95"] <= settling["worst"] <= 1.01 * worst_corner
+    assert settling["certified"] == pytest.approx(settling["worst"], rel=1e-2)

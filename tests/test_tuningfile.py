@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pneuopt.control.dither import Dither
+from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.errors import InputError
@@ -23,6 +23,7 @@ from pneuopt.requirements import (
     IAE,
     ISE,
     ITAE,
+    AirUse,
     ControlRate,
     GainMargin,
     MaxComplementarySensitivity,
@@ -124,21 +125,6 @@ def test_a_short_file_describes_a_continuous_loop_without_limits(tmp_path: Path)
     assert (tuning.minimise, tuning.subject_to, tuning.parameters.free_names) == ({}, (), ())
 
 
-def test_the_standard_form_is_converted(tmp_path: Path) -> None:
-    gains = '[pid]\nform = "standard"\nKp = "2 V*s/m"\nTi = "500 ms"\nTd = "250 ms"\nN = 10\nb = 0.5\n'
-    text = gains + '[[reference]]\nstep = "0.1 m/s"\nhorizon = "1 s"\n'
-    given = read_tuning(written(tmp_path, text), PLANT).parameters
-    assert [given.value(f"pid.{n}") for n in ("Kp", "Ki", "Kd", "Tf", "b")] == pytest.approx(
-        [2.0, 4.0, 0.5, 0.025, 0.5]
-    )
-    with pytest.raises(
-        InputError, match=r"\[pid\] Kp: the standard form takes values only; tune in form = \"parallel\""
-    ):
-        read_tuning(written(tmp_path, text.replace('"2 V*s/m"', '{ value = "2 V*s/m", free = true }')), PLANT)
-    with pytest.raises(InputError, match=r"\[pid\] Ki does not belong to the standard form, which has Kp, Ti, Td, N"):
-        read_tuning(written(tmp_path, text.replace("Ti", "Ki")), PLANT)
-
-
 def test_the_loop_says_which_signals_where_the_plant_has_several(tmp_path: Path) -> None:
     plant = ForceDrive(PressureDependent(Coulomb())).system()
     text = '[pid]\nKp = "200 N/m"\n[[reference]]\nstep = "10 mm"\nhorizon = "1 s"\n[loop]\n'
@@ -161,6 +147,16 @@ def test_a_reference_may_start_elsewhere(tmp_path: Path) -> None:
     )
     path.write_text(text + "[minimise]\nsettling_time = {}\n", encoding="utf-8")
     assert read_tuning(path, drive).references == (Step(-0.1, start={"position": 0.25}),)
+
+
+def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
+    path, drive = tmp_path / "tuning.toml", ForceDrive(Coulomb()).system()
+    held = '[[reference]]\ninitial = "0.1 m/s"\nhorizon = "1 s"\ndisturbance = { "load.force" = "20 N" }\n'
+    still = '[[reference]]\nscale = "50 mm/s"\nat = "0.2 s"\nhorizon = "1 s"\ndisturbance.load.force = "-5 N"\n'
+    path.write_text(f'[pid]\nKp = "200 N*s/m"\n{held}{still}[minimise]\nsettling_time = {{}}\n', encoding="utf-8")
+    first, second = read_tuning(path, drive).references
+    assert first == Step(0.0, initial=0.1, disturbance={"load.force": 20.0})
+    assert second == Step(0.0, at=0.2, scale=0.05, disturbance={"load.force": -5.0})
 
 
 @pytest.mark.parametrize(
@@ -305,7 +301,7 @@ def test_a_sensor_lags_what_the_controller_sees(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("[sensor]\n", r'\[sensor\] says no lag; write lag = "5 ms"'),
+        ("[sensor]\n", r'\[sensor\] says no lag; write lag = "5 ms", or of an encoder resolution = "10 um"'),
         ('[sensor]\nlag = "0 ms"\n', r"\[sensor\]: SensorLag: lag must be at least"),
         ('[sensor]\nlag = "5 mm"\n', r"\[sensor\] lag"),
         ('[sensor]\ndelay = "5 ms"\n', r"\[sensor\].*delay"),
@@ -378,3 +374,25 @@ def test_refuses_a_bad_requirement_and_says_where(tmp_path: Path, old: str, new:
     with pytest.raises(InputError) as error:
         read_tuning(path, PLANT)
     assert said in str(error.value)
+
+
+def test_a_triangle_and_a_limit_on_the_air(tmp_path: Path) -> None:
+    text = TUNING.replace('waveform = "sine"', 'waveform = "triangle"').replace(
+        "max_sensitivity = 1.6", 'air_use = "2 l(ANR)"'
+    )
+    tuning = read_tuning(written(tmp_path, text), PLANT)
+    assert tuning.loop.dither == Dither(160.0, waveform=Waveform.TRIANGLE)
+    assert AirUse(2.0) in tuning.subject_to
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('waveform = "sine"', 'waveform = "square"', "unknown waveform 'square'.*sine, triangle"),
+        ("max_sensitivity = 1.6", 'air_use = "2 l"', r"air_use.*'2 l': air is counted at 20 degC.*\"2 l\(ANR\)\""),
+        ("max_sensitivity = 1.6", "air_use = 2.0", r"air_use.*air is counted at 20 degC"),
+    ],
+)
+def test_air_needs_its_conditions_and_a_waveform_its_name(tmp_path: Path, old: str, new: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        read_tuning(written(tmp_path, TUNING.replace(old, new)), PLANT)

@@ -23,9 +23,21 @@ from pneuopt.commands.shared import (
     read_loop,
     write_csv,
 )
-from pneuopt.console import progress, screen, show_gains, show_metrics, show_rejected, show_status, show_validation
+from pneuopt.console import (
+    progress,
+    screen,
+    show_dither,
+    show_gains,
+    show_metrics,
+    show_rejected,
+    show_relaxations,
+    show_requirements,
+    show_status,
+    show_validation,
+)
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.dithering import judge_dither
 from pneuopt.errors import ConvergenceError, InputError, require
 from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.nlp.status import Code
@@ -41,6 +53,7 @@ from pneuopt.tuningfile import Tuning, write_tuned
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+    from rich.console import Console
 
 
 def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
@@ -62,18 +75,15 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
             progress=tell,
         )
     result = replace(result, provenance={**result.provenance, **hashes(fit, tuning)})
-    console, validation = screen(), None
+    console, shown = screen(), dict[str, Any]()
     show_status(console, result.status)
     if result.status.converged:
-        show_gains(console, parameters, result.parameters)
-        show_metrics(console, result.certified, asked.loop, before=_before(asked, parameters), limits=asked.subject_to)
-        validation = _validation(asked, parameters, result)
-        if validation is not None:
-            show_validation(console, validation, asked.loop)
+        shown = _show_tuned(console, asked, parameters, result)
     else:
         word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
         show_rejected(console, tuning, result.stats, parameters, word)
         show_metrics(console, result.certified, asked.loop, title=word, limits=asked.subject_to)
+        show_relaxations(console, result.relaxations)
     if result.status.code is Code.INTERRUPTED:
         console.print("no file is written")
         return INTERRUPTED
@@ -83,8 +93,7 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     if outputs.plot is not None:
         before_gains = parameters if result.status.converged else None
         writers |= figure_writers(outputs.plot, _loop_figures(asked, result.parameters, before_gains))
-    tables = _tuning_tables(result) | ({} if validation is None else {"validation": records(validation.summary)})
-    return finish(outputs, writers, tables | background(result), result.status)
+    return finish(outputs, writers, _tuning_tables(result) | shown | background(result), result.status)
 
 
 def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
@@ -127,6 +136,32 @@ def _validation(asked: Tuning, parameters: ParameterSet, result: TuningResult) -
         subject_to=asked.subject_to,
         scenarios=fresh,
     )
+
+
+def _show_tuned(console: "Console", asked: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
+    """Gains, metrics, fresh plants, and whether the dither is worth it; the last two as tables."""
+    show_gains(console, before, result.parameters)
+    show_metrics(console, result.certified, asked.loop, before=_before(asked, before), limits=asked.subject_to)
+    show_requirements(console, result.requirements, result.active, asked.loop)
+    tables: dict[str, Any] = {}
+    validation = _validation(asked, before, result)
+    if validation is not None:
+        show_validation(console, validation, asked.loop)
+        tables["validation"] = records(validation.summary)
+    if asked.loop.dither_period(result.parameters) is not None:
+        tables |= _judged(console, asked, result.parameters)
+    return tables
+
+
+def _judged(console: "Console", asked: Tuning, parameters: ParameterSet) -> dict[str, Any]:
+    """The dither's verdict; without it the loop may be one that cannot be simulated."""
+    try:
+        verdict = judge_dither(asked.loop, asked.references, parameters, band=band_of(asked))
+    except ConvergenceError as error:
+        console.print(f"the dither is not judged: {error}", soft_wrap=True)
+        return {}
+    show_dither(console, verdict)
+    return {"dither": {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons)}}
 
 
 def _before(asked: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
@@ -206,4 +241,5 @@ def _with_reference(response: Response) -> Trajectory:
 def _tuning_tables(result: TuningResult) -> dict[str, Any]:
     gains = result.parameters.select(result.parameters.free_names).to_frame()
     tables = {"gains": gains, "claimed": result.claimed.T, "certified": result.certified.T}
+    tables |= {"requirements": result.requirements, "relaxations": result.relaxations}
     return {name: records(table) for name, table in tables.items()} | {"active": result.active}

@@ -1,9 +1,9 @@
 """`averaged`: what a fast dither makes of a plant, without the dither's own oscillation.
 
 Every state swings about its mean, ``x = m + X(theta)``; the means obey ``dm/dt = mean over theta of f(m + X, u + A sin
-theta)``. That smooths at once what the spool's ripple does to the openings and the piston's to its friction. X is the
-first harmonic (`ripple`), about one operating point. Valid where the dither is fast against the loop: the error is of
-the order of its period. Zames & Shneydor, IEEE Trans. Autom. Control 21(5), 1976.
+theta)``, or with a triangle in place of the sine. That smooths at once what the spool's ripple does to the openings and
+the piston's to its friction. X is the first harmonic (`ripple`), about one operating point. Valid where the dither is
+fast against the loop: the error is of the order of its period. Zames & Shneydor, IEEE Trans. Autom. Control 21, 1976.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.control.dither import Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import ConvergenceError, check_known, require
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
@@ -33,6 +34,7 @@ def averaged(
     reference: float = 0.0,
     actuated: str | None = None,
     nodes: int = 64,
+    waveform: Waveform | None = None,
 ) -> System:
     """The mean motion of a plant, or of a loop, under dither.
 
@@ -52,7 +54,9 @@ def averaged(
         Of a plant: the input that is dithered; by default its only one.
     nodes : int
         Phases over which is averaged; a function of the sine alone sees the half as many nodes of Gauss and Chebyshev,
-        ``A cos((2 i - 1) pi / nodes)``.
+        ``A cos((2 i - 1) pi / nodes)``, one of the triangle, which is spread evenly, those of Gauss and Legendre.
+    waveform : Waveform, optional
+        Of the dither on a plant, by default a sine; a loop's dither has its own.
 
     Returns
     -------
@@ -81,9 +85,9 @@ def averaged(
     >>> round(float(mean.linearise(np.zeros(1), {}, given).B[0, 0]), 2)
     0.67
     """
-    swing = ripple(model, parameters, at=at, reference=reference, actuated=actuated, nodes=nodes)
+    swing = ripple(model, parameters, at=at, reference=reference, actuated=actuated, nodes=nodes, waveform=waveform)
     share = np.array([*swing.values()], dtype=np.complex128) / parameters.value(AMPLITUDE)
-    return _dithered(model, parameters, actuated).mean(share, nodes)
+    return _dithered(model, parameters, actuated, waveform).mean(share, nodes)
 
 
 def ripple(
@@ -94,6 +98,7 @@ def ripple(
     reference: float = 0.0,
     actuated: str | None = None,
     nodes: int = 64,
+    waveform: Waveform | None = None,
 ) -> dict[str, complex]:
     """How every state swings under dither: the balance of the first harmonic, with friction and openings as they are.
 
@@ -102,9 +107,9 @@ def ripple(
     Returns
     -------
     dict of str to complex
-        By state: the peak, and the phase by which it leads the sine.
+        By state: the peak, and the phase by which it leads the sine, or the triangle.
     """
-    dithered = _dithered(model, parameters, actuated)
+    dithered = _dithered(model, parameters, actuated, waveform)
     given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
     swing = _first_harmonic(dithered, given, _point(model, dithered, given, at, reference), nodes)
     return dict(zip(names(dithered.system.states), swing.tolist(), strict=True))
@@ -137,31 +142,36 @@ def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Arra
 
 @dataclass(frozen=True, eq=False)
 class _Dithered:
-    """A system and where the sine enters: an input, or, of a loop, the dither's offset."""
+    """A system and where the wave enters: an input, or, of a loop, the dither's offset."""
 
     system: System
     parameters: ParameterSet
     frequency: float
     entrance: str | None
+    waveform: Waveform
 
-    def rates(self, t: ca.SX, x: ca.SX, u: Symbols, p: Symbols, sine: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Rates and outputs while the sine has this value."""
+    def rates(self, t: ca.SX, x: ca.SX, u: Symbols, p: Symbols, wave: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Rates and outputs while the wave has this value."""
         own = {n: p[n] for n in self.system.parameters}
         if self.entrance is None:
-            own |= {AMPLITUDE: ca.SX(0), OFFSET: p[OFFSET] + sine}
+            own |= {AMPLITUDE: ca.SX(0), OFFSET: p[OFFSET] + wave}
         else:
-            u = {**u, self.entrance: u[self.entrance] + p[OFFSET] + sine}
+            u = {**u, self.entrance: u[self.entrance] + p[OFFSET] + wave}
         xdot, y = self.system.ode(t, x, stacked(u), stacked(own))
         return xdot, y
 
     def mean(self, unit: NDArray[np.complex128], nodes: int) -> System:
         """The system of the means, for a ripple of `unit` per amplitude."""
-        system = self.system
+        system, (phases, weights) = self.system, _phases(nodes, self.waveform)
+        waves, swings = (
+            self.waveform.at(phases),
+            np.outer(np.sin(phases), unit.real) + np.outer(np.cos(phases), unit.imag),
+        )
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
-            at = [(np.sin(phase), unit.real * np.sin(phase) + unit.imag * np.cos(phase)) for phase in _phases(nodes)]
-            found = [self.rates(t, stacked(x) + p[AMPLITUDE] * swing, u, p, p[AMPLITUDE] * sine) for sine, swing in at]
-            rates, outputs = (sum(column, start=ca.SX(0)) / nodes for column in zip(*found, strict=True))
+            A, z = p[AMPLITUDE], stacked(x)
+            found = [self.rates(t, z + A * ca.DM(X), u, p, A * w) for w, X in zip(waves.tolist(), swings, strict=True)]
+            rates, outputs = (_weighted(column, weights) for column in zip(*found, strict=True))
             return _named(system.states, rates), _named(system.outputs, outputs)
 
         mean = define(system.states, system.inputs, system.outputs, self.parameters, rhs)
@@ -173,16 +183,18 @@ class _Dithered:
         a, b, x = (ca.SX.sym(k, n) for k in "abx")
         u, p = symbols(self.system.inputs), {n: ca.SX.sym(n) for n in self.parameters}
         inphase, quadrature = ca.SX(n, 1), ca.SX(n, 1)
-        for phase in _phases(nodes):
-            sine, cosine = np.sin(phase), np.cos(phase)
-            rate = self.rates(ca.SX(0), x + a * sine + b * cosine, u, p, p[AMPLITUDE] * sine)[0]
-            inphase, quadrature = inphase + 2 / nodes * sine * rate, quadrature + 2 / nodes * cosine * rate
+        for phase, weight in zip(*_phases(nodes, self.waveform), strict=True):
+            sine, cosine, wave = np.sin(phase), np.cos(phase), float(self.waveform.at(phase))
+            rate = self.rates(ca.SX(0), x + a * sine + b * cosine, u, p, p[AMPLITUDE] * wave)[0]
+            inphase, quadrature = inphase + 2 * weight * sine * rate, quadrature + 2 * weight * cosine * rate
         unknown, left = ca.vertcat(a, b), ca.vertcat(quadrature - w * a, inphase + w * b) / w
         values = [unknown, x, stacked(u), stacked(p)]
         return ca.Function("imbalance", values, [left, ca.jacobian(left, unknown)])
 
 
-def _dithered(model: System | ClosedLoop, parameters: ParameterSet, actuated: str | None) -> _Dithered:
+def _dithered(
+    model: System | ClosedLoop, parameters: ParameterSet, actuated: str | None, waveform: Waveform | None
+) -> _Dithered:
     for name in (AMPLITUDE, FREQUENCY):
         positive = name in parameters and parameters.value(name) > 0
         require(positive, f"averaging needs a dither: parameters with {name} > 0")
@@ -191,13 +203,15 @@ def _dithered(model: System | ClosedLoop, parameters: ParameterSet, actuated: st
         sampled = "the controller is sampled; average the plant, ClosedLoop(averaged(plant, parameters), pid)"
         require(model.dither is not None, "averaging needs a loop with dither: ClosedLoop(plant, pid, Dither())")
         require(model.pid.sample_time is None, sampled)
-        return _Dithered(model.system(), model.parameters, frequency, None)
+        own = model.dither.waveform if model.dither else Waveform.SINE
+        require(waveform in (None, own), f"the loop's dither is a {own.value}; leave waveform= out")
+        return _Dithered(model.system(), model.parameters, frequency, None, own)
     inputs = {q.name: q for q in model.inputs}
     name = actuated or next(iter(inputs), "")
     require(actuated is not None or len(inputs) == 1, f"the plant has the inputs {', '.join(inputs)}; choose actuated=")
     check_known("input", [name], inputs, "averaged: actuated")
-    own = {n: Parameter(0.0, inputs[name].unit) for n in (AMPLITUDE, OFFSET)}
-    return _Dithered(model, model.parameters | ParameterSet(own), frequency, name)
+    added = ParameterSet({n: Parameter(0.0, inputs[name].unit) for n in (AMPLITUDE, OFFSET)})
+    return _Dithered(model, model.parameters | added, frequency, name, waveform or Waveform.SINE)
 
 
 def _point(
@@ -267,9 +281,16 @@ def _root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: Array) 
     return None
 
 
-def _phases(nodes: int) -> Array:
-    """Midway between the turning points of the sine, so that no node lies on one."""
-    return (2 * np.arange(1, nodes + 1) - 1) * pi / nodes
+def _phases(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
+    """Phases of a period, and their weights: for a sine evenly, on no turning point; for a triangle on either slope."""
+    if waveform is Waveform.SINE:
+        return (2 * np.arange(1, nodes + 1) - 1) * pi / nodes, np.full(nodes, 1 / nodes)
+    at, weights = np.polynomial.legendre.leggauss(nodes // 2)
+    return np.concatenate([at * pi / 2, at * pi / 2 + pi]), np.tile(weights / 4, 2)
+
+
+def _weighted(values: Sequence[ca.SX], weights: Array) -> ca.SX:
+    return sum((w * v for w, v in zip(weights.tolist(), values, strict=True)), start=ca.SX(0))
 
 
 def _named(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:

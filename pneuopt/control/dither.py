@@ -1,36 +1,68 @@
-"""Sine dither: a fast small oscillation added to the command, so that spool and piston do not stick."""
+"""Dither: a fast small oscillation added to the command, so that spool and piston do not stick."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from fractions import Fraction
 from math import inf, nextafter, pi
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from pneuopt.errors import require
 from pneuopt.parameters import Parameter, ParameterSet
 
 Symbols = Mapping[str, ca.SX]
+JOINED = 20  # periods, at most, that make a whole number of samples
+BEAT = 1e-3  # of the amplitude: what averaging may leave of it
+
+
+class Waveform(Enum):
+    """The oscillation's shape; both begin at zero, rising, and have amplitude for their peak.
+
+    A square is not among them: it dwells at two values, and its average smooths no relay (Iannelli, Johansson,
+    Jonsson & Vasca, Automatica 42(4), 2006).
+    """
+
+    SINE = "sine"
+    TRIANGLE = "triangle"
+
+    def at(self, phase: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Its value, of amplitude 1, at a phase [rad].
+
+        Examples
+        --------
+        >>> Waveform.TRIANGLE.at(np.pi * np.array([0.0, 0.25, 0.5, 1.0, 1.5])).round(12).tolist()
+        [0.0, 0.5, 1.0, 0.0, -1.0]
+        """
+        turns = np.asarray(phase, dtype=float) / (2 * pi) + 0.25
+        wave = np.sin(phase) if self is Waveform.SINE else 1 - 4 * np.abs(turns - np.floor(turns) - 0.5)
+        return np.asarray(wave, dtype=float)
 
 
 @dataclass(frozen=True)
 class Dither:
-    """``offset + amplitude sin(2 pi frequency t)``, added after the PID and before the clip.
+    """``offset + amplitude w(frequency t)``, w a sine or a triangle, added after the PID and before the clip.
 
     Parameters
     ----------
     frequency : float
         Default of the parameter of that name [Hz].
     analogue : bool
-        With a sampled controller: a generator behind the controller adds the sine at all times, and the actuator
-        clips the sum; the controller knows only the offset. Otherwise the sine is sampled and held with the command.
+        With a sampled controller: a generator behind the controller adds the wave at all times, and the actuator
+        clips the sum; the controller knows only the offset. Otherwise the wave is sampled and held with the command.
+    waveform : Waveform
     """
 
     frequency: float = 160.0
     analogue: bool = False
+    waveform: Waveform = Waveform.SINE
 
     def __post_init__(self) -> None:
         require(0 < self.frequency < inf, f"Dither: frequency must be positive, got {self.frequency} Hz")
+        known = ", ".join(str(w) for w in Waveform)
+        require(isinstance(self.waveform, Waveform), f"Dither: waveform is one of {known}, got {self.waveform!r}")
 
     def parameters(self, unit: str, sample_time: float | None = None) -> ParameterSet:
         """Amplitude (the peak) and offset [unit], zero by default, and frequency [Hz].
@@ -38,7 +70,7 @@ class Dither:
         Raises
         ------
         InputError
-            If a sampled sine's frequency is not below the Nyquist frequency; that is also the parameter's upper bound.
+            If a sampled wave's frequency is not below the Nyquist frequency; that is also the parameter's upper bound.
         """
         self.check(self.frequency, sample_time)
         upper = inf if sample_time is None or self.analogue else nextafter(0.5 / sample_time, 0.0)
@@ -51,7 +83,8 @@ class Dither:
         )
 
     def check(self, frequency: float, sample_time: float | None) -> None:
-        """Raise `InputError` if a sampled sine of `frequency` [Hz] is at or above the Nyquist frequency."""
+        """Raise `InputError` for a frequency [Hz] of zero, and for one that cannot be sampled."""
+        require(frequency > 0, f"dither.frequency must be positive, got {frequency:g} Hz; for no dither: amplitude 0")
         if sample_time is None or self.analogue:
             return
         nyquist = 0.5 / sample_time
@@ -61,20 +94,29 @@ class Dither:
             f"the Nyquist frequency {nyquist:g} Hz; lower it, sample faster, or use Dither(analogue=True)",
         )
 
-    def sine(self, t: ca.SX, p: Symbols) -> ca.SX:
+    def wave(self, t: ca.SX, p: Symbols) -> ca.SX:
         """The oscillation alone at time t [s], in the unit of the command."""
-        return p["amplitude"] * ca.sin(2 * pi * p["frequency"] * t)
+        if self.waveform is Waveform.SINE:
+            return p["amplitude"] * ca.sin(2 * pi * p["frequency"] * t)
+        turns = p["frequency"] * t + 0.25
+        return p["amplitude"] * (1 - 4 * ca.fabs(turns - ca.floor(turns) - 0.5))
 
     def period(self, frequency: float, sample_time: float | None) -> float:
         """Shortest time over which averaging removes the dither [s]: whole periods, and samples where it is sampled.
 
-        At most 20 periods are joined; beyond that the beat between dither and sampling is left.
+        As few periods as leave a thousandth of the amplitude; at most 20, beyond that the beat between dither and
+        sampling is left.
 
         Examples
         --------
         >>> Dither().period(160.0, None), Dither().period(160.0, 1e-3)
         (0.00625, 0.025)
         """
-        if sample_time is None or self.analogue:
+        if sample_time is None:
             return 1 / frequency
-        return Fraction(1 / (frequency * sample_time)).limit_denominator(20).denominator / frequency
+        step = frequency * sample_time
+        for joined in range(1, JOINED + 1):
+            beyond = (joined / step) % 1.0
+            if 20 * step**3 * beyond * (1 - beyond) <= BEAT * joined:  # (w h)^2/8 of the part of a sample at the end
+                return joined / frequency
+        return Fraction(1 / step).limit_denominator(JOINED).denominator / frequency

@@ -1,23 +1,29 @@
 """`ClosedLoop`: a plant, a PID and a dither, as a `System` or a `DiscreteSystem` for the solvers.
 
-Where the parts meet: the reference r and the measured output y, or what a lagging sensor shows of it, enter the PID,
-dither is added to its command, the sum is clipped, and the result, the output "control", drives the actuated input.
+Where the parts meet: the reference r and the measured output y, or what a sensor shows of it, enter the PID,
+feedforward and dither are added to its command, the sum is clipped, and the result, the output "control", drives the
+actuated input.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from math import inf
+from functools import cached_property, reduce
+from operator import or_
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.dither import Dither
+from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.forms import ParallelForm, parallel_gains
+from pneuopt.control.linear_loop import linear_plant, open_loop
 from pneuopt.control.pid import PID
-from pneuopt.control.rest import find_rest, sliding, wired
-from pneuopt.control.sensor import SensorLag
-from pneuopt.errors import ModelError, check_known, require
+from pneuopt.control.rest import find_rest, sliding
+from pneuopt.control.sensor import Encoder, Feedback, SensorLag
+from pneuopt.control.wiring import check_lag, check_reach, chosen, wired
+from pneuopt.errors import ModelError, require
 from pneuopt.parameters import ParameterSet, Quantity
 from pneuopt.system import (
     DiscreteSystem,
@@ -33,7 +39,7 @@ from pneuopt.system import (
 
 Array = NDArray[np.float64]
 Signals = dict[str, ca.SX]
-READING = "sensor.reading"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +55,16 @@ class ClosedLoop:
         The plant's input that the controller drives; by default its only one. Others stay inputs of the loop.
     measured : str, optional
         The plant's output that is fed back; by default "speed", or the only one.
-    sensor : SensorLag, optional
+    sensor : SensorLag or Encoder, optional
         Through which the controller sees it. What the loop is judged by is the output itself.
+    feedforward : Feedforward, optional
+        What a change of the reference adds to the PID's command.
 
     Raises
     ------
     ModelError
         If the input or output is ambiguous or unknown, if the measured output depends on the command without any lag
-        (an algebraic loop), or if names collide.
+        (an algebraic loop), if the sensor does not fit, or if names collide.
     InputError
         If the dither cannot be sampled.
     """
@@ -66,15 +74,20 @@ class ClosedLoop:
     dither: Dither | None = None
     actuated: str | None = None
     measured: str | None = None
-    sensor: SensorLag | None = None
+    sensor: SensorLag | Encoder | None = None
+    feedforward: Feedforward | None = None
 
     def __post_init__(self) -> None:
-        if self.sensor is None:
-            _check_lag(self)
+        if self.sensor is not None:
+            self.sensor.check(self._fed_back)
+        if not isinstance(self.sensor, SensorLag):
+            check_lag(
+                self.plant, self.command.name, self.feedback.name if self.sensor is None else self.sensor.position
+            )
         reserved = {"reference": names(self.plant.inputs), "control": names(self.plant.outputs)}
         for name, taken in reserved.items():
             require(name not in taken, f"the plant has a signal {name!r} of its own; rename it", ModelError)
-        doubled = self.sensor is not None and "sensor.lag" in self.plant.parameters
+        doubled = isinstance(self.sensor, SensorLag) and "sensor.lag" in self.plant.parameters
         require(not doubled, "the plant has a sensor.lag of its own; leave sensor= out", ModelError)
         _ = self.parameters
 
@@ -85,28 +98,35 @@ class ClosedLoop:
     @cached_property
     def command(self) -> Quantity:
         """The plant's input that the controller drives."""
-        return _chosen("input", self.actuated, self.plant.inputs, None)
+        return chosen("input", self.actuated, self.plant.inputs, None)
 
     @cached_property
     def feedback(self) -> Quantity:
         """The plant's output that is fed back."""
-        return _chosen("output", self.measured, self.plant.outputs, "speed")
+        return chosen("output", self.measured, self.plant.outputs, "speed")
 
     @cached_property
     def parameters(self) -> ParameterSet:
-        """Those of the plant, "pid.*", "dither.*" and "sensor.lag", with their defaults."""
-        h, unit = self.pid.sample_time, self.command.unit
-        dither = self.dither.parameters(unit, h) if self.dither else ParameterSet()
-        pid = self.pid.parameters(self.feedback.unit, unit)
-        sensor = self.sensor.parameters() if self.sensor else ParameterSet()
-        return self.plant.parameters | pid.prefixed("pid") | dither.prefixed("dither") | sensor.prefixed("sensor")
+        """Those of the plant, "pid.*", "dither.*", "sensor.*" and "feedforward.*", with their defaults."""
+        h, measured, unit = self.pid.sample_time, self.feedback.unit, self.command.unit
+        parts = {
+            "pid": self.pid.parameters(measured, unit),
+            "dither": self.dither.parameters(unit, h) if self.dither else ParameterSet(),
+            "sensor": self.sensor.parameters(self._fed_back) if self.sensor else ParameterSet(),
+            "feedforward": self.feedforward.parameters(measured, unit) if self.feedforward else ParameterSet(),
+        }
+        return reduce(or_, (own.prefixed(name) for name, own in parts.items()), self.plant.parameters)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """The plant's, a lagging sensor's "sensor.reading", then the controller's ("pid.*")."""
-        own = self.pid.states(self.feedback, self.command)
-        reading = (replace(self.feedback, name=READING),) if self.sensor else ()
-        return (*self.plant.states, *reading, *(replace(q, name=f"pid.{q.name}") for q in own))
+        """The plant's, the sensor's ("sensor.reading"), then the controller's ("pid.*", "feedforward.filter")."""
+        parts = {
+            "sensor": self.sensor.states(self._fed_back) if self.sensor else (),
+            "pid": self.pid.states(self.feedback, self.command),
+            "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
+        }
+        own = (replace(q, name=f"{name}.{q.name}") for name, quantities in parts.items() for q in quantities)
+        return (*self.plant.states, *own)
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
@@ -147,10 +167,12 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        own = self.pid.update(
-            _part("pid", x), u["reference"], self._measured(t, x, u, p), self._dither(t, p), _part("pid", p)
-        )
-        after = stacked({n: own.get(n.removeprefix("pid."), x[n]) if n.startswith("pid.") else x[n] for n in x})
+        (lead, added), seen, y = self._led(x, u, p), Signals(), self._plant(t, x, u, p, ca.SX(0))[1]
+        if self.sensor:
+            seen = self.sensor.update(_part("sensor", x), y, self._fed_back, _part("sensor", p))
+        measured = seen.get("reading", y[self.feedback.name])
+        own = self.pid.update(_part("pid", x), u["reference"], measured, self._dither(t, p) + added, _part("pid", p))
+        after = stacked({**x, **_named("sensor", seen), **_named("pid", own), **lead})
         return ca.Function("update", [t, *map(stacked, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
 
     def discrete(self, substeps: int = 1) -> DiscreteSystem:
@@ -172,21 +194,35 @@ class ClosedLoop:
         h = self.pid.sample_time
         if self.dither:
             self.dither.check(value["dither.frequency"], h)
-        require(
-            value["pid.Tf"] > 0 or h is not None,
-            f"pid.Tf = {value['pid.Tf']:g} s: a continuous derivative needs a filter, Tf > 0",
-        )
-        if self.pid.limits:
-            low, high, Tt = value["pid.lower"], value["pid.upper"], value["pid.Tt"]
-            require(low < high, f"pid.lower {low:g} is not below pid.upper {high:g} {self.command.unit}")
-            require(
-                Tt > 0 and Tt >= (h or 0.0),
-                f"pid.Tt = {Tt:g} s: anti-windup needs Tt > 0, and with sampling at least one sample ({h or 0:g} s)",
-            )
+        if self.feedforward:
+            time = value["feedforward.time"]
+            require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
+        Tf = float(self.gains(list(value.values()))[3])
+        self.pid.check({**_part("pid", value), "Tf": Tf}, self.command.unit)
 
     def numbers(self, parameters: ParameterSet) -> Array:
         """The vector p of `parameters` in the loop's order; a missing one keeps the loop's default."""
         return np.array([parameters.value(n) if n in parameters else q.value for n, q in self.parameters.items()])
+
+    @cached_property
+    def gains(self) -> ca.Function:
+        """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form, which is what runs, from the parameters of any `Form`."""
+        p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
+        return ca.Function("gains", [stacked(p)], [ca.vertcat(*parallel_gains(self.pid.form, _part("pid", p)))])
+
+    def parallel(self, parameters: ParameterSet) -> ParallelForm:
+        """The gains in the parallel form, from the parameters of any `Form`."""
+        return ParallelForm(*self.gains(self.numbers(parameters)).full().ravel().tolist())
+
+    def sensor_lag(self, p: Array) -> Any:
+        """The sensor's time constant in the loop linearised [s]; p of shape (n_parameters,) or (n_parameters, m)."""
+        value = _part("sensor", dict(zip(self.parameters, p, strict=True)))
+        return self.sensor.time_constant(self._fed_back, value) if self.sensor else 0.0
+
+    @property
+    def dead_time(self) -> float:
+        """Of the loop linearised [s]: half a sample for the hold, and the computing delay."""
+        return (0.5 + self.pid.delay) * (self.pid.sample_time or 0.0)
 
     def dither_period(self, parameters: ParameterSet) -> float | None:
         """The time over which averages and ripple are taken [s] (`Dither.period`); None without dither."""
@@ -241,17 +277,17 @@ class ClosedLoop:
         else:
             x, shape = np.asarray(x_plant, dtype=float), (len(self.plant.states),)
             require(x.shape == shape, f"x_plant has shape {x.shape}, the plant's state has {shape}")
-        _check_reach(command, value, self.command.unit)
-        y = float(self._measure(0, x, p))
-        error = value["pid.c"] * reference - y
-        integral = command - value["pid.Kp"] * (value["pid.b"] * reference - y)
-        own = [integral, error] if self.pid.sample_time is None else [integral, 0.0, error, command]
-        return np.concatenate([x, [y] if self.sensor else [], own])
+        check_reach(command, value, self.command.unit)
+        y = dict(zip(names(self.plant.outputs), self._shown(0, x, p).full().ravel().tolist(), strict=True))
+        sensor = self.sensor.start(y, self._fed_back, _part("sensor", value)) if self.sensor else []
+        seen = sensor[0] if sensor else y[self.feedback.name]
+        own = self.pid.start(reference, seen, command, {**_part("pid", value), "Kp": float(self.gains(p)[0])})
+        return np.concatenate([x, sensor, own, [reference] if self.feedforward else []])
 
     def linear_plant(
         self, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
     ) -> Linearisation:
-        """The plant from command to measured output, or to what its sensor shows, linearised.
+        """The plant from command to measured output, or to what its sensor's lag shows, linearised.
 
         Parameters
         ----------
@@ -262,74 +298,39 @@ class ClosedLoop:
         u : mapping of str to float, optional
             The plant's inputs there, zero where absent; at rest the command is solved for.
         """
-        self.check(parameters)
-        if x is None:
-            x, command = find_rest(self, parameters, 0.0, {})
-            u = {self.command.name: command, **(u or {})}
-        plant = self.plant.linearise(x, u or {}, parameters)
-        j, i = plant.inputs.index(self.command.name), plant.outputs.index(self.feedback.name)
-        A, B, C, D = plant.A, plant.B[:, j : j + 1], plant.C[i : i + 1], plant.D[i : i + 1, j : j + 1]
-        states = plant.states
-        if self.sensor is not None:
-            rate, n = 1 / (self.parameters | parameters).value("sensor.lag"), len(A)
-            A = np.block([[A, np.zeros((n, 1))], [rate * C, np.array([[-rate]])]])
-            B, C, D = np.vstack([B, rate * D]), np.eye(1, n + 1, n), np.zeros((1, 1))
-            states = (*states, READING)
-        return Linearisation(A, B, C, D, states, (self.command.name,), (self.feedback.name,))
+        return linear_plant(self, parameters, x, u)
 
     def open_loop(
         self, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
     ) -> Linearisation:
         """``L(s) = C(s) P(s)`` under negative feedback, cut at the measured output, without clip and dither.
 
-        A sampled PID counts as its continuous equivalent behind a hold, half a sample of delay in first-order Padé form
-        ``(1 - s h/4)/(1 + s h/4)``. Parameters as for `linear_plant`.
+        A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé
+        form; the integral as without a dead band. Parameters as for `linear_plant`.
 
         Returns
         -------
         Linearisation
             From the control error, input "error", to the measured output; the plant's states come first.
         """
-        plant, controller = self.linear_plant(parameters, x, u), self._controller(parameters)
-        m, n = len(controller.A), len(plant.A)
-        return Linearisation(
-            np.block([[plant.A, plant.B @ controller.C], [np.zeros((m, n)), controller.A]]),
-            np.vstack([plant.B @ controller.D, controller.B]),
-            np.hstack([plant.C, np.zeros((1, m))]),
-            np.zeros((1, 1)),
-            plant.states + controller.states,
-            ("error",),
-            (self.feedback.name,),
-        )
-
-    def _controller(self, parameters: ParameterSet) -> Linearisation:
-        value = dict(zip(self.parameters, self.numbers(parameters), strict=True))
-        Kp, Ki, Kd, Tf = (value[f"pid.{n}"] for n in ("Kp", "Ki", "Kd", "Tf"))
-        h = self.pid.sample_time
-        require(Tf > 0, "pid.Tf = 0: margins are those of the continuous equivalent, which needs Tf > 0")
-        A, B = np.diag([0.0, -1 / Tf]), np.array([[Ki], [1 / Tf]])
-        C, D = np.array([[1.0, -Kd / Tf]]), np.array([[Kp + Kd / Tf]])
-        if h is not None:
-            a = 4 / h
-            A = np.block([[A, np.zeros((2, 1))], [2 * a * C, np.array([[-a]])]])
-            B, C, D = np.vstack([B, 2 * a * D]), np.hstack([-C, [[1.0]]]), -D
-        own = ("pid.integral", "pid.filter", "pid.hold")[: len(A)]
-        return Linearisation(A, B, C, D, own, ("error",), ("control",))
+        return open_loop(self, parameters, x, u)
 
     def _continuous(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+        lead, added = self._led(x, u, p)
+        seen = x["sensor.reading"] if self.sensor else self._plant(t, x, u, p, ca.SX(0))[1][self.feedback.name]
         rates, command = self.pid.rates(
-            _part("pid", x), u["reference"], self._measured(t, x, u, p), self._dither(t, p), _part("pid", p)
+            _part("pid", x), u["reference"], seen, self._dither(t, p) + added, _part("pid", p)
         )
         xdot, y = self._plant(t, x, u, p, command)
-        own = {f"pid.{n}": rate for n, rate in rates.items()} | self._sensing(x, y, p)
+        own = _named("pid", rates) | lead | self._sensing(x, y, p)
         return xdot | own, y | {"control": command}
 
     def _between(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         command = x["pid.command"]
         if self.dither and self.dither.analogue:
-            command = self.pid.clip(command + self.dither.sine(t, _part("dither", p)), _part("pid", p))
+            command = self.pid.clip(command + self.dither.wave(t, _part("dither", p)), _part("pid", p))
         xdot, y = self._plant(t, x, u, p, command)
-        own = {n: ca.SX(0) for n in x if n.startswith("pid.")} | self._sensing(x, y, p)
+        own = {n: ca.SX(0) for n in x if n.startswith(("pid.", "feedforward."))} | self._sensing(x, y, p)
         return xdot | own, y | {"control": command}
 
     def _dither(self, t: ca.SX, p: Symbols) -> ca.SX:
@@ -338,58 +339,39 @@ class ClosedLoop:
             return ca.SX(0)
         own = _part("dither", p)
         sampled_apart = self.dither.analogue and self.pid.sample_time is not None
-        return own["offset"] if sampled_apart else own["offset"] + self.dither.sine(t, own)
+        return own["offset"] if sampled_apart else own["offset"] + self.dither.wave(t, own)
+
+    def _led(self, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+        """The feedforward's state, its rate or with a sampled PID its next value, and what it adds to the command."""
+        if self.feedforward is None:
+            return {}, ca.SX(0)
+        own, h = (_part("feedforward", x), u["reference"], _part("feedforward", p)), self.pid.sample_time
+        moved, added = self.feedforward.rates(*own) if h is None else self.feedforward.update(*own, h)
+        return _named("feedforward", moved), added
 
     def _sensing(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
-        return {READING: (y[self.feedback.name] - x[READING]) / p["sensor.lag"]} if self.sensor else {}
-
-    def _measured(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
-        """What the controller sees."""
-        return x[READING] if self.sensor else self._true(t, x, u, p)
-
-    def _true(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
-        return self._plant(t, x, u, p, ca.SX(0))[1][self.feedback.name]
+        if self.sensor is None:
+            return {}
+        return _named("sensor", self.sensor.rates(_part("sensor", x), y, self._fed_back, _part("sensor", p)))
 
     def _plant(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
         return wired(self.plant, self.command.name, t, x, u, p, command)
 
     @cached_property
-    def _measure(self) -> ca.Function:
+    def _fed_back(self) -> Feedback:
+        return Feedback(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time)
+
+    @cached_property
+    def _shown(self) -> ca.Function:
+        """The plant's outputs without a command."""
         t, x, u = ca.SX.sym("t"), symbols(self.plant.states), {q.name: ca.SX(0) for q in self.plant.inputs}
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        return ca.Function("measure", [t, stacked(x), stacked(p)], [self._true(t, x, u, p)])
+        return ca.Function("shown", [t, stacked(x), stacked(p)], [stacked(self._plant(t, x, u, p, ca.SX(0))[1])])
 
 
-def _chosen(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:
-    by_name = {q.name: q for q in known}
-    if name is None:
-        name = usual if usual in by_name else next(iter(by_name)) if len(by_name) == 1 else None
-    field = "actuated" if kind == "input" else "measured"
-    require(name is not None, f"the plant has the {kind}s {', '.join(by_name) or 'none'}; choose {field}=", ModelError)
-    check_known(kind, [str(name)], by_name, f"ClosedLoop {field}")
-    return by_name[str(name)]
-
-
-def _check_lag(loop: ClosedLoop) -> None:
-    plant = loop.plant
-    t, x, u = (ca.SX.sym(k, plant.ode.size1_in(i)) for i, k in enumerate("txu"))
-    y = plant.ode(t, x, u, ca.SX.sym("p", plant.ode.size1_in(3)))[1]
-    j, i = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
-    require(
-        ca.jacobian(y[i], u[j]).nnz() == 0,
-        f"algebraic loop: output {loop.feedback.name!r} depends on input {loop.command.name!r} without any lag; "
-        "measure another output, or give the plant an actuator or a sensor with a lag",
-        ModelError,
-    )
-
-
-def _check_reach(command: float, value: Mapping[str, float], unit: str) -> None:
-    low, high = value.get("pid.lower", -inf), value.get("pid.upper", inf)
-    require(
-        low <= command <= high,
-        f"the loop cannot start at rest: it needs a command of {command:g} {unit}, the limits are {low:g} and {high:g}",
-    )
-
-
-def _part(prefix: str, values: Symbols) -> Signals:
+def _part(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
     return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
+
+
+def _named(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
+    return {f"{prefix}.{n}": v for n, v in values.items()}

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from pneuopt.codegen import Rollout
-from pneuopt.control.loop import READING, ClosedLoop
+from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.rest import drifting
+from pneuopt.control.sensor import Encoder
 from pneuopt.errors import LogError, ModelError, require
 from pneuopt.finders import Log, Start
 from pneuopt.parameters import ParameterSet, Quantity
@@ -45,7 +46,7 @@ class LoggedLoop:
     Raises
     ------
     ModelError
-        If the controller is continuous.
+        If the controller is continuous, or reads an encoder, whose steps leave a fit without derivatives.
     """
 
     loop: ClosedLoop
@@ -53,6 +54,8 @@ class LoggedLoop:
     def __post_init__(self) -> None:
         told = "a log comes from a sampled controller: give the loop's PID its sample_time"
         require(self.loop.pid.sample_time is not None, told, ModelError)
+        told = "an identification has no derivatives through an Encoder; give SensorLag(filter + half a sample)"
+        require(not isinstance(self.loop.sensor, Encoder), told, ModelError)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -103,8 +106,10 @@ class LoggedLoop:
         The command is computed anew at the first sample; of previous error and derivative only a sum counts.
         """
         held = {"pid.command", "pid.previous_error"}
-        gain = parameters["pid.Kd"]
-        held |= set() if gain.free or gain.value else {"pid.derivative"}
+        acting = {"pid.Kd": "pid.derivative", "pid.Td": "pid.derivative", "feedforward.gain": "feedforward.filter"}
+        for gain, state in acting.items():
+            idle = gain in parameters and not (parameters[gain].free or parameters[gain].value)
+            held |= {state} if idle else set()
         seen = {self.loop.feedback.name, *(n for n in names(self.loop.plant.outputs) if n in measured)}
         held |= set.intersection(*(set(drifting(self.loop.plant, n)) for n in seen))
         return np.array([states[n][0] if n in held else np.nan for n in names(self.states)])
@@ -152,11 +157,13 @@ class LoggedLoop:
         t, seen = log.measured.t, _fed_back(log.measured, self.loop.feedback.name, self.inputs[0].name, name)
         reference = log.measured[self.inputs[0].name]
         acts = _acting(t, self._sample_time, name)
-        p, value = alone.numbers(log.parameters), {n: log.parameters.value(n) for n in ("pid.Kp", "pid.b", "pid.c")}
-        pushed = value["pid.Kp"] * (value["pid.b"] * reference[0] - seen[0])
-        x0 = {READING: seen[0], "pid.previous_error": value["pid.c"] * reference[0] - seen[0]}
-        x0["pid.integral"] = -pushed if was_at_rest else 0.0
-        start = np.array([[x0.get(n, 0.0) for n in names(discrete.states)]])
+        p, pid = alone.numbers(log.parameters), alone.pid
+        known = {**dict(zip(alone.parameters, p, strict=True)), "pid.Kp": alone.parallel(log.parameters).Kp}
+        own = pid.start(reference[0], seen[0], 0.0, {n: known[f"pid.{n}"] for n in ("Kp", "b", "c")})
+        x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.feedback, alone.command), own, strict=True)}
+        x0 |= {"sensor.reading": seen[0], "feedforward.filter": reference[0]}
+        x0 |= {} if was_at_rest else {"pid.integral": 0.0}
+        start = np.array([[x0[n] for n in names(discrete.states)]])
         u, h = np.column_stack([reference, seen, acts]), np.append(np.diff(t), 0.0)
         lag = log.parameters.value("sensor.lag") if alone.sensor else math.inf
         run = rollout.run(start, u[None], p, t[None], h[None], substeps=math.ceil(h.max() / lag) or 1, states=True)

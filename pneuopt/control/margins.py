@@ -19,6 +19,7 @@ from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
 from pneuopt.codegen import compiled
+from pneuopt.control.linear_loop import delayed, linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import ModelError, require
 from pneuopt.parameters import ParameterSet
@@ -197,7 +198,7 @@ def sensitivity_terms(
     Returns
     -------
     casadi.Function
-        ``p -> terms``: p in the order of ``loop.parameters``, terms of shape (n,); depends on Kp, Ki, Kd and Tf only.
+        ``p -> terms``: p in the order of ``loop.parameters``, terms of shape (n,); depends on the gains only.
 
     Raises
     ------
@@ -207,14 +208,13 @@ def sensitivity_terms(
     free = [n for n in parameters.free_names if n in loop.plant.parameters]
     require(not free, f"{', '.join(free)}: free, but the sensitivity takes the plant as fixed; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
-    h = loop.pid.sample_time or 0.0
-    P = frequency_response(loop.linear_plant(parameters, x), w) * _hold(w, h)
-    p = {n: ca.SX.sym(n) for n in loop.parameters}
-    Kp, Ki, Kd, Tf = (p[f"pid.{n}"] for n in ("Kp", "Ki", "Kd", "Tf"))
+    P = frequency_response(loop.linear_plant(parameters, x), w) * delayed(w, loop.dead_time)
+    p = ca.SX.sym("p", len(loop.parameters))
+    Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
     a, b = _controller((Kp, Ki, Kd, Tf), ws)
     terms = (1 + a * re - b * im) ** 2 + (a * im + b * re) ** 2
-    return ca.Function("sensitivity_terms", [ca.vertcat(*p.values())], [terms], ["p"], ["terms"])
+    return ca.Function("sensitivity_terms", [p], [terms], ["p"], ["terms"])
 
 
 def robustness(
@@ -234,14 +234,13 @@ def robustness(
         ``(p, x, command, only) -> found``, shapes (m, n_parameters) in the order of ``loop.parameters``,
         (m, n_plant_states) and (m,); the plant's other inputs are zero. Found is of shape (m,) for each name in `only`:
         "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in `Margins`, crossings
-        interpolated, and "NoiseGain". What is impossible is not checked. Tf > 0.
+        interpolated, and "NoiseGain". What is impossible is not checked.
     """
     w = np.asarray(omega, dtype=float)
-    plants, position = _plants(loop, w), {name: k for k, name in enumerate(loop.parameters)}
-    gains = [position[f"pid.{k}"] for k in ("Kp", "Ki", "Kd", "Tf")]
+    plants = _plants(loop, w)
 
     def read(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
-        Kp, Ki, Kd, Tf = (p[:, [k]] for k in gains)
+        Kp, Ki, Kd, Tf = linear_gains(loop, p.T).full()[..., None]
         a, b = _controller((Kp, Ki, Kd, Tf), w)
         C = a + 1j * b
         L = plants(p, x, commands) * C
@@ -256,7 +255,7 @@ def robustness(
 
 def _plants(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], ComplexArray]:
     """Responses of the plant with sensor and hold, shape (m, n)."""
-    plant, h = loop.plant, loop.pid.sample_time or 0.0
+    plant = loop.plant
     x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
     command, output = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
     xdot, y = plant.ode(0, x, u, q)
@@ -273,8 +272,8 @@ def _plants(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], Compl
         us[:, command] = commands
         found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
         A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
-        P = (_responses(A, B, C, w) + D) * _hold(w, h)
-        return np.asarray(P if loop.sensor is None else P / (1 + 1j * w * p[:, [position["sensor.lag"]]]))
+        P = (_responses(A, B, C, w) + D) * delayed(w, loop.dead_time)
+        return np.asarray(P / (1 + 1j * w * np.reshape(loop.sensor_lag(p.T), (-1, 1))))
 
     return responses
 
@@ -340,11 +339,6 @@ def _controller(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
     Kp, Ki, Kd, Tf = gains
     lag = 1 / (1 + (Tf * w) ** 2)
     return Kp + Kd * Tf * w**2 * lag, Kd * w * lag - Ki / w
-
-
-def _hold(w: Array, h: float) -> ComplexArray:
-    """Half a sample of delay, as `ClosedLoop.open_loop` has it."""
-    return np.asarray((1 - 0.25j * w * h) / (1 + 0.25j * w * h))
 
 
 def _crossings(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:

@@ -42,6 +42,7 @@ def step_metrics(
     sample_time: float | None = None,
     final: float | None = None,
     envelope: Envelope = (),
+    scale: float | None = None,
 ) -> dict[str, float]:
     """Measure a step response.
 
@@ -71,6 +72,10 @@ def step_metrics(
     envelope : sequence of (float, float, float)
         Instants after the step, in order [s], each with the lower and upper bound that hold from then on, as fractions
         of the step: 0 is `initial`, 1 the reference.
+    scale : float, optional
+        For a disturbance, at `start`, of a loop whose reference stays: what stands for the step's size [unit].
+        Overshoot is then the largest deviation, either side, SettlingTime the time until it is back in the band, Peak
+        its value; nothing rises, RiseTime and Undershoot are 0. In the envelope 0 lies by `scale` below the reference.
 
     Returns
     -------
@@ -135,6 +140,7 @@ def step_metrics(
         sample_time=sample_time,
         final=final,
         envelope=envelope,
+        scale=scale,
     )
     return {name: float(value[0]) for name, value in found.items()}
 
@@ -154,6 +160,8 @@ def batch_metrics(
     final: float | None = None,
     envelope: Envelope = (),
     only: Collection[str] | None = None,
+    averaged: Array | None = None,
+    scale: float | None = None,
 ) -> dict[str, Array]:
     """Measure many step responses on one grid at once; see `step_metrics`.
 
@@ -163,31 +171,34 @@ def batch_metrics(
     y, control : ndarray, shape (m, n)
         A row a response.
     only : collection of str, optional
-        What is asked for: ControlRate and the integrals, which take their time, are left out where they are not in it.
+        What is asked for; what takes its time is left out where it is not in it.
+    averaged : ndarray, shape (m, k), optional
+        Means over the dither's period at the first k samples from the step on, where they are known.
 
     Returns
     -------
     dict of str to ndarray, shape (m,)
     """
-    raw, size = _record(t, y, reference_final, initial, start, band), reference_final - initial
-    smooth = raw if dither_period is None else _averaged(raw, initial, dither_period)
+    require(scale is not None or reference_final != initial, f"no step: the reference stays at {initial:g}")
+    raw, size = _record(t, y, start, band), reference_final - initial if scale is None else scale
+    if averaged is None and dither_period is not None:
+        averaged = _averaged(raw, initial, dither_period)
+    smooth = raw if averaged is None else _Record(raw.t[: averaged.shape[1]], averaged)
     steady = end_mean(raw.t, raw.y, dither_period) if final is None else np.full(len(raw.y), final)
-    rise, lowest, highest = _rise(smooth, initial, steady - initial)
     centre, width = steady, band * np.abs(steady - initial)
     if about is About.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
     latest = raw.t[-1] - max(TAIL * raw.t[-1], PERIODS_INSIDE * (dither_period or 0.0))
     return {
-        "RiseTime": rise,
+        **_rise(smooth, initial, steady, only),
         "SettlingTime": _settling(smooth, centre, width, latest),
-        "SettlingMin": np.minimum(lowest, steady),
-        "SettlingMax": np.maximum(highest, steady),
-        **_extremes(smooth, steady, reference_final, initial),
+        **(_extremes(smooth, steady, reference_final, initial, only) if scale is None else {}),
+        **({} if scale is None else _deviations(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
         "SteadyStateError": 100 * np.abs(reference_final - steady) / abs(size),
-        "Ripple": np.ptp(_tail(raw, dither_period).y, axis=1),
+        **({"Ripple": np.ptp(_tail(raw, dither_period).y, axis=1)} if _asked(only, "Ripple") else {}),
         **_integrals(smooth, reference_final, size, only),
-        **_enveloped(smooth, initial, size, envelope),
+        **_enveloped(smooth, initial if scale is None else reference_final - size, size, envelope),
         **_effort(t, control, start, sample_time, len(raw.y), only),
     }
 
@@ -200,28 +211,30 @@ class _Record:
     y: Array
 
 
-def _record(t: Array, y: Array, reference: float, initial: float, start: float, band: float) -> _Record:
+def _record(t: Array, y: Array, start: float, band: float) -> _Record:
     require(bool(np.all(np.diff(t) > 0)), "time must increase strictly")
     require(bool(np.all(np.isfinite(y))), "the response holds NaN or infinite values; a simulation that fails has none")
-    require(reference != initial, f"no step: the reference stays at {initial:g}")
     require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
-    kept = _since(t, start)
-    require(int(kept.sum()) >= 3, f"fewer than three samples after the step at {start:g} s")
-    return _Record(t[kept] - start, y[:, kept])
+    first = _since(t, start)
+    require(len(t) - first >= 3, f"fewer than three samples after the step at {start:g} s")
+    return _Record(t[first:] - start, y[:, first:])
 
 
-def _since(t: Array, start: float) -> NDArray[np.bool_]:
-    return np.asarray(t >= start - 1e-12 * max(1.0, abs(start)))
+def _asked(only: Collection[str] | None, *metrics: str) -> bool:
+    return only is None or any(n in only for n in metrics)
 
 
-def _averaged(record: _Record, initial: float, period: float) -> _Record:
+def _since(t: Array, start: float) -> int:
+    return int(np.searchsorted(t, start - 1e-12 * max(1.0, abs(start))))
+
+
+def _averaged(record: _Record, initial: float, period: float) -> Array:
     last = record.t[-1] - period / 2
     require(
         period > 0 and last > record.t[0] + period,
         f"the record of {record.t[-1]:g} s is too short to average over {period:g} s; simulate longer",
     )
-    t = record.t[record.t <= last]
-    return _Record(t, period_mean(record.t, record.y, initial, period, t))
+    return period_mean(record.t, record.y, initial, period, record.t[record.t <= last])
 
 
 def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
@@ -276,15 +289,22 @@ def _mean(record: _Record) -> Array:
     return np.asarray(np.trapezoid(record.y, record.t, axis=1) / (record.t[-1] - record.t[0]))
 
 
-def _rise(record: _Record, initial: float, change: Array) -> tuple[Array, Array, Array]:
+def _rise(record: _Record, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:
     """Time from 10 to 90 %, and the range from there on; NaN where 90 % is never reached."""
+    if not _asked(only, "RiseTime", "SettlingMin", "SettlingMax"):
+        return {}
+    change = steady - initial
     with np.errstate(all="ignore"):
         z = (record.y - initial) / np.where(change == 0, nan, change)[:, None]
     reached = (z >= 0.9).any(axis=1)
     after = np.arange(len(record.t)) >= np.argmax(z >= 0.9, axis=1)[:, None]
     rise = _first(record.t, z, 0.9) - _first(record.t, z, 0.1)
     lowest, highest = np.where(after, record.y, np.inf).min(axis=1), np.where(after, record.y, -np.inf).max(axis=1)
-    return np.where(reached, rise, nan), np.where(reached, lowest, nan), np.where(reached, highest, nan)
+    return {
+        "RiseTime": np.where(reached, rise, nan),
+        "SettlingMin": np.where(reached, np.minimum(lowest, steady), nan),
+        "SettlingMax": np.where(reached, np.maximum(highest, steady), nan),
+    }
 
 
 def _first(t: Array, z: Array, level: float) -> Array:
@@ -316,8 +336,13 @@ def _at(rows: Array, k: NDArray[np.intp]) -> Array:
     return np.asarray(rows[np.arange(len(rows)), k], dtype=float)
 
 
-def _extremes(record: _Record, steady: Array, reference: float, initial: float) -> dict[str, Array]:
+def _extremes(
+    record: _Record, steady: Array, reference: float, initial: float, only: Collection[str] | None
+) -> dict[str, Array]:
     size, change = reference - initial, steady - initial
+    if not _asked(only, "OvershootFinal", "Undershoot", "Peak", "PeakTime"):
+        peak = record.y.max(axis=1) if size > 0 else record.y.min(axis=1)
+        return {"Overshoot": 100 * np.maximum(0.0, (peak - reference) / size)}
     k = np.argmax(record.y * np.sign(size), axis=1)
     peak = _at(record.y, k)
     with np.errstate(all="ignore"):
@@ -331,9 +356,18 @@ def _extremes(record: _Record, steady: Array, reference: float, initial: float) 
     }
 
 
+def _deviations(record: _Record, reference: float, size: float) -> dict[str, Array]:
+    """What a response that should not move shows in place of rise and overshoot."""
+    k = np.argmax(np.abs(record.y - reference), axis=1)
+    peak, none = _at(record.y, k), np.zeros(len(record.y))
+    beyond = 100 * np.abs(peak - reference) / abs(size)
+    found = {"Overshoot": beyond, "OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
+    return found | {"RiseTime": none, "Undershoot": none}
+
+
 def _integrals(record: _Record, reference: float, size: float, only: Collection[str] | None) -> dict[str, Array]:
     """By the trapezoidal rule; its weights at the samples make the integrals products."""
-    if only is not None and not set(INTEGRALS) & set(only):
+    if not _asked(only, *INTEGRALS):
         return {}
     h, error = np.diff(record.t), np.abs(record.y - reference) / abs(size)
     weights = 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
@@ -365,12 +399,11 @@ def _effort(
 ) -> dict[str, Array]:
     if control is None:
         return {"PeakControl": np.full(rows, nan), "ControlRate": np.full(rows, nan)}
-    fits = control.shape[-1:] == t.shape
-    require(fits, f"t and control differ in shape: {t.shape} and {control.shape[-1:]}")
-    kept = _since(t, start)
-    found = {"PeakControl": np.asarray(np.max(np.abs(control[:, kept]), axis=1))}
-    if only is None or "ControlRate" in only:
-        found["ControlRate"] = _rate(t[kept], control[:, kept], sample_time)
+    require(control.shape[-1:] == t.shape, f"t and control differ in shape: {t.shape} and {control.shape[-1:]}")
+    first = _since(t, start)
+    found = {"PeakControl": np.asarray(np.max(np.abs(control[:, first:]), axis=1))}
+    if _asked(only, "ControlRate"):
+        found["ControlRate"] = _rate(t[first:], control[:, first:], sample_time)
     return found
 
 

@@ -1,7 +1,6 @@
 """PID with filtered derivative, set-point weights, saturation and back-calculation; continuous or sampled.
 
-The parallel form is what runs, ``Tf`` its derivative filter's time constant [s]. Two things are called N elsewhere: in
-the ISA standard form N is a ratio, ``Tf = Td/N``; in Simulink's block N is a pole [rad/s], ``Tf = 1/N``.
+The parallel form is what runs, whatever form its gains are given in (`forms`).
 """
 
 import re
@@ -11,6 +10,7 @@ from math import inf
 
 import casadi as ca
 
+from pneuopt.control.forms import NO_N, NO_TI, Form, parallel_gains
 from pneuopt.errors import UnitError, require
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
 
@@ -19,19 +19,24 @@ Symbols = Mapping[str, ca.SX]
 
 @dataclass(frozen=True)
 class PID:
-    """A PID controller in parallel form.
+    """A PID controller; the law in parallel gains, which `form` turns its own into.
 
     ``v = Kp (b r - y) + I + D``, ``D = Kd s/(Tf s + 1) (c r - y)``, ``dI/dt = Ki (r - y) + (u - w)/Tt``, where
-    ``w = v + dither`` and ``u = min(max(w, lower), upper)``: a hard clip, because that is what runs. The integral is
-    kept in the unit of the command, so that ``Ki = 0`` needs no special case.
+    ``w = v + added`` (feedforward and dither) and ``u = min(max(w, lower), upper)``: a hard clip, because that is what
+    runs. The integral is kept in the unit of the command, so that ``Ki = 0`` needs no special case.
 
     A sampled controller computes once a sample, h = `sample_time`, and holds u until the next one (backward Euler,
     PHYSICS section 5); the suffix _ marks the previous sample::
 
         D = Tf/(Tf + h) D_ + Kd/(Tf + h) ((c r - y) - (c r - y)_)
         I = I_ + Ki h (r - y)
-        w = Kp (b r - y) + I + D + dither,  u = min(max(w, lower), upper)
+        w = Kp (b r - y) + I + D + added,  u = min(max(w, lower), upper)
         I = I + h/Tt (u - w)
+
+    With a dead band, what is integrated is ``e - min(max(e, -dead_band), dead_band)`` instead of e = r - y: nothing
+    while |e| < dead_band, and beyond it what exceeds it, so that nothing jumps at its edge. That is against windup by
+    stiction: a piston that sticks within the band is left there, instead of being pushed off by a growing integral,
+    over and over. Back-calculation goes on inside the band: a clipped command still unwinds the integral.
 
     Parameters
     ----------
@@ -39,17 +44,38 @@ class PID:
         h [s]; None is a continuous controller.
     limits : bool
         Whether the command saturates; without limits there are no parameters lower, upper and Tt.
+    form : Form
+        Which gains are the parameters: Kp, Ki, Kd, Tf; of the ISA standard form Kp, Ti, Td, N; of the series form K,
+        Ti, Td, Tf. Weights, limits and the rest are the same in all.
+    delay : int
+        Samples, 0 or 1, from computing a command to its acting: with 1 the actuator gets at a sample what was computed
+        at the one before.
+    dead_band : bool
+        Whether the integral has one; its half width is the parameter dead_band [measured unit].
+
+    Raises
+    ------
+    InputError
+        If an option is out of range, or a continuous controller has a delay.
     """
 
     sample_time: float | None = None
     limits: bool = True
+    form: Form = Form.PARALLEL
+    delay: int = 0
+    dead_band: bool = False
 
     def __post_init__(self) -> None:
-        h = self.sample_time
+        h, delay = self.sample_time, self.delay
         require(h is None or 0 < h < inf, f"PID: sample_time must be positive, got {h} s; None is continuous")
+        told = f"PID: delay is 0 or 1, whole samples, got {delay}; a longer one belongs to the plant (pade_order=)"
+        require(delay in (0, 1), told)
+        require(not delay or h is not None, "PID: a delay of 1 sample needs a sample_time; without one, leave it out")
+        names = ", ".join(f"Form.{f.name}" for f in Form)
+        require(isinstance(self.form, Form), f"PID: form is one of {names}, got {self.form!r}")
 
     def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
-        """Defaults: ``Kp = 1``, no I, no D, ``Tf = 10 ms``, ``b = c = 1``, no limit.
+        """Defaults: a gain of 1, no I, no D, ``Tf = 10 ms`` or ``N = 10``, ``b = c = 1``, no limit, no dead band.
 
         Parameters
         ----------
@@ -59,23 +85,31 @@ class PID:
         Returns
         -------
         ParameterSet
-            Kp, Ki, Kd, Tf [s], b, c [1], and with limits Tt [s], lower and upper [output_unit].
+            The form's gains, b, c [1], with a dead band dead_band [input_unit], and with limits Tt [s], lower and upper
+            [output_unit].
 
         Examples
         --------
         >>> [p.unit for p in PID(limits=False).parameters("m/s", "V").values()]
         ['V*s/m', 'V/m', 'V*s^2/m', 's', '1', '1']
+        >>> list(PID(limits=False, form=Form.STANDARD).parameters("m/s", "V"))
+        ['Kp', 'Ti', 'Td', 'N', 'b', 'c']
         """
-        h = self.sample_time or 0.0
+        h, gain = self.sample_time or 0.0, ratio(output_unit, input_unit)
         shortest = h or 1e-6
-        core = {
-            "Kp": Parameter(1.0, ratio(output_unit, input_unit)),
+        known = {
+            "Kp": Parameter(1.0, gain),
+            "K": Parameter(1.0, gain),
             "Ki": Parameter(0.0, ratio(output_unit, f"{_difference(input_unit)}*s")),
             "Kd": Parameter(0.0, ratio(f"{_difference(output_unit)}*s", input_unit)),
             "Tf": Parameter(0.01, "s", lower=0.0 if h else shortest),
-            "b": Parameter(1.0, "1", lower=0.0),
-            "c": Parameter(1.0, "1", lower=0.0),
+            "Ti": Parameter(inf, "s", lower=0.0),
+            "Td": Parameter(0.0, "s", lower=0.0),
+            "N": Parameter(10.0, "1", lower=0.0),
         }
+        core = {n: known[n] for n in self.form.gains}
+        core |= {n: Parameter(1.0, "1", lower=0.0) for n in ("b", "c")}
+        core |= {"dead_band": Parameter(0.0, _difference(input_unit), lower=0.0)} if self.dead_band else {}
         saturation = {
             "Tt": Parameter(max(0.1, 10 * h), "s", lower=shortest),
             "lower": Parameter(-inf, output_unit),
@@ -83,27 +117,73 @@ class PID:
         }
         return ParameterSet(core | saturation if self.limits else core)
 
+    @property
+    def positive(self) -> tuple[str, ...]:
+        """Parameters that a search must keep above zero: what is divided by."""
+        needed = {"Ti", "N"} | (set() if self.sample_time else {"Td"} if self.form is Form.STANDARD else set())
+        return tuple(n for n in self.form.gains if n in needed)
+
+    def check(self, p: Mapping[str, float], unit: str) -> None:
+        """Refuse values that no controller can run with: `InputError` names the parameter.
+
+        Parameters
+        ----------
+        p : mapping of str to float
+            Its parameters and, of the parallel form, "Tf".
+        unit : str
+            The command's.
+        """
+        h = self.sample_time
+        require(p.get("Ti", inf) != 0, f"pid.{NO_TI}")
+        require(p.get("N", inf) != 0, f"pid.{NO_N}")
+        filtered = "pid.N = inf" if self.form is Form.STANDARD else f"pid.Tf = {p['Tf']:g} s"
+        require(p["Tf"] > 0 or h is not None, f"{filtered}: a continuous derivative needs a filter, Tf > 0")
+        band = p.get("dead_band", 0.0)
+        require(band >= 0, f"pid.dead_band must not be negative, got {band:g}; 0 is none")
+        if self.limits:
+            require(p["lower"] < p["upper"], f"pid.lower {p['lower']:g} is not below pid.upper {p['upper']:g} {unit}")
+            Tt, least = p["Tt"], h or 0.0
+            told = f"anti-windup needs Tt > 0, and with sampling at least one sample ({least:g} s)"
+            require(Tt > 0 and Tt >= least, f"pid.Tt = {Tt:g} s: {told}")
+
     def states(self, measured: Quantity, command: Quantity) -> tuple[Quantity, ...]:
-        """What the controller remembers: integral and filter, or with sampling also what it holds."""
+        """What the controller remembers: integral and filter, or with sampling also what it holds, and has computed."""
         integral = Quantity("integral", command.unit, command.nominal)
         if self.sample_time is None:
             return integral, Quantity("filter", measured.unit, measured.nominal)
+        pending = Quantity("pending", command.unit, command.nominal)
         return (
             integral,
             Quantity("derivative", command.unit, command.nominal),
             Quantity("previous_error", measured.unit, measured.nominal),
             Quantity("command", command.unit, command.nominal),
+            *(pending for _ in range(self.delay)),
         )
 
-    def rates(self, x: Symbols, r: ca.SX, y: ca.SX, dither: ca.SX, p: Symbols) -> tuple[dict[str, ca.SX], ca.SX]:
+    def start(self, r: float, y: float, command: float, p: Mapping[str, float]) -> list[float]:
+        """The states with which it takes over a command without a bump.
+
+        Parameters
+        ----------
+        r, y, command : float
+            So far [input unit], [output unit].
+        p : mapping of str to float
+            Kp of the parallel form, b and c.
+        """
+        integral, error = command - p["Kp"] * (p["b"] * r - y), p["c"] * r - y
+        if self.sample_time is None:
+            return [integral, error]
+        return [integral, 0.0, error, *[command] * (1 + self.delay)]
+
+    def rates(self, x: Symbols, r: ca.SX, y: ca.SX, added: ca.SX, p: Symbols) -> tuple[dict[str, ca.SX], ca.SX]:
         """The continuous law.
 
         Parameters
         ----------
         x, p : mapping of str to casadi.SX
             States ("integral", "filter") and parameters.
-        r, y, dither : casadi.SX
-            Reference and measured signal [input unit], dither [output unit].
+        r, y, added : casadi.SX
+            Reference and measured signal [input unit]; what feedforward and dither add [output unit].
 
         Returns
         -------
@@ -112,109 +192,37 @@ class PID:
         u : casadi.SX
             What the actuator gets [output unit].
         """
+        Kp, Ki, Kd, Tf = parallel_gains(self.form, p)
         error = p["c"] * r - y
-        v = p["Kp"] * (p["b"] * r - y) + x["integral"] + p["Kd"] / p["Tf"] * (error - x["filter"])
-        u = self.clip(v + dither, p)
-        windup = (u - v - dither) / p["Tt"] if self.limits else 0.0
-        return {"integral": p["Ki"] * (r - y) + windup, "filter": (error - x["filter"]) / p["Tf"]}, u
+        v = Kp * (p["b"] * r - y) + x["integral"] + Kd / Tf * (error - x["filter"])
+        u = self.clip(v + added, p)
+        windup = (u - v - added) / p["Tt"] if self.limits else 0.0
+        return {"integral": Ki * self._integrated(r - y, p) + windup, "filter": (error - x["filter"]) / Tf}, u
 
-    def update(self, x: Symbols, r: ca.SX, y: ca.SX, dither: ca.SX, p: Symbols) -> dict[str, ca.SX]:
+    def update(self, x: Symbols, r: ca.SX, y: ca.SX, added: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The sampled law at a sample: the next value of each state, "command" being what is held.
 
-        Parameters as for `rates`; the states are "integral", "derivative", "previous_error" and "command".
+        Parameters as for `rates`; the states are "integral", "derivative", "previous_error", "command", and with a
+        delay "pending", the command that the next sample holds.
         """
-        h = self.sample_time or 0.0
+        h, (Kp, Ki, Kd, Tf) = self.sample_time or 0.0, parallel_gains(self.form, p)
         error = p["c"] * r - y
-        derivative = (p["Tf"] * x["derivative"] + p["Kd"] * (error - x["previous_error"])) / (p["Tf"] + h)
-        integral = x["integral"] + p["Ki"] * h * (r - y)
-        w = p["Kp"] * (p["b"] * r - y) + integral + derivative + dither
+        derivative = (Tf * x["derivative"] + Kd * (error - x["previous_error"])) / (Tf + h)
+        integral = x["integral"] + Ki * h * self._integrated(r - y, p)
+        w = Kp * (p["b"] * r - y) + integral + derivative + added
         u = self.clip(w, p)
         windup = h / p["Tt"] * (u - w) if self.limits else 0.0
-        return {"integral": integral + windup, "derivative": derivative, "previous_error": error, "command": u}
+        sent = {"command": x["pending"], "pending": u} if self.delay else {"command": u}
+        return {"integral": integral + windup, "derivative": derivative, "previous_error": error, **sent}
 
     def clip(self, w: ca.SX, p: Symbols) -> ca.SX:
         """The saturated command: hard, as in a real controller; exact derivatives on either side of the corner."""
         return ca.fmin(ca.fmax(w, p["lower"]), p["upper"]) if self.limits else w
 
-
-@dataclass(frozen=True)
-class StandardForm:
-    """ISA standard form ``Kp ((b r - y) + e/(Ti s) + Td s/(1 + s Td/N) (c r - y))``.
-
-    Parameters
-    ----------
-    Kp : float
-        Gain [command/measured].
-    Ti : float
-        Integral time [s]; inf is no integral action.
-    Td : float
-        Derivative time [s].
-    N : float
-        Derivative filter as the ISA ratio ``Tf = Td/N``, not Simulink's pole; inf is no filter.
-    """
-
-    Kp: float
-    Ti: float = inf
-    Td: float = 0.0
-    N: float = 10.0
-
-
-@dataclass(frozen=True)
-class ParallelForm:
-    """Parallel form ``Kp (b r - y) + Ki e/s + Kd s/(Tf s + 1) (c r - y)``; Simulink's pole N is ``1/Tf``.
-
-    Parameters
-    ----------
-    Kp, Ki, Kd : float
-        Gains [command/measured], [command/(measured s)], [command s/measured].
-    Tf : float
-        Time constant of the derivative's filter [s].
-    """
-
-    Kp: float
-    Ki: float = 0.0
-    Kd: float = 0.0
-    Tf: float = 0.0
-
-
-def to_standard(gains: ParallelForm) -> StandardForm:
-    """Convert parallel gains: ``Ti = Kp/Ki``, ``Td = Kd/Kp``, ``N = Td/Tf`` (the ISA ratio, not Simulink's pole).
-
-    Raises
-    ------
-    InputError
-        If ``Kp = 0`` while Ki or Kd is not: the standard form cannot express it.
-
-    Examples
-    --------
-    >>> to_standard(ParallelForm(Kp=2.0, Ki=4.0, Kd=0.5, Tf=0.025))
-    StandardForm(Kp=2.0, Ti=0.5, Td=0.25, N=10.0)
-    """
-    Kp, Ki, Kd, Tf = gains.Kp, gains.Ki, gains.Kd, gains.Tf
-    require(Kp != 0 or Ki == Kd == 0, f"the standard form needs Kp != 0; here Kp = 0, Ki = {Ki:g}, Kd = {Kd:g}")
-    Td = Kd / Kp if Kp else 0.0
-    return StandardForm(Kp, Kp / Ki if Ki else inf, Td, Td / Tf if Tf else inf)
-
-
-def to_parallel(gains: StandardForm) -> ParallelForm:
-    """Convert ISA standard gains: ``Ki = Kp/Ti``, ``Kd = Kp Td``, ``Tf = Td/N`` (the ISA ratio, not Simulink's pole).
-
-    Raises
-    ------
-    InputError
-        If ``Ti = 0`` or ``N = 0``.
-
-    Examples
-    --------
-    >>> to_parallel(StandardForm(Kp=2.0, Ti=0.5, Td=0.25, N=10.0))
-    ParallelForm(Kp=2.0, Ki=4.0, Kd=0.5, Tf=0.025)
-    """
-    require(gains.Ti != 0, "Ti = 0 would be an infinite integral gain; no integral action is Ti = inf")
-    require(
-        gains.N != 0 or gains.Td == 0,
-        "N = 0 would switch the derivative off; the ISA ratio N is 5 to 20, inf unfiltered",
-    )
-    return ParallelForm(gains.Kp, gains.Kp / gains.Ti, gains.Kp * gains.Td, gains.Td / gains.N if gains.Td else 0.0)
+    def _integrated(self, error: ca.SX, p: Symbols) -> ca.SX:
+        if not self.dead_band:
+            return error
+        return error - ca.fmin(ca.fmax(error, -p["dead_band"]), p["dead_band"])
 
 
 def ratio(numerator: str, denominator: str) -> str:

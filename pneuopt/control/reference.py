@@ -1,8 +1,8 @@
-"""References that a loop shall follow."""
+"""References that a loop shall follow, and disturbances against which it shall hold them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 
@@ -12,12 +12,15 @@ from pneuopt.trajectories import Trajectory
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the reference.
+    """A step of the reference, of a disturbance, or of both at one instant.
+
+    What a disturbance alone shows is measured as of a step: Overshoot is the largest deviation, either side, and
+    SettlingTime the time until the signal is back in the band, each for what `whole` is.
 
     Parameters
     ----------
     size : float
-        Height, either sign [unit of the measured signal].
+        Height, either sign [unit of the measured signal]; 0 where only a disturbance steps.
     at : float
         Instant [s].
     initial : float
@@ -27,6 +30,11 @@ class Step:
     start : mapping of str to float
         What else is known of the plant at time 0, by output: {"position": 0.25} [SI]. A `PneumaticDrive` also takes
         "pressure_b", as in its `rest`.
+    disturbance : mapping of str to float
+        By how much a parameter or an input of the plant changes at that instant: {"load.force": 50.0} [its unit]; of
+        the input that the controller drives, by how much it is off.
+    scale : float, optional
+        For a disturbance alone: what fractions are of [unit of the measured signal]; by default `initial`.
     """
 
     size: float
@@ -34,13 +42,24 @@ class Step:
     initial: float = 0.0
     horizon: float = 1.0
     start: Mapping[str, float] = field(default_factory=dict, hash=False)
+    disturbance: Mapping[str, float] = field(default_factory=dict, hash=False)
+    scale: float | None = None
 
     def __post_init__(self) -> None:
         values = {"size": self.size, "at": self.at, "initial": self.initial, "horizon": self.horizon}
         values |= {f"start[{n!r}]": value for n, value in self.start.items()}
+        values |= {f"disturbance[{n!r}]": value for n, value in self.disturbance.items()}
         for name, value in values.items():
             require(isfinite(value), f"Step: {name} must be a finite number, got {value}")
-        require(self.size != 0, "Step: size must not be zero, there would be nothing to follow")
+        for name, value in self.disturbance.items():
+            require(value != 0, f"Step: disturbance[{name!r}] must not be zero, nothing would change; leave it out")
+        told = "Step: size must not be zero, there would be nothing to follow; for a disturbance alone name it"
+        require(self.size != 0 or bool(self.disturbance), f"{told}, disturbance={{'load.force': 50.0}}")
+        alone, given = self.size == 0, self.scale is not None
+        require(alone or not given, "Step: scale is for a disturbance alone; fractions of a step are of its size")
+        told = "Step: a disturbance of a loop that holds 0 needs a scale, of which its deviations are fractions"
+        require(not alone or given or self.initial != 0, f"{told}, scale=0.1 say")
+        require(not given or 0 < (self.scale or 0) < inf, f"Step: scale must be positive, got {self.scale}")
         require(self.at >= 0, f"Step: at must not be negative, got {self.at:g} s; time starts at zero")
         require(self.horizon > self.at, f"Step: horizon {self.horizon:g} s must lie after the step at {self.at:g} s")
 
@@ -50,6 +69,16 @@ class Step:
         return self.initial + self.size
 
     @property
+    def is_step(self) -> bool:
+        """Whether the reference itself steps."""
+        return self.size != 0
+
+    @property
+    def whole(self) -> float:
+        """What fractions are of: the step's size, with its sign, or what stands for it [unit of the measured signal]."""
+        return self.size or self.scale or abs(self.initial)
+
+    @property
     def label(self) -> str:
         """How a table heads it.
 
@@ -57,11 +86,17 @@ class Step:
         --------
         >>> Step(-0.2, start={"position": 0.25}).label
         '0 to -0.2, position 0.25'
+        >>> Step(0.0, initial=0.2, disturbance={"load.force": 50.0}).label
+        '0.2 held, load.force +50'
         """
-        return ", ".join([f"{self.initial:g} to {self.final:g}", *(f"{n} {v:g}" for n, v in self.start.items())])
+        lead = f"{self.initial:g} to {self.final:g}" if self.is_step else f"{self.initial:g} held"
+        told = [f"{n} {v:g}" for n, v in self.start.items()] + [f"{n} {v:+g}" for n, v in self.disturbance.items()]
+        return ", ".join([lead, *told])
 
     def trajectory(self, step: float) -> Trajectory:
         """The column "reference" on the grid 0, step, 2 step, ... to the horizon, held from sample to sample.
+
+        Each disturbance is a column, too, by its name in `disturbed`.
 
         Parameters
         ----------
@@ -89,4 +124,11 @@ class Step:
             f"Step: at = {self.at:g} s falls between two samples of {step:g} s; use {first * step:g} s",
         )
         k = np.arange(int(np.ceil(self.horizon / step - 1e-9)) + 1)
-        return Trajectory(k * step, {"reference": np.where(k >= first, self.final, self.initial)})
+        columns = {"reference": np.where(k >= first, self.final, self.initial)}
+        columns |= {disturbing(n): np.where(k >= first, v, 0.0) for n, v in self.disturbance.items()}
+        return Trajectory(k * step, columns)
+
+
+def disturbing(name: str) -> str:
+    """The loop's input by which a parameter or input of the plant is disturbed."""
+    return f"disturbance.{name}"

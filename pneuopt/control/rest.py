@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.control.wiring import wired
 from pneuopt.errors import ConvergenceError, require
 from pneuopt.parameters import ParameterSet, Quantity
 from pneuopt.system import DIRECTION, Symbols, System, define, names, vector
@@ -80,29 +81,19 @@ def drifting(plant: System, measured: str) -> tuple[str, ...]:
     return tuple(n for n, counts in zip(names(plant.states), matters, strict=True) if not counts)
 
 
-def wired(
-    plant: System, actuated: str, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX
-) -> tuple[Signals, Signals]:
-    """Rates and outputs of the plant under a command."""
-    driven = {**u, actuated: command}
-    xs, us = (ca.vertcat(*(v[n] for n in names(q))) for v, q in ((x, plant.states), (driven, plant.inputs)))
-    xdot, y = plant.ode(t, xs, us, ca.vertcat(*(p[n] for n in plant.parameters)))
-    states, outputs = names(plant.states), names(plant.outputs)
-    return {n: xdot[k] for k, n in enumerate(states)}, {n: y[k] for k, n in enumerate(outputs)}
-
-
 def _resting(loop: "ClosedLoop", free: tuple[str, ...], parameters: ParameterSet) -> System:
     """The loop with the integral as its controller's only state, and without the plant's free ones."""
-    plant, Ki = loop.plant, (loop.parameters | parameters).value("pid.Ki")
-    integral = [Quantity(INTEGRAL, loop.command.unit, loop.command.nominal)] if Ki else []
+    plant, acts = loop.plant, bool(loop.parallel(parameters).Ki)
+    integral = [Quantity(INTEGRAL, loop.command.unit, loop.command.nominal)] if acts else []
     states = [*(q for q in plant.states if q.name not in free), *integral]
 
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
         y = wired(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1][loop.feedback.name]
-        command = p["pid.Kp"] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL, 0.0)
+        gains = loop.gains(ca.vertcat(*p.values()))
+        command = gains[0] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL, 0.0)
         rates, outputs = wired(plant, loop.command.name, t, moving, u, p, command)
-        rates |= {INTEGRAL: p["pid.Ki"] * (u["reference"] - y)}
+        rates |= {INTEGRAL: gains[1] * (u["reference"] - y)}
         return {n: rates[n] for n in x}, outputs | {"control": command}
 
     return define(states, loop.inputs, loop.outputs, loop.parameters, rhs)

@@ -1,19 +1,49 @@
 """What stands between the measured signal and the controller."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from math import inf
+from typing import Any
 
-from pneuopt.errors import require
-from pneuopt.parameters import Parameter, ParameterSet
+import casadi as ca
 
+from pneuopt.control.pid import ratio
+from pneuopt.errors import ModelError, check_known, require
+from pneuopt.parameters import Parameter, ParameterSet, Quantity
+
+Symbols = Mapping[str, ca.SX]
 SHORTEST = 1e-6  # [s]
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """What a sensor is put on.
+
+    Parameters
+    ----------
+    measured : Quantity
+        The plant's output that the controller wants.
+    outputs : mapping of str to Quantity
+        All of the plant's.
+    sample_time : float, optional
+        The controller's [s].
+    """
+
+    measured: Quantity
+    outputs: Mapping[str, Quantity]
+    sample_time: float | None
+
+    @property
+    def h(self) -> float:
+        """The sample time [s], 0 of a continuous controller."""
+        return self.sample_time or 0.0
 
 
 @dataclass(frozen=True)
 class SensorLag:
     """A sensor of first order: ``d(reading)/dt = (signal - reading)/lag``; the controller sees the reading.
 
-    A speed that an encoder's counts are differentiated to lags by the filter's time constant and half a sample.
+    What an `Encoder` shows of a speed, without its steps: take its filter time and half a sample.
 
     Parameters
     ----------
@@ -29,6 +59,117 @@ class SensorLag:
             f"SensorLag: lag must be at least {SHORTEST:g} s, got {self.lag:g} s; without a lag leave the sensor out",
         )
 
-    def parameters(self) -> ParameterSet:
+    def check(self, _on: Feedback) -> None:
+        """It fits any signal."""
+
+    def parameters(self, _on: Feedback) -> ParameterSet:
         """The lag [s]."""
         return ParameterSet({"lag": Parameter(self.lag, "s", lower=SHORTEST)})
+
+    def states(self, on: Feedback) -> tuple[Quantity, ...]:
+        """The reading."""
+        return (replace(on.measured, name="reading"),)
+
+    def start(self, y: Mapping[str, float], on: Feedback, _p: Mapping[str, float]) -> list[float]:
+        """The reading is the truth."""
+        return [y[on.measured.name]]
+
+    def rates(self, x: Symbols, y: Symbols, on: Feedback, p: Symbols) -> dict[str, ca.SX]:
+        """Time derivatives of the states; y are the plant's outputs."""
+        return {"reading": (y[on.measured.name] - x["reading"]) / p["lag"]}
+
+    def update(self, x: Symbols, _y: Symbols, _on: Feedback, _p: Symbols) -> dict[str, ca.SX]:
+        """The states after a sample: as before."""
+        return dict(x)
+
+    def time_constant(self, _on: Feedback, p: Mapping[str, Any]) -> Any:
+        """Of the loop linearised [s]."""
+        return p["lag"]
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A position in whole counts, read once a sample; of it a speed is the difference, then a first-order low-pass.
+
+    ``q = resolution floor(position/resolution + 1/2)``, and where the controller wants the speed, h its sample time and
+    the suffix _ the sample before::
+
+        reading = reading_ + h/(h + filter) ((q - q_)/h - reading_)
+
+    A controller of the position gets q itself. One count is a speed of resolution/h, 10 mm/s for 10 um at 1 ms, which
+    the filter divides by ``1 + filter/h``; it begins with the true speed. The loop linearised about the moving
+    reference, whose margins count, has a lag of filter + h/2, half a sample being the difference's; the steps, which
+    are noise there, it has not.
+
+    Parameters
+    ----------
+    resolution : float
+        Default of the parameter "sensor.resolution" [the position's unit]; 0: a position without steps, no parameter.
+    filter : float
+        Default of the parameter "sensor.filter", the low-pass's time constant [s]; 0 is none.
+    position : str
+        The output that it counts.
+    """
+
+    resolution: float = 0.0
+    filter: float = 5e-3
+    position: str = "position"
+
+    def __post_init__(self) -> None:
+        for name, unit in (("resolution", ""), ("filter", " s")):
+            value = getattr(self, name)
+            require(0 <= value < inf, f"Encoder: {name} must not be negative, got {value:g}{unit}; 0 is none")
+
+    def check(self, on: Feedback) -> None:
+        """Refuse a continuous controller, a plant without a position, and what no difference of it gives."""
+        told = "an Encoder is read once a sample: give the PID a sample_time, or take SensorLag(filter + half a sample)"
+        require(on.sample_time is not None, told, ModelError)
+        check_known("output", [self.position], on.outputs, "Encoder: position")
+        unit, measured = on.outputs[self.position].unit, on.measured
+        require(
+            not self.differentiates(on) or ratio(unit, "s") == ratio(measured.unit, "1"),
+            f"Encoder: the difference of {self.position!r} [{unit}] is not {measured.name!r} [{measured.unit}]",
+            ModelError,
+        )
+
+    def differentiates(self, on: Feedback) -> bool:
+        """Whether the controller wants the speed, and not the position itself."""
+        return on.measured.name != self.position
+
+    def parameters(self, on: Feedback) -> ParameterSet:
+        """The filter's time constant [s] where there is a speed, and the resolution [the position's unit]."""
+        found = {"filter": Parameter(self.filter, "s", lower=0.0)} if self.differentiates(on) else {}
+        if self.resolution:
+            unit = on.outputs[self.position].unit
+            found["resolution"] = Parameter(self.resolution, unit, lower=1e-9 * self.resolution)
+        return ParameterSet(found)
+
+    def states(self, on: Feedback) -> tuple[Quantity, ...]:
+        """The reading, and for a speed the count before."""
+        reading = replace(on.measured, name="reading")
+        return (reading, replace(on.outputs[self.position], name="count"))[: 1 + self.differentiates(on)]
+
+    def start(self, y: Mapping[str, float], on: Feedback, p: Mapping[str, float]) -> list[float]:
+        """The speed is the truth, and the count before fits it."""
+        now = float(self._counted(y[self.position], p))
+        speed = y[on.measured.name]
+        return [speed, now - on.h * speed] if self.differentiates(on) else [now]
+
+    def rates(self, x: Symbols, _y: Symbols, _on: Feedback, _p: Symbols) -> dict[str, ca.SX]:
+        """Nothing moves between two samples."""
+        return {n: ca.SX(0) for n in x}
+
+    def update(self, x: Symbols, y: Symbols, on: Feedback, p: Symbols) -> dict[str, ca.SX]:
+        """The states after a sample; y are the plant's outputs."""
+        now = self._counted(y[self.position], p)
+        if not self.differentiates(on):
+            return {"reading": now}
+        step = on.h / (on.h + p["filter"]) * ((now - x["count"]) / on.h - x["reading"])
+        return {"reading": x["reading"] + step, "count": now}
+
+    def time_constant(self, on: Feedback, p: Mapping[str, Any]) -> Any:
+        """Of the loop linearised [s]; half a sample of it is the difference's."""
+        return p["filter"] + 0.5 * on.h if self.differentiates(on) else 0.0
+
+    def _counted(self, position: Any, p: Mapping[str, Any]) -> Any:
+        return p["resolution"] * ca.floor(position / p["resolution"] + 0.5) if self.resolution else position

@@ -22,9 +22,9 @@ from pneuopt.models.load import Load
 from pneuopt.models.pneumatic_rest import BALANCED, Glide, steady
 from pneuopt.models.pneumatic_start import PneumaticStarts
 from pneuopt.models.pressure_zero import PressureZeros
-from pneuopt.models.valve import Port, ProportionalValve
+from pneuopt.models.valve import Flows, Port, ProportionalValve
 from pneuopt.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import System, define, names, stacked, vector
+from pneuopt.system import System, define, names, stacked, symbols, vector
 from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -178,7 +178,8 @@ class PneumaticDrive:
         starts = PneumaticStarts(self.system, _push)
         system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._rest_for_loop)
         doubts = partial(_doubts, PressureZeros(starts.runs))
-        return replace(system, checker=self.check, guards=guards(self.cylinder.stops), doubter=doubts)
+        known = replace(system, checker=self.check, guards=guards(self.cylinder.stops), doubter=doubts)
+        return replace(known, meter=self._meter())
 
     def _rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG002 - no time in it
         y, v, a, b = (x[n] for n in ("position", "speed", "pressure_a", "pressure_b"))
@@ -194,11 +195,8 @@ class PneumaticDrive:
     def _air(self, x: Symbols, u: Symbols, p: Symbols) -> dict[str, ca.SX]:
         """Rates of the chambers' states."""
         outside, R = p["ambient.temperature"], p["gas.constant"]
-        inside = {side: {q.name: x[f"{q.name}_{side}"] for q in self.chamber.states} for side in SIDES}
-        ports = {side: Port(z["pressure"], self.chamber.temperature(z, outside)) for side, z in inside.items()}
-        spool = self.valve.position(u["valve_voltage"], part(x, "valve"), part(p, "valve"))
-        supply, exhaust = Port(p["supply.pressure"], outside), Port(p["ambient.pressure"], outside)
-        through = self.valve.flows(spool, supply, exhaust, ports["a"], ports["b"], part(p, "valve"))
+        inside, ports = self._inside(x, p)
+        through = self._through(x, u, p)
         leak = piston_leak(x["pressure_a"], x["pressure_b"], p["cylinder.leak"])
         flows = {
             "a": [(through.supply_a, outside), (-through.a_exhaust, outside), (leak, ports["b"].temperature)],
@@ -211,6 +209,28 @@ class PneumaticDrive:
             own = self.chamber.rates(inside[side], [Inflow(*flow) for flow in flows[side]], around, part(p, "chamber"))
             rates |= {f"{name}_{side}": rate for name, rate in own.items()}
         return rates
+
+    def _inside(self, x: Symbols, p: Symbols) -> tuple[dict[str, dict[str, ca.SX]], dict[str, Port]]:
+        """The chambers' states, and how the valve sees them, by side."""
+        inside = {side: {q.name: x[f"{q.name}_{side}"] for q in self.chamber.states} for side in SIDES}
+        outside = p["ambient.temperature"]
+        return inside, {side: Port(z["pressure"], self.chamber.temperature(z, outside)) for side, z in inside.items()}
+
+    def _through(self, x: Symbols, u: Symbols, p: Symbols) -> Flows:
+        """Mass flows through the valve's edges."""
+        outside, ports = p["ambient.temperature"], self._inside(x, p)[1]
+        supply, exhaust = Port(p["supply.pressure"], outside), Port(p["ambient.pressure"], outside)
+        return self.valve.flows(self._spool(x, u, p), supply, exhaust, ports["a"], ports["b"], part(p, "valve"))
+
+    def _spool(self, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
+        return self.valve.position(u["valve_voltage"], part(x, "valve"), part(p, "valve"))
+
+    def _meter(self) -> ca.Function:
+        """``(t, x, u, p)`` to the air that both edges draw from the supply [kg/s], and the spool's position."""
+        x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
+        through = self._through(x, u, p)
+        drawn = [through.supply_a + through.supply_b, self._spool(x, u, p)]
+        return ca.Function("meter", [ca.SX.sym("t"), *map(stacked, (x, u, p))], drawn)
 
     @cached_property
     def _glide(self) -> ca.Function:

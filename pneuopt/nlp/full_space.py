@@ -1,12 +1,12 @@
 """Full-space multiple shooting with IPOPT: every node's state is an unknown, derivatives are exact. The reference path.
 
-`prepare` makes the graph and its derivatives once; `solve_from` solves it from any start.
+`prepare` makes the graph and its derivatives once; `solve_from` solves it from any start, `follow` along a path.
 """
 
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -23,6 +23,8 @@ from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 EXPANDED = 200_000  # scalar operations up to which flattening the whole graph to scalars pays
+NEAR = 1e-6  # barrier and distances from bounds with which a solution's neighbour is begun: 4 iterations for 18
+_PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,11 @@ class FullSpace:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A graph and the solver made from it."""
+    """A graph and the solver made from it; another that starts from a neighbour's solution, where it was asked for."""
 
     graph: Graph
     solver: ca.Function
+    warm: ca.Function | None = None
 
 
 def solve_full_space(transcription: Transcription, method: FullSpace | None = None) -> Solution:
@@ -81,26 +84,33 @@ def solve_full_space(transcription: Transcription, method: FullSpace | None = No
     return solve_from(prepare(transcription, method), transcription.parameters)
 
 
-def prepare(transcription: Transcription, method: FullSpace | None = None) -> Problem:
-    """Flatten a problem and differentiate it, once for any number of starts."""
+def prepare(transcription: Transcription, method: FullSpace | None = None, *, follows: bool = False) -> Problem:
+    """Flatten a problem and differentiate it, once for any number of starts; `follows`: for `follow`, too."""
     graph, method = flatten(transcription), method or FullSpace()
+    cold = _solver(graph, method, {"mu_init": method.first_barrier})
+    pushes = {f"warm_start_{n}": NEAR for n in _PUSHES}
+    near = {"mu_init": NEAR, "warm_start_init_point": "yes", **pushes}
+    return Problem(graph, cold, _solver(graph, method, near) if follows else None)
+
+
+def _solver(graph: Graph, method: FullSpace, own: Mapping[str, Any]) -> ca.Function:
     ipopt = {
         "print_level": 5 if method.verbose else 0,
         "sb": "yes",
         "max_iter": method.max_iterations,
         "tol": method.tolerance,
-        "mu_init": method.first_barrier,
         "acceptable_iter": 0,
         "max_wall_time": method.max_seconds,
+        **own,
     }
     nlp: Any = {"x": graph.w, "p": graph.q, "f": ca.sum1(graph.parts), "g": graph.g}
     options: Any = {
         "print_time": False,
         "show_eval_warnings": False,
-        "expand": _operations(transcription) <= EXPANDED,
+        "expand": _operations(graph.transcription) <= EXPANDED,
         "ipopt": ipopt,
     }
-    return Problem(graph, ca.nlpsol("full_space", "ipopt", nlp, options))
+    return ca.nlpsol("full_space", "ipopt", nlp, options)
 
 
 def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | None] = ()) -> Solution:
@@ -118,7 +128,7 @@ def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | 
     -------
     Solution
     """
-    transcription, begun = problem.graph.transcription, time.perf_counter()
+    transcription = problem.graph.transcription
     require(tuple(start) == tuple(transcription.parameters), "the start's names are not the problem's", ModelError)
     q = np.array([p.value for p in start.values()])
     low, up = variable_bounds(transcription)
@@ -127,10 +137,52 @@ def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | 
     fault = _find_nan(problem, w, q)
     if fault:
         return _solution(problem, w, q, Status(Code.DIVERGED, f"at the start {fault}; start elsewhere"), {}, {})
+    return _solved(problem, w, q)[0]
+
+
+def follow(problem: Problem, start: ParameterSet, path: Sequence[Mapping[str, float]]) -> list[Solution]:
+    """Solve along a path of fixed parameters, each problem from its neighbour's solution and multipliers.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of ``prepare(..., follows=True)``.
+    start : ParameterSet
+        From which the first of them is solved; names as in the problem.
+    path : sequence of mapping of str to float
+        Values of fixed parameters.
+
+    Returns
+    -------
+    list of Solution
+        One a step; a step that fails starts the next one from the last that did not.
+    """
+    if problem.warm is None:
+        raise ModelError("the problem was not prepared to be followed: prepare(..., follows=True)")
+    transcription, warm = problem.graph.transcription, replace(problem, solver=problem.warm)
+    (low, up), found, last = variable_bounds(transcription), list[Solution](), None
+    for step in path:
+        q = np.array([p.value for p in start.with_values(step).values()])
+        if last is None:
+            w = np.clip(np.concatenate([to_unknowns(transcription, q), *node_guesses(transcription, q, ())]), low, up)
+            solution, raw = _solved(problem, w, q)
+        else:
+            solution, raw = _solved(warm, last["x"], q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
+        last = raw if solution.status.converged else last
+        found.append(solution)
+    return found
+
+
+def _solved(
+    problem: Problem, w: Array, q: Array, multipliers: Mapping[str, Array] | None = None
+) -> tuple[Solution, dict[str, Array]]:
+    """The solution, and what the solver returned."""
+    begun, (low, up) = time.perf_counter(), variable_bounds(problem.graph.transcription)
     low_g, up_g = (
         np.concatenate([np.zeros(0), *(getattr(r, s) for r in problem.graph.table)]) for s in ("lower", "upper")
     )
-    found = {k: np.array(v).ravel() for k, v in problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g).items()}
+    raw = problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g, **(multipliers or {}))
+    found = {k: np.array(v).ravel() for k, v in raw.items()}
     stats = problem.solver.stats()
     figures = {
         "iterations": float(stats.get("iter_count", 0)),
@@ -140,7 +192,7 @@ def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | 
         "largest_violation": _violation(problem, found["g"], continuity=False),
     }
     status = _status(problem, str(stats["return_status"]), found, q, figures)
-    return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up))
+    return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up)), found
 
 
 def _operations(transcription: Transcription) -> int:

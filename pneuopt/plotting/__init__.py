@@ -8,6 +8,7 @@ from pneuopt.plotting.canvas import check_figure_path, save_figure
 from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
 from pneuopt.plotting.fits import plot_fit, plot_prediction
 from pneuopt.plotting.friction_map import friction_force, has_friction_map, plot_friction
+from pneuopt.plotting.fronts import plot_front
 from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
 
@@ -20,6 +21,7 @@ __all__ = [
     "plot_correlation",
     "plot_fit",
     "plot_friction",
+    "plot_front",
     "plot_map",
     "plot_prediction",
     "plot_residuals",

@@ -80,7 +80,7 @@ def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure"
 
 def _follow(axes: "Axes", response: Response, band: float) -> None:
     run, reference, unit = response.run, response.reference, response.units[0]
-    width = band * abs(reference.size)
+    width = band * abs(reference.whole)
     end = float(run.t[-1])
     axes.fill_between(
         [reference.at, end],

@@ -10,11 +10,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.metrics import About, Envelope, step_metrics
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Step, disturbing
 from pneuopt.errors import require
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.parameters import ParameterSet
 from pneuopt.system import Linearisation
 from pneuopt.trajectories import Trajectory
 
@@ -23,6 +24,7 @@ Tell = Callable[[str], None]
 STABLE = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
 MOST_SUBSTEPS = 100
 POINTS = 1000  # samples of a response where the loop has no sample time
+READINGS, FEWEST_READINGS, MOST_READINGS = 1000, 2, 16  # of a sampled loop: so many a horizon, and a sample
 POINTS_A_PERIOD = 20  # of a continuous dither; at six, its average claimed 47 ms on T32 where 63 are certified
 
 
@@ -130,14 +132,16 @@ def span(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     Raises
     ------
     InputError
-        If nothing is free, something is free that is neither the controller's nor the dither's, or a bound is missing.
+        If nothing is free, something is free that is not the controller's (dither and feedforward included), or a bound
+        is missing.
     """
     full = loop.parameters | parameters.select(n for n in parameters if n in loop.parameters)
     free = tuple(n for n in parameters.free_names if n in loop.parameters)
     require(len(free) > 0, 'nothing is free; mark what may be tuned: parameters.freed("pid.K*", "dither.offset")')
+    divisors = {"dither.frequency", *(f"pid.{n}" for n in loop.pid.positive)}
     for n in free:
         require(
-            n.startswith(("pid.", "dither.")),
+            n.startswith(("pid.", "dither.", "feedforward.")),
             f"{n} is free, but tune changes the controller and the dither only; use parameters.fixed({n!r})",
         )
         p = full[n]
@@ -147,9 +151,35 @@ def span(loop: ClosedLoop, parameters: ParameterSet) -> Space:
             f"parameters.with_bounds({{{n!r}: (lower, upper)}}), or fix it",
         )
         require(
+            n not in divisors or p.lower > 0, f"{n}: its lower bound must be positive, got {p.lower:g} {p.unit}"
+        )
+        if n == "dither.amplitude":
+            _check_amplitude(full)
+        require(
             not p.log or p.lower > 0, f"{n}: a log parameter needs a positive lower bound, got {p.lower:g} {p.unit}"
         )
     return Space(full, free)
+
+
+def command_range(p: ParameterSet) -> tuple[float, float, str]:
+    """Between which values the command acts, and what ends it: the controller's limits, or the valve's span."""
+    low, high, whose = -math.inf, math.inf, "the command"
+    if "pid.lower" in p:
+        low, high = p.value("pid.lower"), p.value("pid.upper")
+    if "valve.span" in p and p.value("valve.span") < min(-low, high):
+        low, high, whose = -p.value("valve.span"), p.value("valve.span"), "the valve"
+    return low, high, whose
+
+
+def _check_amplitude(p: ParameterSet) -> None:
+    """Refuse a search where dither alone, around no matter what offset, runs into the command's limits."""
+    (low, high, whose), most = command_range(p), p["dither.amplitude"].upper
+    unit = p["dither.amplitude"].unit
+    require(
+        2 * most <= high - low,
+        f"dither.amplitude may reach {most:g} {unit}, but {whose} ends at {low:g} and {high:g} {unit}, which cuts the "
+        f"peaks of more than {(high - low) / 2:g} {unit}; lower its upper bound",
+    )
 
 
 def measure(
@@ -181,22 +211,18 @@ def measure(
         control=response["control"],
         sample_time=loop.pid.sample_time,
         envelope=envelope,
+        scale=None if reference.is_step else reference.whole,
     )
 
 
-def cut(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> Linearisation:
-    """The open loop for margins, about a plant state x under a command.
-
-    The filter is that of `filtered`.
-    """
-    return loop.open_loop(filtered(loop, parameters), x, {loop.command.name: command})
-
-
-def filtered(loop: ClosedLoop, parameters: ParameterSet) -> ParameterSet:
-    """With a filter for margins: a sampled derivative without one is a difference over a sample, which lags by half."""
-    h = loop.pid.sample_time
-    unfiltered = h is not None and "pid.Tf" in parameters and parameters.value("pid.Tf") == 0
-    return parameters | ParameterSet({"pid.Tf": Parameter(0.5 * (h or 0.0), "s")}) if unfiltered else parameters
+def cut(
+    loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step | None = None
+) -> Linearisation:
+    """The open loop for margins, about a plant state x under a command, and under what disturbs it in the end."""
+    others = {} if reference is None else {disturbing(n): v for n, v in reference.disturbance.items()}
+    return disturbed(loop, [reference] if reference else []).open_loop(
+        parameters, x, {loop.command.name: command, **others}
+    )
 
 
 def inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
@@ -206,14 +232,38 @@ def inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
     return run.with_columns({n: np.zeros(len(run)) for n in others})
 
 
-def spacing(loop: ClosedLoop, reference: Step) -> float:
+def spacing(
+    loop: ClosedLoop, reference: Step, parameters: ParameterSet, points_a_period: int = POINTS_A_PERIOD
+) -> float:
     """Samples' distance [s]: the controller's, or a fine one on which the step's instant lies."""
     if loop.pid.sample_time is not None:
         return loop.pid.sample_time
-    period = np.inf if loop.dither is None else 1 / loop.dither.frequency
-    longest = min(reference.horizon / POINTS, period / POINTS_A_PERIOD)
+    rate = highest(loop, parameters)
+    longest = min(reference.horizon / POINTS, 1 / (points_a_period * rate) if rate else np.inf)
     whole = reference.at if reference.at > 0 else reference.horizon
     return float(whole / math.ceil(whole / longest - 1e-9))
+
+
+def readings(loop: ClosedLoop, reference: Step) -> int:
+    """How often a response is read in a sample: between two of them it may leave the band."""
+    h = loop.pid.sample_time
+    if h is None:
+        return 1
+    return min(MOST_READINGS, max(FEWEST_READINGS, math.ceil(h * READINGS / reference.horizon - 1e-9)))
+
+
+def highest(loop: ClosedLoop, parameters: ParameterSet) -> float:
+    """The highest frequency that the dither may get [Hz]; 0 without dither."""
+    if loop.dither is None:
+        return 0.0
+    frequency = (loop.parameters | parameters)["dither.frequency"]
+    return frequency.upper if frequency.free else frequency.value
+
+
+def resolving(loop: ClosedLoop, parameters: ParameterSet) -> float:
+    """The rate [1/s] with which steps must keep up between two samples, so that an analogue dither has its points."""
+    between = loop.dither is not None and loop.dither.analogue and loop.pid.sample_time is not None
+    return STABLE * POINTS_A_PERIOD * highest(loop, parameters) if between else 0.0
 
 
 def fastest(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> Array:

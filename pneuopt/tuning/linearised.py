@@ -4,7 +4,7 @@ The settling time Ts is an unknown: from Ts on the averaged response shall lie w
 the objective is smooth where the settling time itself jumps. Nodes after Ts move with it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,21 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.codegen import Rollout
-from pneuopt.control.metrics import PERIODS_INSIDE, TAIL, end_mean, period_mean
+from pneuopt.control.metrics import PERIODS_INSIDE, TAIL
 from pneuopt.nlp.sqp import Groups, Point
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.requirements import ROBUSTNESS, Overshoot, SettlingTime, SteadyStateError, read
 from pneuopt.specification import Specification
-from pneuopt.tuning.simulator import CONTROL, SIGNAL, Grid, Simulator, is_sound, watched
+from pneuopt.tuning.rows import READ, Lanes
+from pneuopt.tuning.rows import nodes as times
+from pneuopt.tuning.simulator import Mask, Simulator, is_sound
+from pneuopt.tuning.watching import CONTROL, METERED, watched
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-KINDS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
+SMOOTH = (SettlingTime, *READ, *ROBUSTNESS)
+"""What gradients are there for."""
 BAND = 50.0  # what leaving the band by the whole step costs at least, times the objective's scale
 LIMIT = 2.0  # what a limit missed by its whole size costs, times the same
 FREELY = 5.0  # trust region of Ts over that of the gains: with 1 it, not they, was what held steps back
 LANES = 64  # that are run and read at a time
 NUDGE = 1e-4  # of a gain's range: the sensitivity is differentiated over it
-SHAPING = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.Tf")  # gains that the sensitivity feels
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,9 @@ class Linearised:
         self._cases = [np.flatnonzero(own) for own in simulator.by_grid()]
         self._periods = simulator.averaged_over()
         self.horizon = min(g.reference.horizon - g.reference.at for g in simulator.grids)
-        self._nodes = [_nodes(g, nodes, max(self._periods, default=0.0)) for g in simulator.grids]
+        self._strides = [max(1, (len(g.t) - g.after) // nodes) for g in simulator.grids]
+        longest = max(self._periods, default=0.0)
+        self._nodes = [times(g, stride, longest) for g, stride in zip(simulator.grids, self._strides, strict=True)]
         self._latest = (1 - TAIL) * self.horizon
         self._latest = min(self._latest, self.horizon - PERIODS_INSIDE * max(self._periods, default=0.0))
         most = min(self._latest, spec.limit(SettlingTime))
@@ -133,7 +138,7 @@ class Linearised:
         kinds, weights, floors = list[tuple[type, float, bool]](), [], []
         if self._spec.concerns(SettlingTime):
             kinds, weights, floors = [(SettlingTime, 1.0, True)], [self._band_weight], [0.0]
-        for kind in KINDS:
+        for kind in SMOOTH[1:]:
             weight, limit = self._spec.weight(kind), self._spec.limit(kind)
             if weight > 0:
                 kinds.append((kind, 1.0, False))
@@ -198,30 +203,30 @@ class Linearised:
         u, instants, h, steps = self._simulator.padded(case)
         with np.errstate(all="ignore"):
             found = self._rollout.run(starts, u, p, instants, h, substeps=steps)
-        after = int(np.searchsorted(grid.t, grid.reference.at - 1e-12))
         assert found.dy is not None
-        lanes = _Lanes(
+        sound = is_sound(found.y, found.x_end) & np.isfinite(found.dy[:, -1]).all(axis=(1, 2))
+        if not sound.all():
+            found.y[~sound], found.dy[~sound] = 0.0, 0.0
+        lanes = Lanes(
             grid,
-            grid.t[after:] - grid.reference.at,
-            found.y[:, after:],
-            found.dy[:, after:],
-            is_sound(found.y, found.x_end) & np.isfinite(found.dy[:, -1]).all(axis=(1, 2)),
+            found.y,
+            found.dy,
             self._chain(points, rows, case),
             [self._periods[k] for k in case.tolist()],
+            self._strides[g],
+            self._spec.envelope,
         )
-        if not lanes.sound.all():
-            lanes.y[~lanes.sound], lanes.dy[~lanes.sound] = 0.0, 0.0
-        error, by_gain = lanes.averaged(self._nodes[g])
-        values: dict[type, Array] = {Overshoot: np.where(lanes.sound[:, None], error, np.inf)}
-        derivatives: dict[type, Array] = {Overshoot: by_gain}
-        if self._spec.concerns(SteadyStateError):
-            values[SteadyStateError], derivatives[SteadyStateError] = lanes.at_end()
-        if self._spec.concerns(PeakControl):
-            values[PeakControl], derivatives[PeakControl] = lanes.peaks(len(self._nodes[g]))
-        if self._spec.concerns(MaxSensitivity):
-            robust = self._robust(p, found.x_end, lanes, points[rows], case)
-            values[MaxSensitivity], derivatives[MaxSensitivity] = robust
-        return Reading(values[Overshoot], by_gain, values, derivatives)
+        error, by_gain = lanes.error
+        rows_of = {kind: reader(lanes) for kind, reader in READ.items() if self._spec.concerns(kind)}
+        if self._spec.concerns(ROBUSTNESS):
+            ends = found.x_end[sound], found.y[sound, -1, CONTROL]
+            rows_of |= self._robust(p, sound, ends, points[rows], case)
+        return Reading(
+            np.where(sound[:, None], error, np.inf),
+            by_gain,
+            {kind: np.where(sound[:, None], value, np.inf) for kind, (value, _) in rows_of.items()},
+            {kind: slopes for kind, (_, slopes) in rows_of.items()},
+        )
 
     def _chain(self, points: Array, rows: Index, case: Index) -> Array:
         """How parameters, and before them the rest, move with the unknowns, shape (m, n_columns, n)."""
@@ -242,93 +247,43 @@ class Linearised:
             columns.append((next(moved) - next(moved)) / (above - below)[rows, k][:, None])
         return np.stack(columns, axis=-1)
 
-    def _robust(self, p: Array, x_end: Array, lanes: "_Lanes", points: Array, case: Index) -> tuple[Array, Array]:
-        """Ms and its derivatives by differences, the operating point held."""
-        names, n, sound = self._space.names, len(self._wrt), lanes.sound
-        shaping = [k for k, name in enumerate(names) if name in SHAPING]
-        steps = NUDGE * np.diff(self._space.bounds, axis=1)[:, 0]
-        values, slopes = np.full((len(p), 1), np.inf), np.zeros((len(p), 1, n))
+    def _robust(
+        self, p: Array, sound: Mask, ends: tuple[Array, Array], points: Array, case: Index
+    ) -> dict[type, tuple[Array, Array]]:
+        """Margins and peaks of the linearised loop, and derivatives by differences, the operating point held."""
+        names, n, kinds = self._space.names, len(self._wrt), [k for k in ROBUSTNESS if self._spec.concerns(k)]
+        felt = {f"pid.{gain}" for gain in self._simulator.loop.pid.form.gains}
+        shaping = [k for k, name in enumerate(names) if name in felt]
+        found: dict[type, tuple[Array, Array]] = {
+            kind: (np.full((len(p), 1), np.inf), np.zeros((len(p), 1, n))) for kind in kinds
+        }
         if not sound.any():
-            return values, slopes
+            return found
+        steps = NUDGE * np.diff(self._space.bounds, axis=1)[:, 0]
         nudged = [p, *(p + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping)]
-        ends = np.tile(x_end[sound], (len(nudged), 1)), np.tile(lanes.y[sound, -1, CONTROL], len(nudged))
+        tiled = np.tile(ends[0], (len(nudged), 1)), np.tile(ends[1], len(nudged))
         stacked = np.concatenate([q[sound] for q in nudged])
-        found = self._simulator.robustness(stacked, *ends, ("MaxSensitivity",))["MaxSensitivity"]
-        peaks = found.reshape(len(nudged), -1)
-        values[sound, 0] = peaks[0]
+        metrics = read(self._simulator.robustness(stacked, *tiled, [k.__name__ for k in kinds]))
         factors = np.array([c.slopes(names) for c in self._simulator.cases])[case[sound]]
         rates = self._space.rates(points[sound]) * factors
-        for row, k in zip(peaks[1:], shaping, strict=True):
-            slopes[sound, 0, k] = (row - peaks[0]) / steps[k] * rates[:, k]
-        return values, slopes
-
-
-@dataclass(frozen=True, eq=False)
-class _Lanes:
-    """Simulated lanes of one reference, from the step on; what is no number is zero where `sound` is False."""
-
-    grid: Grid
-    t: Array
-    y: Array
-    dy: Array
-    sound: NDArray[np.bool_]
-    chain: Array
-    periods: Sequence[float]
-
-    def averaged(self, nodes: Array) -> tuple[Array, Array]:
-        """The averaged distance from the reference at the nodes, a fraction of the step, and its derivatives."""
-        reference, shape = self.grid.reference, (len(self.y), self.dy.shape[-1])
-        error, by_column = np.empty((len(self.y), len(nodes))), np.empty((*shape, len(nodes)))
-        for period, own, signal, columns in self._alike():
-            error[own] = _smooth(self.t, signal, reference.initial, period, nodes) - reference.final
-            by_column[own] = _smooth(self.t, columns, 0.0, period, nodes).reshape(-1, shape[1], len(nodes))
-        return error / reference.size, np.swapaxes(by_column, 1, 2) @ self.chain / reference.size
-
-    def at_end(self) -> tuple[Array, Array]:
-        """The steady-state error, a fraction of the step, and its derivatives, a row a lane."""
-        reference, columns = self.grid.reference, self.dy.shape[-1]
-        error, by_column = np.empty((len(self.y), 1)), np.empty((len(self.y), 1, columns))
-        for period, own, signal, flat in self._alike():
-            error[own, 0] = end_mean(self.t, signal, period or None) - reference.final
-            by_column[own, 0] = end_mean(self.t, flat, period or None).reshape(-1, columns)
-        sign = np.sign(error)[..., None]
-        return np.abs(error / reference.size), sign * (by_column @ self.chain) / abs(reference.size)
-
-    def peaks(self, blocks: int) -> tuple[Array, Array]:
-        """The largest command of each stretch of time, either side, and its derivatives."""
-        control, n = self.y[:, :, CONTROL], self.y.shape[1]
-        edges = np.linspace(0, n, min(blocks, n) + 1).astype(int)[:-1]
-        parts = np.split(np.abs(control), edges[1:], axis=1)
-        k = np.array([edge + part.argmax(axis=1) for edge, part in zip(edges, parts, strict=True)]).T
-        rows = np.arange(len(control))[:, None]
-        slopes = np.sign(control[rows, k])[..., None] * (self.dy[rows, k, CONTROL] @ self.chain)
-        return np.abs(control[rows, k]), slopes
-
-    def _alike(self) -> Iterator[tuple[float, NDArray[np.bool_], Array, Array]]:
-        """Lanes with one period: which, their signals, and these signals' derivatives, a row a lane and column."""
-        for period in sorted(set(self.periods)):
-            own = np.array([other == period for other in self.periods])
-            columns = np.ascontiguousarray(np.moveaxis(self.dy[own, :, SIGNAL], 2, 1))
-            yield period, own, self.y[own, :, SIGNAL], columns.reshape(-1, len(self.t))
+        for kind, (values, slopes) in found.items():
+            first, *others = np.reshape(metrics[kind.__name__], (len(nudged), -1))
+            values[sound, 0] = np.nan_to_num(first, nan=np.inf, posinf=np.inf)
+            with np.errstate(invalid="ignore"):
+                for row, k in zip(others, shaping, strict=True):
+                    slopes[sound, 0, k] = (row - first) / steps[k] * rates[:, k]
+        return found
 
 
 def differentiated(simulator: Simulator) -> Rollout:
     """The compiled loop with its sensitivities to the gains; to the start where the rest depends on them."""
     order, names = list(simulator.loop.parameters), simulator.space.names
     through_start = any(simulator.starts_vary(k) for k in range(len(simulator.cases)))
-    return Rollout(watched(simulator.loop), [order.index(n) for n in names], start=through_start)
-
-
-def _nodes(grid: Grid, count: int, period: float) -> Array:
-    t = grid.t[grid.t >= grid.reference.at - 1e-12] - grid.reference.at
-    t = t[t <= t[-1] - period / 2]
-    return np.asarray(t[:: max(1, len(t) // count)])
-
-
-def _smooth(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
-    if period:
-        return period_mean(t, y, initial, period, at)
-    return np.asarray(y[:, np.searchsorted(t, at)])
+    return Rollout(
+        watched(simulator.loop, with_meter=METERED in simulator.read),
+        [order.index(n) for n in names],
+        start=through_start,
+    )
 
 
 def _crossings(t: Array, size: Array, band: float) -> Array:

@@ -18,10 +18,10 @@ from pneuopt.requirements import ROBUSTNESS, most, name
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.simulator import Index, Mask, Responses, Simulator
+from pneuopt.tuning.watching import LOST, unsettled
 
 Array = NDArray[np.float64]
 PENALTY = 20.0  # weight of a limit's relative violation, in units of the objective's scale
-LOST = 1e6
 
 
 @dataclass(frozen=True)
@@ -256,9 +256,9 @@ def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Arr
         The horizon, which stands for the settling time of what never settles [s].
     """
     filled = {n: np.where(np.isfinite(value), value, LOST) for n, value in values.items()}
-    unsettled = scale * (2 + np.minimum(filled["Excess"], LOST))
-    filled["SettlingTime"] = np.where(np.isfinite(values["SettlingTime"]), filled["SettlingTime"], unsettled)
-    total = np.zeros_like(unsettled)
+    late = unsettled(scale, filled["Excess"])
+    filled["SettlingTime"] = np.where(np.isfinite(values["SettlingTime"]), filled["SettlingTime"], late)
+    total = np.zeros_like(late)
     for q, weight in spec.weights.items():
         total += weight * filled[name(q)]
     for q in spec.limits:

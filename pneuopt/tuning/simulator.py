@@ -4,21 +4,31 @@ import copy
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Pieces, Rollout
+from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import robustness
-from pneuopt.control.metrics import About, Envelope, batch_metrics
 from pneuopt.control.reference import Step
+from pneuopt.parameters import ParameterSet
 from pneuopt.requirements import AT_LEAST, ROBUSTNESS, read
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.specification import Specification
 from pneuopt.system import names
-from pneuopt.tuning.candidates import MOST_SUBSTEPS, Space, fastest, inputs, spacing, substeps
+from pneuopt.tuning.candidates import (
+    MOST_SUBSTEPS,
+    POINTS_A_PERIOD,
+    Space,
+    fastest,
+    inputs,
+    readings,
+    resolving,
+    spacing,
+    substeps,
+)
 from pneuopt.tuning.cases import cases
+from pneuopt.tuning.watching import CONTROL, METERED, Grid, is_averaged, read_off, watched
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,8 +37,8 @@ RUNAWAY = 1e12
 READ = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "Ripple", "Excess")
 FEW = 32  # lanes: different references then share the lanes of a processor, the shorter ones padded
 CHUNK = 128  # lanes that are run, and read, at a time: what a processor's cache holds
+COARSE = 10  # samples a dither period; settling times then are off by a tenth of a millisecond on T32, 3 at worst
 STIFFEST = 8  # corners of the gains' box whose rates are looked at on the scenarios' plants too
-SIGNAL, CONTROL = 0, 1  # outputs that are run
 
 
 class Simulator:
@@ -65,19 +75,33 @@ class Simulator:
         self.read = tuple(dict.fromkeys((*READ, *(k for k in kinds if k not in linearised))))
         self.margins = tuple(dict.fromkeys(("MaxSensitivity", *(k for k in kinds if k in linearised))))
         self._envelope = spec.envelope if spec else ()
+        self._wider: tuple[float, ...] = ()
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
         self._rest = [case.rest(loop, space) for case in self.cases]
-        self._rollout = Rollout(watched(loop))
-        self.grids = _grids(loop, references)
+        self._rollout = Rollout(watched(loop, with_meter=METERED in self.read))
+        self.grids = _grids(loop, references, space.parameters)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
-        rate = self._fastest(references)
+        self._rate = rate = max(self._fastest(references), resolving(loop, space.parameters))
         self.substeps = [substeps(rate, grid.spacing) for grid in self.grids]
         slowest = 1 / max(r.horizon for r in references)
         omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
         if len(self.margins) > 1:  # unlike the sensitivity's peak, crossings lie where a slow integral puts them
             omega = np.concatenate([np.geomspace(3e-5, 0.29, 60) * slowest, omega])
         self._robustness = robustness(loop, omega)
+
+    def coarse(self, spec: Specification, bands: Sequence[float] = ()) -> "Simulator":
+        """The same for a search on its way, by copy: half as many samples, and nothing read but what `spec` asks.
+
+        With `bands` SettlingTime is the mean over those and the one asked for, an unsettled one for the horizon and
+        more.
+        """
+        part = copy.copy(self)
+        part._wider = tuple(bands)
+        part.read = tuple(dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.kinds if n in self.read))))
+        part.grids = _grids(self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE)
+        part.substeps = [substeps(self._rate, grid.spacing) for grid in part.grids]
+        return part
 
     def only(self, chosen: Sequence[int]) -> "Simulator":
         """The same with some of the cases, by copy."""
@@ -114,7 +138,7 @@ class Simulator:
         wanted = np.ones((len(points), len(self.cases)), dtype=bool) if lanes is None else lanes
         rows, case = np.nonzero(wanted)
         p, starts = self.lanes(points, rows, case)
-        measured = Measured.empty(len(rows), len(self.loop.states), self.read)
+        measured = Measured.empty(len(rows), starts.shape[1], self.read)
         for chunk in self._chunks(case):
             self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
         return Responses(self, wanted, p, measured)
@@ -139,15 +163,13 @@ class Simulator:
         return each({n: responses.table(n)[0] for n in self.read} | margins)
 
     def robustness(self, p: Array, x_end: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
-        """Margins on a grid, about the states in which the responses end; an absent filter counts as in `cut`."""
-        p, filtered = p.copy(), list(self.loop.parameters).index("pid.Tf")
-        p[:, filtered] = np.where(p[:, filtered] == 0, 0.5 * (self.loop.pid.sample_time or 0.0), p[:, filtered])
+        """Margins on a grid, about the states in which the responses end."""
         return self._robustness(p, x_end[:, : len(self.loop.plant.states)], commands, only)
 
     def lanes(self, points: Array, rows: Index, case: Index) -> tuple[Array, Array]:
         """Parameters and start states of lanes, each a candidate's row and a case."""
         base, order = self.space.vectors(points)[rows], list(self.space.parameters)
-        p, starts = np.empty_like(base), np.empty((len(rows), len(self.loop.states)))
+        p, starts = np.empty_like(base), np.empty((len(rows), self._rollout.n_states))
         for k in np.unique(case).tolist():
             own = case == k
             p[own] = self.cases[k].rows(base[own], order)
@@ -155,11 +177,13 @@ class Simulator:
         return p, starts
 
     def starts(self, case: int, points: Array) -> Array:
-        """Where the loop waits for the step, shape (m, n_states)."""
+        """Where the loop waits for the step, shape (m, n_states), and under dither a zero, the signal's integral."""
         rest = self._rest[case]
         if rest is not None:
-            return np.tile(rest, (len(points), 1))
-        return np.array([self.cases[case].initial(self.loop, self.space.filled(point)) for point in points])
+            found = np.tile(rest, (len(points), 1))
+        else:
+            found = np.array([self.cases[case].initial(self.loop, self.space.filled(point)) for point in points])
+        return np.column_stack([found, np.zeros((len(found), int(is_averaged(self.loop))))])
 
     def starts_vary(self, case: int) -> bool:
         """Whether the rest of a case depends on the gains."""
@@ -196,13 +220,15 @@ class Simulator:
         with np.errstate(all="ignore"):
             found = self._rollout.run(starts, u, p, t, h, substeps=steps)
         out.x_end[chunk] = found.x_end
+        planes = np.ascontiguousarray(np.moveaxis(found.y, 2, 0))  # reading is over time, several times faster so
         for g in np.unique(self._grid_of[case]).tolist():
             own, grid = self._grid_of[case] == g, self.grids[g]
-            y = found.y[own, : len(grid.t)]
+            y = np.moveaxis(planes[:, own, : len(grid.t)], 0, 2)
             sound = is_sound(y, found.x_end[own])
             out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL]
             for period, rows in self.periods(p[own], sound):
-                for n, value in _metrics(grid, y[rows], band, period, self.read, self._envelope).items():
+                metrics = read_off(grid, _some(y, rows), (band, *self._wider), period, self.read, self._envelope)
+                for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
 
     def _dither_rates(self, p: Array) -> Array:
@@ -231,32 +257,8 @@ class Simulator:
         u, t, h = (a[None] for a in grid.padded(len(grid.t)))
         found = self._rollout.run(start, u, p, t, h, substeps=MOST_SUBSTEPS, states=True).x
         assert found is not None
-        along = found[0][:: max(1, len(grid.t) // 10)]
-        return [start[0], *along[np.isfinite(along).all(axis=1)]]
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """The samples of one reference.
-
-    Attributes
-    ----------
-    reference : Step
-    t : ndarray, shape (n,)
-    u : ndarray, shape (n, n_inputs)
-    spacing : float
-        [s]
-    """
-
-    reference: Step
-    t: Array
-    u: Array
-    spacing: float
-
-    def padded(self, n: int) -> tuple[Array, Array, Array]:
-        """Inputs, instants and steps, the last sample repeated with steps of 0 to n samples."""
-        k = np.minimum(np.arange(n), len(self.t) - 1)
-        return self.u[k], self.t[k], np.where(np.arange(n) < len(self.t), self.spacing, 0.0)
+        along = np.vstack([start, found[0][:: max(1, len(grid.t) // 10)]])[:, : len(self.loop.states)]
+        return list(along[np.isfinite(along).all(axis=1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,6 +350,11 @@ def worst(found: Sequence[dict[str, float]]) -> dict[str, float]:
     return {n: float(np.max([values[n] for values in found])) for n in found[0]}
 
 
+def _some(y: Array, rows: Mask) -> Array:
+    """Some rows, the time axis as contiguous as it was."""
+    return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)
+
+
 def is_sound(y: Array, x_end: Array) -> Mask:
     """Which lanes did not run away."""
     with np.errstate(all="ignore"):
@@ -355,46 +362,14 @@ def is_sound(y: Array, x_end: Array) -> Mask:
     return np.asarray(tame & np.isfinite(x_end).all(axis=1))
 
 
-def watched(loop: ClosedLoop) -> Pieces:
-    """The loop's sampled step with no outputs but the measured signal and the command."""
-    whole, outputs = loop.discrete().pieces, names(loop.outputs)
-    kept = [outputs.index(loop.feedback.name), outputs.index("control")]
-
-    def reduced(function: ca.Function) -> ca.Function:
-        arguments = [ca.SX.sym(function.name_in(i), function.size1_in(i)) for i in range(function.n_in())]
-        first, y = function(*arguments)
-        labels = [function.name_in(i) for i in range(function.n_in())]
-        return ca.Function(function.name(), arguments, [first, y[kept]], labels, list(function.name_out()))
-
-    return Pieces(reduced(whole.step), whole.update, None if whole.ode is None else reduced(whole.ode))
-
-
-def _grids(loop: ClosedLoop, references: Sequence[Step]) -> list[Grid]:
+def _grids(
+    loop: ClosedLoop, references: Sequence[Step], parameters: ParameterSet, a_period: int = POINTS_A_PERIOD
+) -> list[Grid]:
     found = []
     for reference in references:
-        h = spacing(loop, reference)
-        run = inputs(loop, reference, h)
-        found.append(Grid(reference, run.t, run.matrix(names(loop.inputs)), h))
+        h = spacing(loop, reference, parameters, a_period)
+        run, k = inputs(loop, reference, h), readings(loop, reference)
+        number = np.arange(k * (len(run) - 1) + 1)
+        t: Array = np.asarray(number * (h / k), dtype=np.float64)
+        found.append(Grid(reference, t, run.matrix(names(loop.inputs))[number // k], h / k, loop.pid.sample_time))
     return found
-
-
-def _metrics(
-    grid: Grid, y: Array, band: float, period: float | None, only: Collection[str], envelope: Envelope
-) -> dict[str, Array]:
-    reference, signal = grid.reference, y[:, :, SIGNAL]
-    late = grid.t >= 0.8 * reference.horizon + 0.2 * reference.at
-    measured = batch_metrics(
-        grid.t,
-        signal,
-        reference.final,
-        reference.initial,
-        start=reference.at,
-        band=band,
-        about=About.REFERENCE,
-        dither_period=period,
-        control=y[:, :, CONTROL],
-        envelope=envelope,
-        only=only,
-    )
-    measured["Excess"] = np.abs(signal[:, late] - reference.final).mean(axis=1) / abs(reference.size)
-    return {n: measured[n] for n in only}

@@ -17,21 +17,22 @@ from numpy.typing import NDArray
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_grid, sensitivity_terms
 from pneuopt.control.metrics import TAIL
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Step, disturbing
 from pneuopt.errors import require
-from pneuopt.nlp.full_space import FullSpace, prepare, solve_from
+from pneuopt.nlp.full_space import FullSpace, Problem, follow, prepare, solve_from
 from pneuopt.nlp.status import Solution
 from pneuopt.nlp.transcription import Cost, Limit, Phase, Transcription, Where, every
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError
+from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError, most, name
 from pneuopt.specification import Specification
 from pneuopt.system import DiscreteSystem, System, discretise, names
-from pneuopt.tuning.candidates import Space, Tell, fastest, substeps
+from pneuopt.tuning.candidates import STABLE, Space, Tell, fastest, substeps
 
 Array = NDArray[np.float64]
 KINDS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
 LARGEST = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
 SETTLING = "SettlingTime"
+MOST_STEPS = 12  # between two nodes; the paper's loop takes 3, a lag with dead time and wide bounds 50
 SAME = 1e-3  # relative difference of two optima that count as one
 
 
@@ -92,6 +93,14 @@ def is_exact(spec: Specification) -> bool:
     return not _strange(spec)
 
 
+def is_light(loop: ClosedLoop, references: Sequence[Step], space: Space, method: TwoPhase) -> bool:
+    """Whether the steps between two nodes are few; with many the problem takes minutes, where a screening takes one."""
+    own = Space(space.parameters, tuple(n for n in space.names if n not in ("pid.Tt", "pid.lower", "pid.upper")))
+    rate = fastest(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))]).max()
+    longest = max(r.horizon for r in references) / min(method.nodes)
+    return bool(rate * longest <= MOST_STEPS * STABLE)
+
+
 def check_exact(spec: Specification) -> None:
     """Refuse what the problem has no equation for: `InputError` names it and the remedy."""
     require(not _strange(spec), f"TwoPhase has no equation for {', '.join(_strange(spec))}; use method=Screening()")
@@ -133,6 +142,36 @@ def solve_two_phase(
     return Optima(best, len(found), len(good), agreeing)
 
 
+@dataclass(frozen=True, eq=False)
+class TwoPhasePath:
+    """A two-phase problem to be solved for one set of limits after the other, all of the same kinds.
+
+    Parameters
+    ----------
+    problem : Problem
+    names : tuple of str
+        The gains.
+    """
+
+    problem: Problem
+    names: tuple[str, ...]
+
+    def follow(self, start: Array, specs: Sequence[Specification]) -> list[Solution]:
+        """Solve for one after the other, the first from gains of shape (n,)."""
+        parameters = self.problem.graph.transcription.parameters
+        gains = dict(zip(self.names, start.tolist(), strict=True))
+        path = [{name(q): most(q) for q in spec.limits} for spec in specs]
+        return follow(self.problem, parameters.with_values(gains), path)
+
+
+def two_phase_path(
+    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
+) -> TwoPhasePath:
+    """Prepare a problem whose limits, but not the settling band, will move; `spec` already tightened."""
+    transcription = transcribe(loop, references, space, spec, method)
+    return TwoPhasePath(prepare(transcription, method.solver, follows=True), space.names)
+
+
 def transcribe(
     loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
 ) -> Transcription:
@@ -158,7 +197,7 @@ def _cost(solution: Solution) -> float:
 
 
 def _extra(references: Sequence[Step], spec: Specification) -> ParameterSet:
-    """The settling time, and an unknown for each further term of the objective."""
+    """The settling time, an unknown for each further term of the objective, and a number for each other limit."""
     horizon = min(r.horizon - r.at for r in references)
     most = min(spec.limit(SettlingTime), (1 - TAIL) * horizon)  # in the rest a metric would not call it settled
     free = spec.weight(SettlingTime) > 0
@@ -173,6 +212,8 @@ def _extra(references: Sequence[Step], spec: Specification) -> ParameterSet:
             most = min(spec.limit(kind), LARGEST[kind.__name__])
             start = min(2.0, most) if kind is MaxSensitivity else min(1.0, most)
             given[kind.__name__] = Parameter(start, "1", least, most, free=True)
+        elif spec.limit(kind) < math.inf:  # a number of the problem, which a continuation may move
+            given[kind.__name__] = Parameter(spec.limit(kind), "1")
     return ParameterSet(given)
 
 
@@ -202,10 +243,11 @@ def _extended(
 
 def _phases(loop: ClosedLoop, space: Space, i: int, reference: Step, method: TwoPhase) -> list[Phase]:
     start = _rest(loop, space, reference)
-    others = len(loop.inputs) - 1
+    disturbed = {disturbing(n): v for n, v in reference.disturbance.items()}
+    after = [disturbed.get(n, 0.0) for n in names(loop.inputs)[1:]]
 
     def phase(name: str, n: int, value: float, duration: str, first: Array | None) -> Phase:
-        inputs = np.tile([value, *np.zeros(others)], (n, 1))
+        inputs = np.tile([value, *(np.zeros(len(after)) if name == "before" else after)], (n, 1))
         grid, step = np.arange(n) / n, np.full(n, 1 / n)
         return Phase(f"{name}.{i}", grid, step, inputs, every(n, 1), first, first is None, duration)
 
@@ -235,7 +277,7 @@ def _path_limits(
     t, x, u, p = (ca.SX.sym(k, system.step.size1_in(j)) for k, j in zip("txup", (0, 2, 3, 4), strict=True))
     y = system.step(t, 0, x, u, p)[1]
     outputs, at = names(system.outputs), list(system.parameters).index
-    error = (y[outputs.index(loop.feedback.name)] - u[0]) / reference.size
+    error = (y[outputs.index(loop.feedback.name)] - u[0]) / reference.whole
     control = y[outputs.index("control")]
     count = 3 if reference.at > 0 else 2
     transient, settled = count * i + count - 2, count * i + count - 1
@@ -246,15 +288,15 @@ def _path_limits(
 
     def below(kind: type, value: ca.SX, where: Where, phases: tuple[int, ...]) -> list[Limit]:
         """Value and, where it has a sign, its negative, at most the limit or the unknown."""
-        if spec.weight(kind) > 0:
-            return [limit(kind.__name__, value - p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
-        most = spec.limit(kind)
-        return [limit(kind.__name__, value, -math.inf, most, where, phases)] if most < math.inf else []
+        if not spec.concerns(kind):
+            return []
+        return [limit(kind.__name__, value - p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
 
     found = []
     if spec.concerns(SettlingTime):
         found += [limit("settling band", error, -spec.band, spec.band, w, (settled,)) for w in (Where.NODES, Where.END)]
-    found += below(Overshoot, error, Where.NODES, both)
+    beyond = error if reference.is_step else ca.vertcat(error, -error)
+    found += below(Overshoot, beyond, Where.NODES, both)
     found += below(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,))
     found += below(PeakControl, ca.vertcat(control, -control), Where.NODES, both)
     if loop.pid.limits:
@@ -274,7 +316,7 @@ def _sensitivity_limit(
     )
     terms = sensitivity_terms(loop, grid, averaged)
     q = ca.SX.sym("q", len(parameters))
-    Ms = q[list(parameters).index("MaxSensitivity")] if spec.weight(MaxSensitivity) > 0 else spec.limit(MaxSensitivity)
+    Ms = q[list(parameters).index("MaxSensitivity")]
     value = terms(q[: len(loop.parameters)]) * Ms**2
     return [Limit("MaxSensitivity", ca.Function("limit", [q], [value]), 1.0, math.inf, Where.PARAMETERS)]
 

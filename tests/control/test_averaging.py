@@ -1,5 +1,7 @@
 """The averaged model of dither against closed formulas, linear theory and the resolved simulation."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from math import acos, asin, hypot, pi
 
 import casadi as ca
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 
 from pneuopt.control.averaging import averaged, mean_start, ripple
-from pneuopt.control.dither import Dither
+from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.errors import InputError, ModelError, UnknownNameError
@@ -75,6 +77,56 @@ def test_the_offset_and_the_amplitude_stay_parameters() -> None:
         assert rate(mean, u, moved) == pytest.approx(rate(mean, u + 0.1, p), rel=1e-12)
         other = p.with_values({"dither.amplitude": 0.2})
         assert rate(mean, u, other) == pytest.approx(rate(half, u, other), rel=1e-12)
+
+
+@pytest.mark.parametrize("X", [0.25, 0.4, 1.0])
+def test_a_triangle_opens_a_dead_zone_by_the_time_that_it_spends_beyond(X: float) -> None:
+    """Its values are spread evenly: at null the slope is ``1 - x0/X``, where a sine has ``(2/pi) acos(x0/X)``."""
+    p = dither(X, 100.0)
+    mean = averaged(lands(0.2, 2e-3), p, nodes=512, waveform=Waveform.TRIANGLE)
+    assert mean.linearise(np.zeros(1), {}, p).B[0, 0] == pytest.approx(1 - 0.2 / X, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("waveform", "law"), [(Waveform.TRIANGLE, lambda s: s), (Waveform.SINE, lambda s: 2 / pi * asin(s))]
+)
+def test_a_relay_under_dither_becomes_its_distribution(waveform: Waveform, law: Callable[[float], float]) -> None:
+    """The mean of sgn(u + X w): a straight line under a triangle, an arcsine under a sine (Zames & Shneydor)."""
+    level, command = Quantity("level", "1"), Quantity("command", "1")
+    relay = define(
+        [level], [command], [level], ParameterSet(), lambda _t, x, u, _p: ({"level": ca.sign(u["command"])}, dict(x))
+    )
+    mean = averaged(relay, dither(0.5, 100.0), nodes=256, waveform=waveform)
+    for share in (-0.7, -0.2, 0.0, 0.4, 0.9):
+        assert rate(mean, 0.5 * share, dither(0.5, 100.0)) == pytest.approx(law(share), abs=2 / 128), share
+
+
+def test_a_triangles_ripple_is_that_of_its_fundamental() -> None:
+    """8/pi^2 of a sine's of the same peak, whatever the linear plant."""
+    plant = SecondOrder().system()
+    p = plant.parameters | dither(2.0, 20.0, "V")
+    sine, triangle = (list(ripple(plant, p, waveform=w).values()) for w in Waveform)
+    assert triangle == pytest.approx([8 / pi**2 * x for x in sine], rel=1e-9)
+
+
+def test_an_averaged_loop_under_a_triangle_is_the_moving_average_of_the_resolved_one() -> None:
+    """A level behind lands with a dead zone, which a wave of 1.5 times that opens by a third."""
+    loop = ClosedLoop(lands(0.2, 0.02), PID(limits=False), Dither(100.0, waveform=Waveform.TRIANGLE))
+    p = loop.parameters.with_values({"pid.Kp": 2.0, "dither.amplitude": 0.3, "dither.frequency": 100.0})
+    t = np.arange(6001) * 2.5e-4
+    inputs, start = Trajectory(t, {"reference": np.full(len(t), 0.5)}), loop.initial(p)
+    resolved = simulate(loop, inputs, p, initial=start, rtol=1e-8)["level"]
+    over, at = (np.convolve(y, np.ones(40) / 40, "valid") for y in (resolved, t))
+    begun = mean_start(ripple(loop, p), start)
+    sine = replace(loop, dither=Dither(100.0))
+    off = []
+    for mean in (averaged(loop, p), averaged(sine, p)):
+        run = simulate(mean, inputs, p, initial=begun, rtol=1e-8)
+        off.append(np.abs(np.interp(at, run.t, run["level"]) - over).max())
+    assert off[0] < 2e-3
+    assert off[1] > 5 * off[0]
+    with pytest.raises(InputError, match="the loop's dither is a triangle"):
+        averaged(loop, p, waveform=Waveform.SINE)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])

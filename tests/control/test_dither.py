@@ -1,8 +1,14 @@
+import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt.control.dither import Dither
+from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
 from pneuopt.errors import InputError
+from pneuopt.models.linear import FirstOrder
+from pneuopt.simulate import simulate
+from pneuopt.trajectories import Trajectory
 
 
 @pytest.mark.parametrize("frequency", [500.0, 600.0])
@@ -36,3 +42,60 @@ def test_averaging_over_the_period_removes_the_sampled_sine(frequency: float, pe
 def test_frequency_must_be_positive(frequency: float) -> None:
     with pytest.raises(InputError, match="frequency must be positive"):
         Dither(frequency)
+
+
+@pytest.mark.parametrize("waveform", Waveform)
+def test_both_waves_begin_at_zero_rise_and_have_amplitude_for_their_peak(waveform: Waveform) -> None:
+    t, q = ca.SX.sym("t"), {"amplitude": ca.SX(0.3), "frequency": ca.SX(20.0)}
+    wave = ca.Function("wave", [t], [Dither(waveform=waveform).wave(t, q)])
+    at = np.linspace(-0.05, 0.1, 3001)
+    found = np.array([float(wave(k)) for k in at])
+    assert (found.max(), found.min()) == pytest.approx((0.3, -0.3), abs=1e-9)
+    assert float(wave(0.0)) == pytest.approx(0.0, abs=1e-12) and float(wave(1e-3)) > 0
+    np.testing.assert_allclose(found, 0.3 * waveform.at(2 * np.pi * 20.0 * at), atol=1e-12)
+    np.testing.assert_allclose(found[:2001], found[1000:], atol=1e-9)  # a period of 50 ms later
+
+
+def test_a_triangle_is_straight_between_its_peaks() -> None:
+    phase = np.linspace(-np.pi / 2, np.pi / 2, 101)
+    np.testing.assert_allclose(Waveform.TRIANGLE.at(phase), 2 * phase / np.pi, atol=1e-12)
+    np.testing.assert_allclose(Waveform.TRIANGLE.at(np.pi - phase), 2 * phase / np.pi, atol=1e-12)
+
+
+@pytest.mark.parametrize("analogue", [False, True])
+def test_the_simulation_sees_a_triangles_corners(analogue: bool) -> None:
+    """A lag of first order under it, exactly: on a ramp of slope s, ``y = u - s T + (y0 - u0 + s T) exp(-t/T)``."""
+    plant = FirstOrder().system()
+    pid = PID(1e-2, limits=False) if analogue else PID(limits=False)
+    loop = ClosedLoop(plant, pid, Dither(20.0, analogue, Waveform.TRIANGLE))
+    given = loop.parameters.with_values({"pid.Kp": 0.0, "dither.amplitude": 0.4})
+    t = np.arange(401) * 1e-3
+    run = simulate(loop, Trajectory(t, {"reference": np.zeros(len(t))}), given)
+    gain, T = (given.value(n) for n in plant.parameters)
+    y, corners = 0.0, np.arange(-0.0125, 0.5, 0.025)
+    for k, (a, b) in enumerate(zip(t, t[1:], strict=False)):
+        cuts = [a, *corners[(corners > a + 1e-9) & (corners < b - 1e-9)], b]
+        for c, d in zip(cuts, cuts[1:], strict=False):
+            u0, u1 = (0.4 * float(Waveform.TRIANGLE.at(2 * np.pi * 20.0 * s)) for s in (c, d))
+            s = gain * (u1 - u0) / (d - c)
+            y = gain * u1 - s * T + (y - gain * u0 + s * T) * np.exp(-(d - c) / T)
+        assert run["speed"][k + 1] == pytest.approx(y, abs=1e-8), t[k + 1]
+
+
+def test_joined_periods_are_as_few_as_average_the_sampled_wave_away() -> None:
+    """Of a slow one every sample is close to the next: one period; what is left stays below a thousandth."""
+    h, t = 1e-3, np.linspace(0.0, 3.0, 3001)
+    for frequency in (7.3, 13.37, 29.0, 61.3, 83.0, 97.0, 160.0, 250.0):
+        period = Dither().period(frequency, h)
+        assert period * frequency == pytest.approx(round(period * frequency))
+        y = np.sin(2 * np.pi * frequency * t)
+        whole = np.concatenate([[0.0], np.cumsum((y[1:] + y[:-1]) / 2 * h)])
+        at = t[(t > period) & (t < 3.0 - period)]
+        mean = (np.interp(at + period / 2, t, whole) - np.interp(at - period / 2, t, whole)) / period
+        assert np.abs(mean).max() < 3e-3, frequency
+    assert Dither().period(13.37, h) == pytest.approx(1 / 13.37)
+
+
+def test_a_waveform_is_one_of_the_two() -> None:
+    with pytest.raises(InputError, match=r"waveform is one of Waveform.SINE, Waveform.TRIANGLE, got 'triangle'"):
+        Dither(waveform="triangle")  # type: ignore[arg-type]

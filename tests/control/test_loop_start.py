@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.control.pid import PID
@@ -76,6 +77,19 @@ def test_a_lagging_sensor_is_part_of_the_loop() -> None:
     loop = loop_of(sensor=SensorLag(4e-3))
     log, _ = logged(loop, "position", "speed")
     fit = identify(loop, [log], given(loop).freed("friction.coulomb", "load.mass"))
+    assert fit.estimates["value"]["load.mass"] == pytest.approx(3.0, rel=0.01)
+
+
+def test_a_delay_and_a_feedforward_are_part_of_the_loop() -> None:
+    drive = ForceDrive(Coulomb()).system()
+    loop = ClosedLoop(drive, PID(2e-3, delay=1), feedforward=Feedforward(0.05))
+    known = given(loop).with_values({"feedforward.gain": 100.0})
+    t = np.arange(600) * 1e-3
+    wanted = np.where(t < 0.1, 0.0, np.where(t < 0.35, 0.3, -0.2))
+    run = simulate(loop, Trajectory(t, {"reference": wanted}), known, initial=[0.0] * len(loop.states))
+    noisy = run["position"] + NOISE["position"] * np.random.default_rng(1).standard_normal(t.size)
+    log = Experiment(Trajectory(t, {"speed_reference": wanted, "position": noisy}), {"position": NOISE["position"]})
+    fit = identify(loop, [log], known.freed("friction.coulomb", "load.mass"))
     assert fit.estimates["value"]["load.mass"] == pytest.approx(3.0, rel=0.01)
 
 

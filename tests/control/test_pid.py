@@ -3,10 +3,8 @@ from math import inf
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from pneuopt.control.pid import PID, ParallelForm, StandardForm, ratio, to_parallel, to_standard
+from pneuopt.control.pid import PID, ratio
 from pneuopt.errors import InputError, UnitError
 from pneuopt.parameters import Quantity
 
@@ -43,39 +41,6 @@ def test_sample_time_must_be_positive(sample_time: float) -> None:
 
 def test_without_limits_there_is_nothing_to_saturate() -> None:
     assert tuple(PID(limits=False).parameters("m", "N")) == ("Kp", "Ki", "Kd", "Tf", "b", "c")
-
-
-@given(
-    Kp=st.floats(0.01, 100),
-    Ki=st.floats(0.01, 1000),
-    Kd=st.floats(1e-4, 10),
-    Tf=st.floats(1e-5, 1.0),
-)
-def test_parallel_to_standard_and_back(Kp: float, Ki: float, Kd: float, Tf: float) -> None:
-    back = to_parallel(to_standard(ParallelForm(Kp, Ki, Kd, Tf)))
-    np.testing.assert_allclose([back.Kp, back.Ki, back.Kd, back.Tf], [Kp, Ki, Kd, Tf], rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("parallel", "standard"),
-    [
-        (ParallelForm(2.0), StandardForm(2.0, inf, 0.0, inf)),
-        (ParallelForm(2.0, 4.0), StandardForm(2.0, 0.5, 0.0, inf)),
-        (ParallelForm(2.0, 0.0, 0.5), StandardForm(2.0, inf, 0.25, inf)),
-    ],
-)
-def test_missing_actions_convert_both_ways(parallel: ParallelForm, standard: StandardForm) -> None:
-    assert to_standard(parallel) == standard
-    assert to_parallel(standard) == parallel
-
-
-def test_what_the_standard_form_cannot_say_is_refused() -> None:
-    with pytest.raises(InputError, match="needs Kp != 0"):
-        to_standard(ParallelForm(0.0, 1.0))
-    with pytest.raises(InputError, match="Ti = inf"):
-        to_parallel(StandardForm(1.0, 0.0))
-    with pytest.raises(InputError, match="N = 0"):
-        to_parallel(StandardForm(1.0, 1.0, 0.1, 0.0))
 
 
 def run_sampled(r: np.ndarray, y: np.ndarray, h: float) -> np.ndarray:

@@ -4,23 +4,31 @@ import pytest
 
 from pneuopt.certify import evaluate, respond
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.control.margins import frequency_response, margins, robustness
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.control.sensor import SensorLag
+from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.errors import InputError, ModelError
-from pneuopt.instruments import Encoder, Sensor
+from pneuopt.instruments import Sensor
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.requirements import MaxSensitivity, SettlingTime
+from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.rig import Rig
+from pneuopt.scenarios import Scenarios, corners
+from pneuopt.specification import specify
 from pneuopt.system import define
 from pneuopt.tune import tune
+from pneuopt.tuning.candidates import span
+from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.two_phase import TwoPhase
 
 LAG = 5e-3
+QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
 
 
 def first_order(sample_time: float | None = None) -> ClosedLoop:
@@ -93,7 +101,7 @@ def test_a_rig_has_sensors_of_its_own() -> None:
     drive = ForceDrive(Viscous()).system()
     seen, plain = (ClosedLoop(drive, PID(1e-3), sensor=sensor) for sensor in (SensorLag(LAG), None))
     values = {"pid.Kp": 300.0, "pid.Ki": 4000.0}
-    sensors, encoder = {"position": Sensor(resolution=1e-6)}, Encoder(filter_time=LAG)
+    sensors, encoder = {"position": Sensor(resolution=1e-6)}, Encoder(filter=LAG)
     runs = [
         respond(Rig(loop, sensors, encoder=encoder), Step(0.1, horizon=0.2), loop.parameters.with_values(values))
         for loop in (seen, plain)
@@ -120,3 +128,102 @@ def test_an_output_without_lag_needs_a_sensor() -> None:
 def test_a_lag_of_zero_is_no_sensor() -> None:
     with pytest.raises(InputError, match="leave the sensor out"):
         SensorLag(0.0)
+
+
+def encoder_loop(encoder: Encoder, measured: str = "speed") -> ClosedLoop:
+    return ClosedLoop(ForceDrive(Viscous()).system(), PID(1e-3), sensor=encoder, measured=measured)
+
+
+SPEED_GAINS = {"pid.Kp": 300.0, "pid.Ki": 4000.0}
+
+
+@pytest.mark.parametrize("resolution", [1e-5, 2e-4])
+def test_an_encoder_shows_what_a_rigs_does(resolution: float) -> None:
+    """`Rig` rounds and differentiates on its own; from rest the responses are the same, count by count."""
+    loop = encoder_loop(Encoder(resolution, LAG))
+    given = loop.parameters.with_values(SPEED_GAINS)
+    rig = Rig(ClosedLoop(loop.plant, PID(1e-3)), {"position": Sensor(resolution=resolution)}, encoder=Encoder(0.0, LAG))
+    ours, theirs = respond(loop, Step(0.1, horizon=0.2), given), respond(rig, Step(0.1, horizon=0.2), given)
+    assert np.interp(theirs.t, ours.t, ours["speed"]) == pytest.approx(theirs["speed"], abs=1e-6)
+    counts = Rig(rig.model, {"position": Sensor()}, encoder=Encoder(resolution, LAG))
+    assert respond(counts, Step(0.1, horizon=0.2), given)["speed"] == pytest.approx(theirs["speed"], abs=1e-12)
+
+
+def test_a_position_loop_sees_the_counts() -> None:
+    loop = encoder_loop(Encoder(1e-3), "position")
+    values = {"pid.Kp": 400.0, "pid.Kd": 40.0, "pid.Tf": 5e-3}
+    assert [n for n in loop.parameters if n.startswith("sensor.")] == ["sensor.resolution"]
+    run = respond(loop, Step(0.05, horizon=0.2), loop.parameters.with_values(values))
+    at = run.t % 1e-3 < 1e-9
+    expected = 1e-3 * np.floor(run["position"][at] / 1e-3 + 0.5)
+    assert run["sensor.reading"][at] == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_fine_encoder_is_a_lag_of_its_filter_and_half_a_sample() -> None:
+    drive = ForceDrive(Viscous()).system()
+    loops = [ClosedLoop(drive, PID(1e-3), sensor=sensor) for sensor in (Encoder(1e-9, LAG), SensorLag(LAG + 5e-4))]
+    runs = [respond(loop, Step(0.1, horizon=0.2), loop.parameters.with_values(SPEED_GAINS)) for loop in loops]
+    assert runs[0]["speed"] == pytest.approx(runs[1]["speed"], abs=2e-4)
+    fine, lagging = (loop.open_loop(loop.parameters.with_values(SPEED_GAINS)) for loop in loops)
+    np.testing.assert_allclose(fine.A, lagging.A)
+
+
+@pytest.mark.parametrize("h", [1e-3, 5e-3])
+@pytest.mark.parametrize("filter_time", [0.0, LAG])
+def test_an_encoders_margins_are_those_of_the_sampled_loop(h: float, filter_time: float) -> None:
+    """Against the exact z-transform: the position's zero-order hold, difference, filter, controller."""
+    loop = ClosedLoop(ForceDrive(Viscous()).system(), PID(h), sensor=Encoder(1e-5, filter_time))
+    given = loop.parameters.with_values(SPEED_GAINS)
+    plant = control.tf([1], [given.value("load.mass"), given.value("friction.viscous"), 0])
+    w = np.geomspace(1.0, 0.99 * np.pi / h, 4000)
+    z = np.exp(1j * w * h)
+    slope = (1 - 1 / z) / h
+    L = control.sample_system(plant, h, "zoh")(z) * slope / (1 + filter_time * slope) * (300 + 4000 / slope)
+    ours = loop.open_loop(given)
+    assert margins(ours).max_sensitivity == pytest.approx(np.max(1 / np.abs(1 + L)), rel=0.02)
+    x, numbers = np.zeros((1, 2)), loop.numbers(given)[None]
+    found = robustness(loop, np.geomspace(1.0, 1e3, 2000))(numbers, x, np.zeros(1), ("MaxSensitivity",))
+    assert found["MaxSensitivity"][0] == pytest.approx(margins(ours).max_sensitivity, rel=1e-4)
+
+
+@pytest.mark.parametrize("step", [Step(0.1, horizon=0.4), Step(0.1, at=0.05, initial=0.0537, horizon=0.4)])
+def test_search_and_certificate_count_alike(step: Step) -> None:
+    loop = encoder_loop(Encoder(2e-5, LAG))
+    given = loop.parameters.with_values(SPEED_GAINS).with_bounds({"pid.Kp": (50.0, 600.0)}).freed("pid.Kp")
+    (claimed,) = Simulator(loop, [step], span(loop, given)).table(np.array([300.0]), specify(SettlingTime()))
+    certified = evaluate(loop, step, given)[step.label]
+    assert np.isfinite(certified["SettlingTime"])
+    for name in ("SettlingTime", "Overshoot", "PeakControl", "MaxSensitivity"):
+        assert claimed[name] == pytest.approx(certified[name], rel=1e-3, abs=2e-4), name
+
+
+def test_counts_are_tuned_by_screening() -> None:
+    loop = encoder_loop(Encoder(2e-5, LAG))
+    given = loop.parameters.with_values(SPEED_GAINS).with_bounds({"pid.Kp": (50.0, 600.0)}).freed("pid.Kp")
+    told = r"Condensed has no gradient for sensor\.resolution \(an encoder's counts\); use method=Screening\(\)"
+
+    def tuned(loop: ClosedLoop, method: Condensed | Screening, scenarios: Scenarios) -> bool:
+        step, limits = Step(0.1, horizon=0.3), [Overshoot(0.1)]
+        goal = SettlingTime()
+        found = tune(loop, step, given, minimise=goal, subject_to=limits, method=method, scenarios=scenarios)
+        return found.status.converged
+
+    with pytest.raises(InputError, match=told):
+        tuned(loop, Condensed(), {})
+    assert tuned(loop, Screening(members=6, generations=2, refinements=20), corners(given, {"load.mass": 0.1}))
+    assert tuned(encoder_loop(Encoder(0.0, LAG)), QUICK, {})
+
+
+def test_an_encoder_needs_a_sampled_controller_and_a_position() -> None:
+    drive = ForceDrive(Viscous()).system()
+    with pytest.raises(ModelError, match="an Encoder is read once a sample: give the PID a sample_time"):
+        ClosedLoop(drive, PID(), sensor=Encoder(1e-5))
+    with pytest.raises(InputError, match="unknown output 'position'"):
+        ClosedLoop(FirstOrder().system(), PID(1e-3), sensor=Encoder(1e-5))
+    with pytest.raises(ModelError, match=r"the difference of 'pressure_a' \[Pa\(a\)\] is not 'speed' \[m/s\]"):
+        ClosedLoop(PneumaticDrive().system(), PID(1e-3), sensor=Encoder(1e-5, position="pressure_a"))
+    for resolution, filter_time, name in ((-1.0, 0.0, "resolution"), (0.0, -1.0, "filter")):
+        with pytest.raises(InputError, match=f"Encoder: {name} must not be negative"):
+            Encoder(resolution, filter_time)
+    with pytest.raises(ModelError, match="no derivatives through an Encoder"):
+        LoggedLoop(encoder_loop(Encoder(1e-5)))

@@ -25,7 +25,7 @@ from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator
 
 STEP = Step(1.0, horizon=2.0)
-QUICK = Condensed(members=8, generations=(3, 0, 0, 0), keep=(2, 2, 2, 1), iterations=(4, 4, 4, 12), polish=4)
+QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
 SPEC = specify(SettlingTime(), [Overshoot(0.1), SteadyStateError(0.05), PeakControl(200.0), MaxSensitivity(1.6)])
 
 
@@ -156,10 +156,10 @@ def test_what_has_no_gradient_is_refused() -> None:
 
 
 def test_bad_options_are_refused() -> None:
-    with pytest.raises(InputError, match="4 numbers, one a band"):
-        Condensed(keep=(3, 2))
-    with pytest.raises(InputError, match="nothing to start from"):
-        Condensed(generations=(0, 0, 0, 0))
+    with pytest.raises(InputError, match="keep must be a whole number, at least 1, got 0"):
+        Condensed(keep=0)
+    with pytest.raises(InputError, match="generations must be a whole number"):
+        Condensed(generations=0)
     with pytest.raises(InputError, match="working must be at least 1"):
         Condensed(working=0)
 
@@ -179,7 +179,7 @@ def test_a_working_set_takes_in_the_case_that_it_missed() -> None:
     """One case at a time; the answer is still that of the slowest of six."""
     loop, given = integrator()
     scenarios = {f"gain {k:g}": {"plant.gain": k} for k in (0.7, 0.9, 1.1, 1.2, 1.3)}
-    method = Condensed(members=8, generations=(2, 0, 0, 0), keep=(1,) * 4, iterations=(4,) * 4, working=2, polish=2)
+    method = Condensed(members=8, generations=2, keep=1, iterations=16, working=2, polish=2)
     best = tune(
         loop,
         STEP,

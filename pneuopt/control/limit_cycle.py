@@ -1,0 +1,184 @@
+"""Hunting and crawl: a sustained oscillation in a response or a log, found and measured.
+
+A limit cycle repeats (its autocorrelation comes back), keeps its size (a ringing that dies out is none) and is what is
+left when the dither's own ripple is averaged away.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import log
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pneuopt.control.metrics import period_mean
+from pneuopt.errors import require
+
+Array = NDArray[np.float64]
+SETTLED = 0.4  # share of a record that is left out for the transient, unless a start is given
+CYCLES = 3  # at least, in what is looked at
+REPEATS = 0.5  # least autocorrelation a period later: noise as strong as the cycle is allowed
+IRREGULAR = 0.35  # most relative spread of the periods; filtered noise has more
+SMOOTHER = 8  # parts of the period over which noise is averaged before zeros are looked for
+SWITCH = 0.3  # hysteresis of the crossings, in standard deviations
+KEEPS, DIES = log(0.98), log(0.8)  # growth per period: surely below the first, or just below the second, it dies out
+LEAST = 0.01  # of the record's range: a smaller amplitude is none
+STILL = 0.02  # of the largest size in sight: a speed below it is a standstill
+PHASES = 64
+
+
+@dataclass(frozen=True)
+class LimitCycle:
+    """A sustained oscillation.
+
+    Attributes
+    ----------
+    amplitude : float
+        Half of peak to peak of the mean cycle [unit of the signal].
+    frequency : float
+        [Hz]
+    stick_share : float
+        Of a speed: the share of time at a standstill.
+    cycles : int
+        How many were seen.
+    """
+
+    amplitude: float
+    frequency: float
+    stick_share: float
+    cycles: int
+
+    def told(self, unit: str) -> str:
+        """In words.
+
+        Examples
+        --------
+        >>> LimitCycle(0.012, 2.34, 0.4, 7).told("m/s")
+        'a limit cycle of +-0.012 m/s at 2.34 Hz, at a standstill 40 % of the time'
+        """
+        sticks = f", at a standstill {100 * self.stick_share:.0f} % of the time" if self.stick_share >= 0.005 else ""
+        return f"a limit cycle of +-{self.amplitude:.3g} {unit} at {self.frequency:.3g} Hz{sticks}"
+
+
+def find_limit_cycle(
+    t: ArrayLike,
+    y: ArrayLike,
+    *,
+    start: float | None = None,
+    dither_period: float | None = None,
+    least: float | None = None,
+    still: float | None = None,
+) -> LimitCycle | None:
+    """Look for hunting in a signal under a constant reference.
+
+    Parameters
+    ----------
+    t : array_like, shape (n,)
+        Time, strictly increasing [s].
+    y : array_like, shape (n,)
+        A speed, say [unit].
+    start : float, optional
+        From when on [s]; by default the first 40 % of the record are left to the transient.
+    dither_period : float, optional
+        Average over this time first [s] (`ClosedLoop.dither_period`): a dither's ripple is no limit cycle.
+    least : float, optional
+        Smallest amplitude that counts [unit]; by default 1 % of the record's range.
+    still : float, optional
+        Up to which size a speed is a standstill [unit]; by default 2 % of the largest in sight.
+
+    Returns
+    -------
+    LimitCycle or None
+        None for noise, for a ringing that dies out, and where fewer than three cycles are in sight.
+
+    Raises
+    ------
+    InputError
+        If the record does not fit together or is too short to average.
+
+    Examples
+    --------
+    >>> t = np.linspace(0.0, 4.0, 2001)
+    >>> hunting = 0.05 + 0.02 * np.sin(2 * np.pi * 2.5 * t)
+    >>> print(find_limit_cycle(t, hunting).told("m/s"))
+    a limit cycle of +-0.02 m/s at 2.5 Hz
+    >>> find_limit_cycle(t, 0.05 + 0.02 * np.exp(-t) * np.sin(2 * np.pi * 2.5 * t)) is None
+    True
+    """
+    grid, values = np.asarray(t, dtype=float), np.asarray(y, dtype=float)
+    require(grid.ndim == 1 and grid.shape == values.shape, f"t and y differ in shape: {grid.shape} and {values.shape}")
+    require(
+        len(grid) > 2 and bool(np.all(np.diff(grid) > 0)), "time must increase strictly, over at least three samples"
+    )
+    require(bool(np.all(np.isfinite(values))), "the signal holds NaN; cut the record, or fill it")
+    begin = grid[0] + SETTLED * (grid[-1] - grid[0]) if start is None else start
+    require(begin < grid[-1], f"start = {begin:g} s lies behind the record's end, {grid[-1]:g} s")
+    at, swing = _swing(grid, values, begin, dither_period)
+    smallest = LEAST * np.ptp(values) if least is None else least
+    lag = _lag(swing) if np.ptp(swing) >= 2 * smallest > 0 else 0
+    if lag == 0:
+        return None
+    swing = _levelled(swing, lag)
+    smooth = np.convolve(swing, np.ones(1 + lag // SMOOTHER) / (1 + lag // SMOOTHER), "same")
+    crossings = _crossings(at, smooth)
+    if len(crossings) <= CYCLES or np.std(np.diff(crossings)) > IRREGULAR * np.mean(np.diff(crossings)):
+        return None
+    phases = np.array([np.linspace(a, b, PHASES) for a, b in pairwise(crossings)])
+    amplitude = float(np.ptp(np.interp(phases, at, swing).mean(axis=0)) / 2)
+    if amplitude < smallest or _dies_out(np.ptp(np.interp(phases, at, smooth), axis=1)):
+        return None
+    size = np.abs(values[grid >= begin])
+    share = float(np.mean(size <= (STILL * size.max() if still is None else still)))
+    count = len(crossings) - 1
+    return LimitCycle(amplitude, float(count / (crossings[-1] - crossings[0])), share, count)
+
+
+def _swing(t: Array, y: Array, begin: float, period: float | None) -> tuple[Array, Array]:
+    """On an even grid from `begin` on: without the dither, without a straight line."""
+    edge = 0.0 if period is None else period / 2
+    first, last = max(begin, t[0] + edge), t[-1] - edge
+    require(first < last, f"the record of {t[-1] - t[0]:g} s is too short to average over {2 * edge:g} s")
+    at = np.linspace(first, last, max(3, int((last - first) / np.median(np.diff(t))) + 1))
+    level = np.interp(at, t, y) if period is None else period_mean(t, y[None], y[0], period, at)[0]
+    return at, level - np.polyval(np.polyfit(at - at[0], level, 1), at - at[0])
+
+
+def _lag(swing: Array) -> int:
+    """Samples after which it comes back, by the autocorrelation's peak within a third of the record; 0: it does not."""
+    n = len(swing)
+    power = np.abs(np.fft.rfft(swing, 2 * n)) ** 2
+    r = np.fft.irfft(power)[: n // CYCLES] * n / (n - np.arange(n // CYCLES))
+    below = np.flatnonzero(r < 0)
+    if not len(below) or r[below[0] :].max() < REPEATS * r[0]:
+        return 0
+    return int(below[0] + np.argmax(r[below[0] :]))
+
+
+def _levelled(swing: Array, lag: int) -> Array:
+    """Without the straight line through its means over whole periods, which a part of a period does not bend."""
+    whole = np.convolve(swing, np.ones(lag) / lag, "valid")
+    line = np.polyfit(np.arange(len(whole)) + (lag - 1) / 2, whole, 1)
+    return np.asarray(swing - np.polyval(line, np.arange(len(swing))))
+
+
+def _crossings(t: Array, swing: Array) -> Array:
+    """When it begins to rise through zero, if it goes on to rise as far as `SWITCH` says, having been as far below."""
+    level = SWITCH * np.std(swing)
+    side = np.where(swing > level, 1, np.where(swing < -level, -1, 0))
+    far = np.flatnonzero(side)
+    up = np.flatnonzero(np.diff(side[far]) > 0)
+    found = []
+    for before, after in zip(far[up], far[up + 1], strict=True):
+        k = before + np.flatnonzero((swing[before:after] < 0) & (swing[before + 1 : after + 1] >= 0))[-1]
+        found.append(t[k] - swing[k] * (t[k + 1] - t[k]) / (swing[k + 1] - swing[k]))
+    return np.array(found)
+
+
+def _dies_out(sizes: Array) -> bool:
+    """Whether the cycles shrink: the logarithm's slope, with its standard error."""
+    k = np.arange(len(sizes)) - (len(sizes) - 1) / 2
+    logs = np.log(np.maximum(sizes, 1e-300))
+    slope = float(k @ logs / (k @ k))
+    left = logs - logs.mean() - slope * k
+    error = float(np.sqrt(left @ left / max(1, len(sizes) - 2) / (k @ k)))
+    return slope < DIES or slope + 2 * error < KEEPS

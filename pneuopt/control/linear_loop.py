@@ -1,0 +1,102 @@
+"""The loop linearised: the plant as the controller sees it, and the open loop whose margins count."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pneuopt.control.rest import find_rest
+from pneuopt.errors import require
+from pneuopt.parameters import ParameterSet
+from pneuopt.system import Linearisation
+
+if TYPE_CHECKING:
+    from pneuopt.control.loop import ClosedLoop
+
+Array = NDArray[np.float64]
+
+
+def linear_plant(
+    loop: "ClosedLoop", parameters: ParameterSet, x: Array | None, u: Mapping[str, float] | None
+) -> Linearisation:
+    """As `ClosedLoop.linear_plant`."""
+    loop.check(parameters)
+    if x is None:
+        x, command = find_rest(loop, parameters, 0.0, {})
+        u = {loop.command.name: command, **(u or {})}
+    plant = loop.plant.linearise(x, u or {}, parameters)
+    j, i = plant.inputs.index(loop.command.name), plant.outputs.index(loop.feedback.name)
+    A, B, C, D = plant.A, plant.B[:, j : j + 1], plant.C[i : i + 1], plant.D[i : i + 1, j : j + 1]
+    states, lag = plant.states, loop.sensor_lag(loop.numbers(parameters))
+    if lag:
+        n = len(A)
+        A = np.block([[A, np.zeros((n, 1))], [C / lag, np.array([[-1 / lag]])]])
+        B, C, D = np.vstack([B, D / lag]), np.eye(1, n + 1, n), np.zeros((1, 1))
+        states = (*states, "sensor.reading")
+    return Linearisation(A, B, C, D, states, (loop.command.name,), (loop.feedback.name,))
+
+
+def open_loop(
+    loop: "ClosedLoop", parameters: ParameterSet, x: Array | None, u: Mapping[str, float] | None
+) -> Linearisation:
+    """As `ClosedLoop.open_loop`."""
+    plant, controller = linear_plant(loop, parameters, x, u), _controller(loop, parameters)
+    m, n = len(controller.A), len(plant.A)
+    return Linearisation(
+        np.block([[plant.A, plant.B @ controller.C], [np.zeros((m, n)), controller.A]]),
+        np.vstack([plant.B @ controller.D, controller.B]),
+        np.hstack([plant.C, np.zeros((1, m))]),
+        np.zeros((1, 1)),
+        plant.states + controller.states,
+        ("error",),
+        (loop.feedback.name,),
+    )
+
+
+def linear_gains(loop: "ClosedLoop", p: Any) -> Any:
+    """Kp, Ki, Kd, Tf of the controller's continuous equivalent, shape (4, m).
+
+    Backward Euler puts ``(1 - e^(-s h))/h``, nearly ``s/(1 + s h/2)``, for s: a sampled controller is the continuous
+    one with ``Kp + Ki h/2`` and ``Tf + h/2``.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    p : array or casadi.SX, shape (n_parameters, m)
+        In the order of ``loop.parameters``.
+
+    Returns
+    -------
+    casadi.DM or casadi.SX, shape (4, m)
+    """
+    gains, half = loop.gains(p), 0.5 * (loop.pid.sample_time or 0.0)
+    return ca.vertcat(gains[0, :] + half * gains[1, :], gains[1:3, :], gains[3, :] + half)
+
+
+def delayed(omega: ArrayLike, dead_time: float) -> NDArray[np.complex128]:
+    """``e^(-jw dead_time)`` as Padé's approximant of second order has it, shape (n,); omega [rad/s].
+
+    Examples
+    --------
+    >>> round(float(np.angle(delayed([1.0], 1.0), deg=True)[0]), 2)
+    -57.22
+    """
+    s = 1j * np.asarray(omega, dtype=float) * dead_time
+    return np.asarray((1 - s / 2 + s**2 / 12) / (1 + s / 2 + s**2 / 12))
+
+
+def _controller(loop: "ClosedLoop", parameters: ParameterSet) -> Linearisation:
+    Kp, Ki, Kd, Tf = linear_gains(loop, loop.numbers(parameters)).full().ravel().tolist()
+    require(Tf > 0, "a continuous derivative needs a filter, Tf > 0")
+    A, B = np.diag([0.0, -1 / Tf]), np.array([[Ki], [1 / Tf]])
+    C, D, dead_time = np.array([[1.0, -Kd / Tf]]), np.array([[Kp + Kd / Tf]]), loop.dead_time
+    if dead_time:  # `delayed` is 1 - (12 s/T)/(s^2 + 6 s/T + 12/T^2), here with states of one size
+        root = np.sqrt(12) / dead_time
+        lags, fed = np.array([[0.0, root], [-root, -6 / dead_time]]), np.array([[0.0], [1.0]])
+        taken = np.array([[0.0, -12 / dead_time]])
+        A = np.block([[A, np.zeros((2, 2))], [fed @ C, lags]])
+        B, C = np.vstack([B, fed @ D]), np.hstack([C, taken])
+    own = ("pid.integral", "pid.filter", "pid.held", "pid.held_before")[: len(A)]
+    return Linearisation(A, B, C, D, own, ("error",), ("control",))

@@ -1,0 +1,75 @@
+"""Bumpless change of gains: the integral with which new gains take over where the old ones are."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.errors import require
+from pneuopt.parameters import ParameterSet
+from pneuopt.system import names
+
+Array = NDArray[np.float64]
+
+
+def take_over(loop: ClosedLoop, x: ArrayLike, old: ParameterSet, new: ParameterSet, *, reference: float = 0.0) -> Array:
+    """The state from which a running loop goes on with new gains as if nothing had happened (bumpless transfer).
+
+    The next command that the new gains give, before the clip, is the one that the old gains would have given. What
+    differs is taken by the integral, ``I' = I + Kp (b r - y) + D - Kp' (b' r - y) - D'``, each with what it adds by
+    itself (feedforward, dither's offset), and where c changes, the error that the derivative remembers moves with it.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    x : array_like, shape (n_states,)
+        The running loop's state: a sampled one's between two samples, as at the end of a simulation.
+    old, new : ParameterSet
+        A missing parameter has the loop's default.
+    reference : float
+        At this instant [unit of the measured signal].
+
+    Returns
+    -------
+    ndarray, shape (n_states,)
+
+    Raises
+    ------
+    InputError
+        If new gains cannot run, or the state has another shape.
+
+    Examples
+    --------
+    A loop at rest at 1 m/s stays there with twice the gain, which its state as it was would have pushed:
+
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(1e-3, limits=False))
+    >>> old = loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 9.0, "pid.b": 0.5})
+    >>> new = old.with_values({"pid.Kp": 4.0})
+    >>> before = loop.initial(old, reference=1.0)
+    >>> after = take_over(loop, before, old, new, reference=1.0)
+    >>> [loop.update(0, x, [1.0], loop.numbers(new))[-1].__float__() for x in (before, after)]
+    [0.0, 1.0]
+    """
+    loop.check(new)
+    order, state = names(loop.states), np.array(x, dtype=float)
+    require(state.shape == (len(order),), f"x has shape {state.shape}, the loop has {len(order)} states")
+    remembered = order.index("pid.filter" if loop.pid.sample_time is None else "pid.previous_error")
+    c, c_new = (loop.numbers(p)[list(loop.parameters).index("pid.c")] for p in (old, new))
+    before = _command(loop, state, old, reference)
+    state[remembered] += (c_new - c) * reference
+    state[order.index("pid.integral")] += before - _command(loop, state, new, reference)
+    return state
+
+
+def _command(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:
+    """The next one that is computed, before the clip; at t = 0, where a dither's wave is zero."""
+    free = replace(loop, pid=replace(loop.pid, limits=False))
+    u, p = np.zeros(len(loop.inputs)), free.numbers(parameters)
+    u[0] = reference
+    if loop.pid.sample_time is None:
+        return float(free.system().ode(0.0, x, u, p)[1][-1])
+    held = "pid.pending" if loop.pid.delay else "pid.command"
+    return float(free.update(0.0, x, u, p)[names(loop.states).index(held)])

@@ -1,0 +1,188 @@
+"""`validate_design`: what a design is worth on plants, and with gains, that no search has seen."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.certify import evaluate
+from pneuopt.control.disturbance import disturbed
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Step
+from pneuopt.errors import require
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import AT_LEAST, KINDS, PERCENT, Requirement, most, name
+from pneuopt.scenarios import Scenarios
+from pneuopt.specification import Specification, specify
+from pneuopt.tuning.candidates import Space
+from pneuopt.tuning.simulator import Simulator
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+QUANTILE = 95.0  # [%]
+LOWER = tuple(kind.__name__ for kind in AT_LEAST)  # metrics of which the smallest is the worst
+
+
+@dataclass(frozen=True, eq=False)
+class DesignValidation:
+    """What `validate_design` found.
+
+    Attributes
+    ----------
+    summary : DataFrame
+        A row a requirement, in the units of `TuningResult.certified`: "median", "p95" (95 of 100 plants do better) and
+        "worst" by the compiled simulation; "worst_plant", and "certified", what the independent simulation says of that
+        plant; "limit", NaN without; "violations", the plants that break it, or that never settle. NaN: never settles.
+    plants : DataFrame
+        A row a plant, a column a metric, the worst over the references; by the compiled simulation.
+    certified : DataFrame
+        A row a metric, a column a reference and one of the worst plants; by the independent one.
+    """
+
+    summary: "pd.DataFrame"
+    plants: "pd.DataFrame"
+    certified: "pd.DataFrame"
+
+    def __repr__(self) -> str:
+        return f"DesignValidation on {len(self.plants)} fresh plants\n{self.summary.to_string()}"
+
+
+def validate_design(
+    loop: ClosedLoop,
+    references: Step | Sequence[Step],
+    parameters: ParameterSet,
+    *,
+    minimise: Requirement | Mapping[Requirement, float],
+    subject_to: Sequence[Requirement] = (),
+    scenarios: Scenarios,
+) -> DesignValidation:
+    """Try a design on fresh plants: all by compiled simulation, each requirement's worst plant by the independent one.
+
+    Parameters
+    ----------
+    loop, references, minimise, subject_to
+        As for `tune`.
+    parameters : ParameterSet
+        Of the design, a `TuningResult.parameters` say.
+    scenarios : mapping of str to mapping
+        The plants, or tolerances of the gains: of `samples` or `draws` with another seed than the search had, or
+        `tolerances` with a count.
+
+    Returns
+    -------
+    DesignValidation
+
+    Raises
+    ------
+    InputError
+        If there is no scenario, or parameters, scenarios and requirements do not fit together.
+    ConvergenceError
+        If the loop has no rest on one of the plants, or the independent simulation stops.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> from pneuopt.requirements import Overshoot, SettlingTime
+    >>> from pneuopt.scenarios import samples
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    >>> design = loop.parameters.with_values({"pid.Kp": 5.0, "pid.Ki": 50.0})
+    >>> fresh = samples(design, {"plant.gain": 0.2}, 50, seed=1)
+    >>> found = validate_design(
+    ...     loop, Step(1.0), design, minimise=SettlingTime(), subject_to=[Overshoot(0.01)], scenarios=fresh
+    ... )
+    >>> int(found.summary.loc["Overshoot", "violations"])
+    0
+    """
+    require(len(scenarios) > 0, "no fresh plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)")
+    spec = specify(minimise, subject_to)
+    steps = [references] if isinstance(references, Step) else list(references)
+    loop = disturbed(loop, steps)
+    full = loop.parameters | parameters.select(n for n in parameters if n in loop.parameters)
+    values = _simulated(loop, steps, full, spec, scenarios)
+    plants = [str(n) for n in values]
+    worst = {str(n): plants[_order(row.to_numpy(dtype=float), str(n))[-1]] for n, row in values.iterrows()}
+    named = list(dict.fromkeys(worst.values()))
+    certified = evaluate(
+        loop, steps, full, scenarios={n: scenarios[n] for n in named}, band=spec.band, envelope=spec.envelope
+    )
+    certified = certified.loc[list(values.index), certified.columns[len(steps) :]]
+    return DesignValidation(_summary(values, worst, _by_plant(certified, named, len(steps)), spec), values.T, certified)
+
+
+def _simulated(
+    loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
+) -> "pd.DataFrame":
+    """Metrics by compiled simulation, the worst over the references."""
+    import pandas as pd
+
+    simulator = Simulator(loop, steps, Space(parameters, ()), scenarios, spec)
+    rows = simulator.table(np.zeros(0), spec)
+    found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
+    shown = [kind.__name__ for kind in KINDS if kind.__name__ in spec.kinds]
+    return _by_plant(found.loc[shown, found.columns[len(steps) :]], list(scenarios), len(steps))
+
+
+def _by_plant(metrics: "pd.DataFrame", plants: Sequence[str], references: int) -> "pd.DataFrame":
+    """Metrics of one plant after another, so many references each, as the worst of each plant; NaN is the worst."""
+    import pandas as pd
+
+    found = {}
+    for number, plant in enumerate(plants):
+        own = metrics.iloc[:, number * references : (number + 1) * references]
+        found[plant] = {n: _worst(row.to_numpy(dtype=float), str(n)) for n, row in own.iterrows()}
+    return pd.DataFrame(found, index=metrics.index)
+
+
+def _worst(values: Array, metric: str) -> float:
+    return float(values[_order(values, metric)[-1]])
+
+
+def _order(values: Array, metric: str) -> NDArray[np.intp]:
+    """From the best to the worst; what is no number is the worst."""
+    cost = -values if metric in LOWER else values
+    return np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
+
+
+def _summary(
+    values: "pd.DataFrame", worst: Mapping[str, str], certified: "pd.DataFrame", spec: Specification
+) -> "pd.DataFrame":
+    import pandas as pd
+
+    limits, proven = {name(q): _limit(q) for q in spec.limits}, certified.to_dict()
+    rows = {}
+    for metric, plant in worst.items():
+        given, limit = values.loc[metric].to_numpy(dtype=float), limits.get(metric, math.nan)
+        rows[metric] = {
+            "median": _quantile(given, metric, 50.0),
+            "p95": _quantile(given, metric, QUANTILE),
+            "worst": _worst(given, metric),
+            "worst_plant": plant,
+            "certified": float(proven[plant][metric]),
+            "limit": limit,
+            "violations": int(np.sum(~_kept(given, limit, metric))),
+        }
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def _quantile(values: Array, metric: str, percent: float) -> float:
+    """The value of the plant that so many do not exceed."""
+    return float(values[_order(values, metric)[math.ceil(len(values) * percent / 100) - 1]])
+
+
+def _limit(requirement: Requirement) -> float:
+    """As the metric counts: percent where it does, a margin itself."""
+    if isinstance(requirement, AT_LEAST):
+        return 1 / most(requirement)
+    return most(requirement) * (100 if name(requirement) in PERCENT else 1)
+
+
+def _kept(values: Array, limit: float, metric: str) -> NDArray[np.bool_]:
+    if math.isnan(limit):
+        return np.isfinite(values)
+    return np.asarray(values >= limit if metric in LOWER else values <= limit)

@@ -1,0 +1,320 @@
+"""`pareto_front`: what one requirement costs in terms of another, as a table of certified designs.
+
+By epsilon constraint: the first requirement is minimised for a row of limits on the second, from the design that is
+best by the first to the one that is best by the second, which two full tunings find. Each design is the start of its
+neighbours', in both directions, so that a branch of local minima that one end leads into is left for the other's; a
+design that a neighbour beats in both requirements is searched for again from there.
+"""
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import nan
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.certificate import Found, TuningResult
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Step
+from pneuopt.errors import ConvergenceError, require
+from pneuopt.nlp.status import Code, Solution, Status
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import Requirement, name, shown
+from pneuopt.scenarios import NOMINAL, Scenarios
+from pneuopt.specification import Specification, allowing
+from pneuopt.tune import Method, Search, brief, ended_in, pose
+from pneuopt.tuning.candidates import Tell
+from pneuopt.tuning.relaxation import settling
+from pneuopt.tuning.simulator import each
+from pneuopt.tuning.two_phase import TwoPhase, TwoPhasePath, two_phase_path
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+WIDE = 8.0  # ratio of the ends from which on the limits lie evenly in the logarithm
+ROUNDS = 2  # of searching again for designs that others beat
+BEATEN = 1e-3  # relative, by which another design has to be better
+BESIDE = 1e-3  # weight of the other requirement at an end: of designs that are equally good, the best by the other
+
+
+def pareto_front(
+    loop: ClosedLoop,
+    references: Step | Sequence[Step],
+    parameters: ParameterSet,
+    *,
+    minimise: tuple[Requirement, Requirement],
+    subject_to: Sequence[Requirement] = (),
+    scenarios: Scenarios = NOMINAL,
+    points: int = 15,
+    method: Method | None = None,
+    progress: Tell | None = None,
+) -> "pd.DataFrame":
+    """Designs that are best by one requirement for what they are by another.
+
+    Parameters
+    ----------
+    loop, references, parameters, subject_to, scenarios, method, progress
+        As for `tune`.
+    minimise : (Requirement, Requirement)
+        Two kinds; a bound of theirs is a limit as well.
+    points : int
+        Designs, the two ends included; at least 3.
+
+    Returns
+    -------
+    DataFrame
+        A row a design, from the best by the first requirement to the best by the second. Columns: both requirements'
+        names, certified, the worst over references and scenarios, as the user writes them (a fraction where
+        `Overshoot.max` is one); "claimed" and a name, by the search; "limit", what the second was held to; the gains;
+        "solver_seconds", where a solver follows the front of a linear loop; "seconds"; "error", empty where the
+        design is certified, else the reason, and the figures are missing. One row where one design is best by both.
+        Ctrl-C leaves the designs found so far, the others as rows with that reason.
+
+    Raises
+    ------
+    InputError
+        As `tune`; if both requirements are of one kind.
+    ConvergenceError
+        If an end of the front cannot be found; `solution` is its `TuningResult`.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.linear import FirstOrder
+    >>> from pneuopt.requirements import PeakControl, SettlingTime
+    >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    >>> given = loop.parameters.with_bounds({"pid.Kp": (1.0, 20.0), "pid.Ki": (10.0, 200.0)}).freed("pid.Kp", "pid.Ki")
+    >>> front = pareto_front(loop, Step(1.0), given, minimise=(SettlingTime(), PeakControl()), points=4)
+    >>> bool(front["SettlingTime"].is_monotonic_increasing), bool(front["PeakControl"].is_monotonic_decreasing)
+    (True, True)
+    """
+    first, second = minimise
+    require(name(first) != name(second), f"both requirements are {name(first)}; a front needs two kinds")
+    require(points >= 3, f"a front needs at least 3 points, got {points}")
+    both = pose(loop, references, parameters, {first: 1.0, second: 1.0}, subject_to, scenarios, method, progress)
+    front = _Front(both, first, second)
+    with suppress(KeyboardInterrupt):
+        front.find(points)
+    return front.frame()
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """One point of a front.
+
+    Attributes
+    ----------
+    limit : float
+        On the second requirement, as `read` gives it.
+    result : TuningResult or None
+        None: not reached.
+    seconds, solver_seconds : float
+    """
+
+    limit: float
+    result: TuningResult | None = None
+    seconds: float = 0.0
+    solver_seconds: float = 0.0
+
+
+@dataclass(eq=False)
+class _Front:
+    """A front in the making."""
+
+    both: Search
+    first: Requirement
+    second: Requirement
+    designs: list[Design] = field(default_factory=list)
+
+    def find(self, points: int) -> None:
+        """All designs; again where one between the ends shows that an end was none."""
+        ends = [self._end(self.first), self._end(self.second)]
+        for _ in range(ROUNDS):
+            self._between(ends, points)
+            better = [self._best(self.first), self._best(self.second)]
+            if better == ends or len(self.designs) == 1:
+                break
+            pairs = zip((self.first, self.second), ends, better, strict=True)
+            ends = [old if old is new else self._end(q, new.result) for q, old, new in pairs]
+
+    def _best(self, requirement: Requirement) -> Design:
+        """The best design by one requirement; an end unless another is clearly better."""
+        end = self.designs[0 if requirement is self.first else -1]
+        good = [d for d in self.designs if d.result is not None and d.result.status.converged]
+        best = min(good, key=lambda d: _value(_found(d), requirement))
+        return best if _value(_found(best), requirement) < _value(_found(end), requirement) * (1 - BEATEN) else end
+
+    def _between(self, ends: list[Design], points: int) -> None:
+        """What lies between the ends."""
+        high, low = ends[0].limit, ends[1].limit
+        if high <= low * (1 + BEATEN):
+            self.designs = ends[:1]
+            return
+        self.designs = [ends[0], *(Design(limit) for limit in _spread(high, low, points)[1:-1]), ends[1]]
+        if isinstance(self.both.method, TwoPhase):
+            self._follow(self.both.method)
+        else:
+            for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
+                self._improve(k, start)
+        tried = set[tuple[int, int]]()
+        for _ in range(ROUNDS):
+            for k, better in [pair for pair in self._beaten() if pair not in tried]:
+                tried.add((k, better))
+                self._improve(k, better)
+
+    def frame(self) -> "pd.DataFrame":
+        """What there is so far."""
+        import pandas as pd
+
+        return pd.DataFrame([self._row(design) for design in self.designs])
+
+    def _end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
+        """The best by one requirement, and of many such by the other."""
+        begun, pair = time.perf_counter(), (self.first, self.second)
+        weights = {q: self._weight(q) * (1.0 if q is requirement else BESIDE) for q in pair}
+        spec = replace(self.both.spec, weights=weights, limits=settling(self.both.spec, self.both.notary.references))
+        method, point = self.both.method, None
+        if start is not None:  # a search over wide bands would lose it
+            method, point = brief(method, method.margin), ended_in(start, self.both.space)
+        result = self.both.asking(spec, method).run(point)
+        if not result.status.converged:
+            told = f"no front: its end, {name(requirement)} as small as the limits allow, is {result.status}"
+            raise ConvergenceError(told, result)
+        return Design(_value(result, self.second), result, time.perf_counter() - begun)
+
+    def _weight(self, requirement: Requirement) -> float:
+        """That makes a requirement of the order of the horizon, as the searches' penalties are."""
+        horizon = min(r.horizon - r.at for r in self.both.notary.references)
+        return horizon / self._sizes[name(requirement)] if self._sizes[name(requirement)] else 1.0
+
+    @cached_property
+    def _sizes(self) -> dict[str, float]:
+        """What the requirements come to with the given gains; 0 where that is unknown."""
+        space = self.both.space
+        found = each(self.both.simulator.values(space.start[None], self.both.spec))[0]
+        return {n: v if np.isfinite(v) and v > 0 else 0.0 for n, v in found.items()}
+
+    def _limited(self, limit: float) -> Specification:
+        """The first requirement to be minimised, the second held."""
+        others = tuple(q for q in self.both.spec.limits if name(q) != name(self.second))
+        weights = {self.first: self._weight(self.first)}
+        return replace(self.both.spec, weights=weights, limits=(*others, allowing(self.second, limit)))
+
+    def _follow(self, method: TwoPhase) -> None:
+        """With a solver along the limits; where what is found does not survive printing, again with more margin."""
+        search = self.both.asking(self._limited(self.designs[1].limit), method)
+        notary, todo = search.notary, list(range(1, len(self.designs) - 1))
+        spec = search.tightened(method.margin)
+        path = two_phase_path(notary.loop, notary.references, search.space, spec, method)
+        for margin in (method.margin, 2 * method.margin, 4 * method.margin):
+            asked = [self._search(k, method) for k in todo]
+            found = self._tracked(path, [own.tightened(margin) for own in asked])
+            for k, own, solution in zip(todo, asked, found, strict=True):
+                self._certify(k, own, solution, margin)
+                self.both.tell(f"design {k + 1} of {len(self.designs)}: {_status(self.designs[k])}")
+            todo = [k for k in todo if not _status(self.designs[k]).converged]
+            if not todo:
+                break
+
+    def _tracked(self, path: TwoPhasePath, specs: Sequence[Specification]) -> list[Solution]:
+        """From the first end; where the other end is on another branch, from there, too, and the better.
+
+        Two tracks that agree next to the second end are one.
+        """
+        space, ends = self.both.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
+        starts = [ended_in(result, space) for result in ends]
+        found = path.follow(starts[0], specs)
+        other = path.follow(starts[1], specs[-1:])
+        if _cost(other[0]) < _cost(found[-1]) * (1 - BEATEN):
+            other = path.follow(starts[1], specs[::-1])
+        for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
+            spent = found[k].stats["seconds"] + back.stats["seconds"]
+            better = back if _cost(back) < _cost(found[k]) else found[k]
+            found[k] = replace(better, stats={**better.stats, "seconds": spent})
+        return found
+
+    def _certify(self, k: int, search: Search, solution: Solution, margin: float) -> None:
+        begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
+        point = np.array([solution.parameters.value(n) for n in search.space.names])
+        found = Found(point, solution.status, tuple(solution.multipliers), {"optimum": solution.stats["cost"]})
+        good = solution.status.converged
+        result = search.certified(found, margin) if good else search.notary.result(search.simulator, found, point)
+        seconds = old.seconds + spent + time.perf_counter() - begun
+        self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
+
+    def _search(self, k: int, method: Method) -> Search:
+        return self.both.asking(self._limited(self.designs[k].limit), method)
+
+    def _improve(self, k: int, start: int) -> None:
+        """Search for a design from another; the better stays."""
+        begun, old, other = time.perf_counter(), self.designs[k], self.designs[start].result
+        search = self._search(k, brief(self.both.method, self.both.method.margin))
+        result = search.run(None if other is None else ended_in(other, search.space))
+        if result.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        self.both.tell(f"{name(self.second)} {shown(self.second, old.limit):.4g}: {result.status}")
+        seconds = old.seconds + time.perf_counter() - begun
+        kept = old.result if old.result is not None and not self._is_better(result, old.result) else result
+        self.designs[k] = replace(old, result=kept, seconds=seconds)
+
+    def _is_better(self, one: TuningResult, other: TuningResult) -> bool:
+        if not one.status.converged or not other.status.converged:
+            return one.status.converged
+        return _value(one, self.first) < _value(other, self.first)
+
+    def _beaten(self) -> list[tuple[int, int]]:
+        """Designs that another, which keeps their limit, beats; and the best such other."""
+        good = {k: d.result for k, d in enumerate(self.designs) if d.result is not None and d.result.status.converged}
+        values = {k: (_value(r, self.first), _value(r, self.second)) for k, r in good.items()}
+        found = []
+        for k, design in list(enumerate(self.designs))[1:-1]:
+            own = values[k][0] if k in values else np.inf
+            rivals = [j for j, (a, b) in values.items() if j != k and b <= design.limit and a < own * (1 - BEATEN)]
+            if rivals:
+                found.append((k, min(rivals, key=lambda j: values[j][0])))
+        return found
+
+    def _row(self, design: Design) -> dict[str, Any]:
+        result, pair, space = design.result, (self.first, self.second), self.both.space
+        good = result is not None and result.status.converged
+        columns = {"": "certified", "claimed ": "claimed"}
+        known = result.requirements if result is not None and good else None
+        figures = {
+            f"{lead}{name(q)}": nan if known is None else float(known[column][name(q)])
+            for lead, column in columns.items()
+            for q in pair
+        }
+        gains = {n: nan if result is None or not good else result.parameters.value(n) for n in space.names}
+        costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
+        error = "" if good else str(_status(design))
+        return {**figures, "limit": shown(self.second, design.limit), **gains, **costs, "error": error}
+
+
+def _found(design: Design) -> TuningResult:
+    assert design.result is not None
+    return design.result
+
+
+def _status(design: Design) -> Status:
+    return Status(Code.INTERRUPTED) if design.result is None else design.result.status
+
+
+def _cost(solution: Solution) -> float:
+    """The objective; inf where it is no solution."""
+    return solution.stats["cost"] if solution.status.converged else np.inf
+
+
+def _value(result: TuningResult, requirement: Requirement) -> float:
+    """The certified figure as `read` gives it, so that smaller is better."""
+    return shown(requirement, float(result.requirements["certified"][name(requirement)]))  # its own inverse
+
+
+def _spread(high: float, low: float, points: int) -> list[float]:
+    """Limits from high to low, evenly or, where the ends are far apart, evenly in the logarithm."""
+    even = np.geomspace if low > 0 and high / low > WIDE else np.linspace
+    return [float(v) for v in even(high, low, points)]

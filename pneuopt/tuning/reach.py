@@ -1,0 +1,209 @@
+"""Whether a tuning can have an answer at all: said before anything is searched for, with the number and the remedy."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import frequency_response
+from pneuopt.control.metrics import TAIL
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.control.rest import find_rest, sliding
+from pneuopt.errors import ConvergenceError, InputError, ModelError, require
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, most, name
+from pneuopt.specification import Specification
+from pneuopt.tuning.candidates import Space, highest
+from pneuopt.tuning.cases import Case
+from pneuopt.units import write_value
+
+Array = NDArray[np.float64]
+SLOW = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read
+HALVINGS = 10  # of the interval in which the fastest reachable reference is sought
+
+
+def check_reach(loop: ClosedLoop, every: Sequence[Case], space: Space, spec: Specification) -> None:
+    """Refuse what no gains can mend.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    every : sequence of Case
+        The nominal plant's first.
+    space : Space
+    spec : Specification
+
+    Raises
+    ------
+    InputError
+        If a limit lies beyond the horizon, the dither cannot be sampled, the stroke is too short for a reference, no
+        command holds it, or none that the limits allow, or all gains allowed have the wrong sign.
+    """
+    _check_dither(loop, space)
+    for case in every:
+        _check_horizon(case.reference, spec)
+    _check_noise(loop, space, spec)
+    for case in every:
+        _check_travel(loop, case, space)
+        _check_hold(loop, case, space, spec)
+    _check_sign(loop, every[0], space)
+
+
+def _check_dither(loop: ClosedLoop, space: Space) -> None:
+    if loop.dither is not None:
+        loop.dither.check(highest(loop, space.parameters), loop.pid.sample_time)
+
+
+def _check_horizon(reference: Step, spec: Specification) -> None:
+    record = reference.horizon - reference.at
+    for q in spec.limits:
+        if isinstance(q, SettlingTime | RiseTime) and most(q) > (1 - TAIL) * record:
+            told = f"{name(q)}: max {most(q):g} s is more than {record:g} s after the step can show"
+            needed = f"{reference.at + most(q) / (1 - TAIL):.4g} s"
+            require(False, f"{told} (reference {reference.label}); lengthen its horizon to {needed}, or lower max")
+    first = min((t for t, _, _ in spec.envelope), default=0.0)
+    told = f"StepEnvelope begins {first:g} s after the step, the record of reference {reference.label} ends after"
+    require(first < record, f"{told} {record:g} s; lengthen its horizon, or let the bounds begin earlier")
+
+
+def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
+    Tf = _range(space, "pid.Tf")[1] + 0.5 * (loop.pid.sample_time or 0.0)  # as `linear_gains` has it
+    least = _least(space, "pid.Kp") + (_least(space, "pid.Kd") / Tf if Tf else 0.0)
+    told = (
+        f"NoiseGain: max {spec.limit(NoiseGain):g} is below Kp + Kd/Tf, at least {least:.4g} within the gains' bounds"
+    )
+    require(least <= spec.limit(NoiseGain), f"{told}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
+
+
+def _check_travel(loop: ClosedLoop, case: Case, space: Space) -> None:
+    """That a piston led along the reference stays off the end stops."""
+    stops = [g for g in loop.plant.guards if g.state == "position"]
+    states = [q.name for q in loop.plant.states]
+    if not stops or "position" not in states:
+        return
+    reference, own = case.reference, case.filled(space.parameters)
+    begin = float(case.initial(loop, space.parameters)[states.index("position")])
+    for stop in stops:
+        limit = stop.limit(loop.parameters | own)
+        left = stop.side * (limit - begin)
+        if loop.feedback.name == "position":
+            far, remedy = stop.side * (reference.final - begin), "take a smaller step"
+        elif loop.feedback.name == "speed":
+            lead, rest = stop.side * reference.initial * reference.at, reference.horizon - reference.at
+            far = max(lead, lead + stop.side * reference.final * rest)
+            fits = (left - lead) / (stop.side * reference.final) if reference.final else inf
+            early = f"end it by horizon = {reference.at + fits:.3g} s"
+            remedy = f"{early}, or start elsewhere, start={{'position': ...}}" if fits > 0 else "start elsewhere"
+        else:
+            return
+        where = "front" if stop.side > 0 else "rear"
+        require(
+            far <= left,
+            f"{_lead(case)}it leads the piston over {write_value(far, 'm', 4)}, but from position "
+            f"{write_value(begin, 'm', 4)} to the {where} end stop there are {write_value(max(left, 0.0), 'm', 4)}; "
+            f"{remedy}",
+        )
+
+
+def _check_hold(loop: ClosedLoop, case: Case, space: Space, spec: Specification) -> None:
+    """That some command, one that the limits allow, holds the reference to within the settling band."""
+    reference = case.reference
+    target = reference.final - spec.band * reference.size  # of a disturbance alone 0: what is to be held is known
+
+    def missing(share: float) -> str:
+        """What keeps a part of the reference from being held; empty: nothing."""
+        try:
+            command = _holding(loop, case, space, share * target)
+        except InputError as error:
+            return str(error)
+        return _beyond(loop, case, space, spec, command, share * target)
+
+    fault = missing(1.0)
+    if fault:
+        low, high = 0.0, 1.0
+        for _ in range(HALVINGS if not missing(0.0) else 0):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if missing(middle) else (middle, high)
+        most_held = f"; the most that can be held is {low * target:.3g} {loop.feedback.unit}" if low else ""
+        require(False, f"{_lead(case)}{fault}{most_held}")
+
+
+def _holding(loop: ClosedLoop, case: Case, space: Space, value: float) -> float:
+    """The command that holds the measured signal at a value; 0 where no steady state is known."""
+    try:
+        return _held(loop, case, space, value)[1]
+    except ConvergenceError:
+        return 0.0
+
+
+def _held(loop: ClosedLoop, case: Case, space: Space, value: float) -> tuple[Array, float]:
+    """The plant's state and the command with the measured signal at a value, as an integral action finds them."""
+    own, acting = case.filled(loop.parameters | space.parameters), replace(loop, pid=PID(loop.pid.sample_time))
+    own = own | ParameterSet({"pid.Ki": replace(acting.parameters["pid.Ki"], value=1.0)})
+    start = {n: v for n, v in case.reference.start.items() if n == "position"}
+    return find_rest(acting, sliding(acting, own, value), value, start)
+
+
+def _beyond(loop: ClosedLoop, case: Case, space: Space, spec: Specification, command: float, value: float) -> str:
+    own, unit = case.filled(loop.parameters | space.parameters), loop.command.unit
+    takes = f"holding {value:.4g} {loop.feedback.unit} takes {command:.4g} {unit}"
+    if loop.pid.limits:
+        low, high = own.value("pid.lower"), own.value("pid.upper")
+        if not low <= command <= high:
+            return (
+                f"{takes}, the controller's limits are {low:g} and {high:g} {unit}; take a smaller step, or widen them"
+            )
+    shaken = _least(space, "dither.amplitude")
+    if abs(command) + shaken > spec.limit(PeakControl):
+        beside = f" beside a dither of at least {shaken:g} {unit}" if shaken else ""
+        most_allowed = f"PeakControl allows {spec.limit(PeakControl):g} {unit}"
+        return f"{takes}{beside}, {most_allowed}; take a smaller step, or raise it"
+    return ""
+
+
+def _check_sign(loop: ClosedLoop, case: Case, space: Space) -> None:
+    """That not every loop allowed is positive feedback."""
+    sign = _static_sign(loop, case, space)
+    gains = {n: [sign * v for v in _range(space, n)] for n in ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")}
+    best = {n: max(ends) for n, ends in gains.items()}
+    wrong = [n for n, ends in gains.items() if max(ends) <= 0 and min(ends) < 0]
+    hopeless = best["pid.Ki"] < 0 or (wrong and all(v <= 0 for v in best.values()))
+    if sign and hopeless:
+        words = ", ".join(f"{n} within [{', '.join(f'{v:g}' for v in _range(space, n))}]" for n in wrong)
+        moves = f"{loop.feedback.name} {'rises' if sign > 0 else 'falls'} with {loop.command.name}"
+        remedy = "turn the sign of the gains' bounds, or of the actuator"
+        require(False, f"{words}: every gain allowed has the wrong sign, for the plant's {moves}; {remedy}")
+
+
+def _static_sign(loop: ClosedLoop, case: Case, space: Space) -> float:
+    """Of the plant's response to a slow command, where it follows the reference; 0 where that is unknown."""
+    reference, own = case.reference, case.filled(loop.parameters | space.parameters)
+    try:
+        x, command = _held(loop, case, space, reference.final)
+        plant = loop.linear_plant(own, x, {loop.command.name: command})
+        slow = complex(frequency_response(plant, [SLOW / reference.horizon])[0])
+    except (ConvergenceError, InputError, ModelError, np.linalg.LinAlgError):
+        return 0.0
+    return float(np.sign(slow.real if abs(slow.real) >= abs(slow.imag) else -slow.imag))
+
+
+def _range(space: Space, n: str) -> tuple[float, float]:
+    """Between what a parameter may lie, a fixed one at its value; (0, 0) where there is none."""
+    if n not in space.parameters:
+        return 0.0, 0.0
+    p = space.parameters[n]
+    return (p.lower, p.upper) if n in space.names else (p.value, p.value)
+
+
+def _least(space: Space, n: str) -> float:
+    """The least size that a parameter may have."""
+    low, high = _range(space, n)
+    return 0.0 if low <= 0 <= high else min(abs(low), abs(high))
+
+
+def _lead(case: Case) -> str:
+    return f"reference {case.label}: "

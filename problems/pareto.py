@@ -1,0 +1,149 @@
+"""What settling fast costs: Pareto fronts by continuation on the paper's linear plant, and on T32.
+
+    python problems/pareto.py [--json FILE] [--out DIR]
+
+The linear plant is the paper's at half its loop gain, band 0.1 %, overshoot at most 0.02 %, peak command at most 1.225:
+settling time against maximum sensitivity, 15 designs. The solver's CPU time is that of one continuation through all 15
+limits from a warm solution, as `pareto_front` runs it, without the two full tunings that find its ends, the making of
+the problem, and the certificates. Brute force is differential evolution for each design's limit, on the search's own
+simulator, many times as long; "beaten_by" is by how much its best settling time is better than the front's.
+
+On T32 (t32.py: LuGre friction, dead zone, dither; overshoot at most 5 %) settling time against the command's peak, 5
+designs by short searches from their neighbours.
+"""
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from claims import Claim, arguments, finish, frame
+from t32 import STEP, benchmark
+
+import pneuopt as po
+from pneuopt.models.paper2015 import paper_plant
+from pneuopt.plotting import plot_front
+from pneuopt.specification import specify
+from pneuopt.tuning.candidates import span
+from pneuopt.tuning.screening import screen
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.two_phase import two_phase_path
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+LINEAR = po.Step(1.0)
+BAND = 0.001
+PAPER = {"pid.Kp": 0.225, "pid.Ki": 1.23, "pid.Kd": 0.01, "pid.Tf": 0.01}
+RANGES = {"pid.Kp": (0.0, 1.0), "pid.Ki": (0.0, 5.0), "pid.Kd": (0.0, 0.05), "pid.Tf": (0.005, 0.05)}
+LIMITS: tuple[po.Overshoot | po.PeakControl, ...] = (po.Overshoot(2e-4), po.PeakControl(1.225))
+POINTS, FEW = 15, 5
+PROBED = (3, 7, 11)  # designs that brute force is set on
+EVOLUTION = po.Screening(members=60, generations=60, bands=(0.02, 0.005), refinements=1000, seed=1)
+UNITS = {"linear": {"SettlingTime": "s", "MaxSensitivity": ""}, "t32": {"SettlingTime": "s", "PeakControl": "V"}}
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """The fronts; CPU seconds of the solver along the linear one's limits; by how much brute force beats its designs."""
+
+    fronts: dict[str, "pd.DataFrame"]
+    solver: float
+    beaten: dict[int, float]
+
+
+def run() -> Job:
+    loop, given = paper_loop()
+    method = po.TwoPhase()
+    pair = (po.SettlingTime(BAND), po.MaxSensitivity())
+    linear = po.pareto_front(
+        loop, LINEAR, given, minimise=pair, subject_to=LIMITS, points=POINTS, method=method, progress=told
+    )
+    friction, hardware = benchmark()
+    pair_t32 = (po.SettlingTime(0.02), po.PeakControl())
+    t32 = po.pareto_front(
+        friction, STEP, hardware, minimise=pair_t32, subject_to=[po.Overshoot(0.05)], points=FEW, progress=told
+    )
+    solver = continuation(loop, given, linear, method)
+    return Job({"linear": linear, "t32": t32}, solver, {k: beaten(loop, given, linear, k) for k in PROBED})
+
+
+def told(line: str) -> None:
+    print(line[:100], end="\r", file=sys.stderr)
+
+
+def paper_loop() -> tuple[po.ClosedLoop, po.ParameterSet]:
+    plant, printed = paper_plant(0.5)
+    loop = po.ClosedLoop(plant, po.PID(limits=False))
+    return loop, (loop.parameters | printed).with_values(PAPER).with_bounds(RANGES).freed(*RANGES)
+
+
+def continuation(loop: po.ClosedLoop, given: po.ParameterSet, front: "pd.DataFrame", method: po.TwoPhase) -> float:
+    """CPU seconds of the solver along the front's limits, each solved from its neighbour; inf if one fails."""
+    space = span(loop, given)
+    specs = [
+        specify(po.SettlingTime(BAND), [*LIMITS, po.MaxSensitivity(float(limit))]).tightened(
+            method.margin, method.margin / 300
+        )
+        for limit in front["limit"]
+    ]
+    path = two_phase_path(loop, [LINEAR], space, specs[0], method)
+    start = np.array([float(front.loc[0, n]) for n in space.names])
+    path.follow(start, specs[:1])  # warm
+    begun = time.process_time()
+    solutions = path.follow(start, specs)
+    spent = time.process_time() - begun
+    return spent if all(s.status.converged for s in solutions[:-1]) else float("inf")
+
+
+def beaten(loop: po.ClosedLoop, given: po.ParameterSet, front: "pd.DataFrame", k: int) -> float:
+    """By how much differential evolution settles faster than a design within its limit, as a fraction."""
+    space = span(loop, given)
+    spec = specify(po.SettlingTime(BAND), [*LIMITS, po.MaxSensitivity(float(front.loc[k, "limit"]))])
+    simulator = Simulator(loop, [LINEAR], space, spec=spec)
+    found = screen(simulator, [LINEAR], space, spec, EVOLUTION, space.start, lambda _: None)
+    values = {n: float(v[0]) for n, v in simulator.values(found.point[None], spec).items()}
+    ours = float(front.loc[k, "SettlingTime"])
+    return 1 - values["SettlingTime"] / ours if not spec.violated(values, 1e-4) else -np.inf
+
+
+def main(job: Job) -> "pd.DataFrame":
+    claims = []
+    for name, front in job.fronts.items():
+        first, second = UNITS[name]
+        good = front[front["error"] == ""]
+        a, b = (good[n].to_numpy(dtype=float) for n in (first, second))
+        dominated = sum(bool(np.any((a < a[k] * (1 - 1e-3)) & (b <= b[k]))) for k in range(len(good)))
+        claims += [
+            Claim(f"{name}.designs", len(front), "1"),
+            Claim(f"{name}.certified", len(good), "1", None, f">= {len(front)}"),
+            Claim(f"{name}.dominated", dominated, "1", None, "<= 0"),
+            Claim(
+                f"{name}.deviation",
+                1e3 * float((good[first] - good[f"claimed {first}"]).abs().max()),
+                "ms",
+                None,
+                "<= 1",
+            ),
+            Claim(f"{name}.seconds", float(front["seconds"].sum()), "s"),
+        ]
+        for end, k in {"fastest": 0, "gentlest": len(good) - 1}.items():
+            claims += [
+                Claim(f"{name}.{end}.{n}", float(good[n].iloc[k]), unit or "1") for n, unit in UNITS[name].items()
+            ]
+    claims.append(Claim("linear.solver_cpu_seconds", job.solver, "s", None, "<= 1"))
+    claims += [Claim(f"linear.design_{k}.beaten_by", 100 * by, "%", None, "<= 3") for k, by in job.beaten.items()]
+    return frame(claims)
+
+
+def figures(job: Job) -> Mapping[str, "Figure"]:
+    return {f"pareto_{name}": plot_front(front, UNITS[name]) for name, front in job.fronts.items()}
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__).parse_args()
+    job = run()
+    sys.exit(finish(main(job), options, lambda: figures(job)))

@@ -1,0 +1,112 @@
+"""The computing delay of a sampled controller: in the loop, in its margins, in search and certificate."""
+
+import control
+import numpy as np
+import pytest
+
+from pneuopt.certify import evaluate
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import margins
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
+from pneuopt.specification import specify
+from pneuopt.system import System
+from pneuopt.tune import tune
+from pneuopt.tuning.candidates import span
+from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.simulator import Simulator
+
+GAINS = {"pid.Kp": 0.18, "pid.Ki": 0.9, "pid.Kd": 0.008, "pid.Tf": 0.01}
+STEP = Step(0.1, horizon=0.3)
+
+
+def exact(h: float, delay: int) -> control.TransferFunction:
+    """The sampled open loop of eq. 16: exact zero-order hold, backward-Euler controller, whole samples of delay."""
+    plant = control.sample_system(control.tf([1270.12], [1, 17.5, 86.34]), h, "zoh")
+    z = control.tf([1, 0], [1], h)
+    slope = (z - 1) / (h * z)
+    C = GAINS["pid.Kp"] + GAINS["pid.Ki"] / slope + GAINS["pid.Kd"] * slope / (GAINS["pid.Tf"] * slope + 1)
+    return control.minreal(plant * C / z**delay, verbose=False)
+
+
+@pytest.mark.parametrize("h", [1e-3, 4e-3, 1e-2])
+@pytest.mark.parametrize("delay", [0, 1])
+def test_margins_are_those_of_the_sampled_loop(second_order: System, h: float, delay: int) -> None:
+    loop = ClosedLoop(second_order, PID(h, delay=delay))
+    ours, L = margins(loop.open_loop(loop.parameters.with_values(GAINS))), exact(h, delay)
+    w = np.geomspace(0.1, 0.999 * np.pi / h, 2000)
+    Ms = np.max(1 / np.abs(1 + L(np.exp(1j * w * h))))
+    gain, phase, *_ = control.stability_margins(control.frd(L, w, smooth=True))
+    assert ours.max_sensitivity == pytest.approx(Ms, rel=1e-3)
+    assert ours.gain_margin == pytest.approx(gain, rel=0.02)
+    assert ours.phase_margin == pytest.approx(phase, abs=0.1)
+
+
+def test_a_delay_costs_phase(second_order: System) -> None:
+    found = []
+    for delay in (0, 1):
+        loop = ClosedLoop(second_order, PID(4e-3, delay=delay))
+        found.append(margins(loop.open_loop(loop.parameters.with_values(GAINS))))
+    lost = np.degrees(found[0].gain_crossover * 4e-3)
+    assert found[0].phase_margin - found[1].phase_margin == pytest.approx(lost, rel=1e-3)
+
+
+def friction_loop() -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(5e-3, delay=1))
+    bounds = {"pid.Kp": (50.0, 400.0), "pid.Ki": (500.0, 6000.0), "pid.Kd": (0.0, 0.5)}
+    values = {"pid.Kp": 200.0, "pid.Ki": 3000.0, "pid.lower": -300.0, "pid.upper": 300.0}
+    return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
+
+
+@pytest.mark.parametrize("step", [Step(0.1, horizon=0.6), Step(0.1, at=0.05, initial=0.05, horizon=0.6)])
+def test_search_and_certificate_agree(step: Step) -> None:
+    loop, given = friction_loop()
+    simulator, spec = Simulator(loop, [step], span(loop, given)), specify(SettlingTime(), [MaxSensitivity(2.0)])
+    (claimed,) = simulator.table(np.array([200.0, 3000.0, 0.0]), spec)
+    certified = evaluate(loop, step, given)[step.label]
+    assert np.isfinite(certified["SettlingTime"])
+    for name in ("SettlingTime", "Overshoot", "PeakControl", "MaxSensitivity"):
+        assert claimed[name] == pytest.approx(certified[name], rel=2e-3, abs=2e-4), name
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    loop, given = friction_loop()
+    simulator = Simulator(loop, [STEP, Step(0.1, at=0.05, initial=0.05, horizon=0.3)], span(loop, given))
+    spec = specify(SettlingTime(), [Overshoot(0.1), MaxSensitivity(1.6)])
+    posed = Linearised(simulator, differentiated(simulator), spec, 60, 1.0)
+    z = np.array([0.3, 0.3, 0.2, 0.2037])
+    (point,) = posed.evaluate(z[None])
+    for k in range(len(z)):
+        nudge = 1e-6 * (np.arange(len(z)) == k)
+        above, below = posed.evaluate(np.array([z + nudge, z - nudge]))
+        off = np.abs((above.values - below.values) / 2e-6 - point.slopes[:, k])
+        scale = np.abs(point.slopes[:, k]).max() + 1e-3
+        assert np.quantile(off, 0.99) < 2e-3 * scale, k
+        assert np.median(off) < 1e-5 * scale, k
+
+
+def test_a_tuning_reckons_with_it() -> None:
+    """Tuned without the delay the loop overshoots once it is there; tuned with it, it keeps the limit."""
+    loop, given = friction_loop()
+    ignorant = ClosedLoop(loop.plant, PID(5e-3))
+    quick = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
+    limits = [Overshoot(0.05)]
+    knowing = tune(loop, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)
+    blind = tune(ignorant, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)
+    seen = evaluate(loop, STEP, blind.parameters)["0 to 0.1"]
+    assert knowing.certified["0 to 0.1"]["Overshoot"] <= 5.0
+    assert seen["Overshoot"] > 5.0 or not seen["SettlingTime"] <= knowing.certified["0 to 0.1"]["SettlingTime"]
+
+
+def test_a_delay_is_a_whole_sample_of_a_sampled_controller() -> None:
+    with pytest.raises(InputError, match="a delay of 1 sample needs a sample_time"):
+        PID(delay=1)
+    for delay in (0.5, 2, -1):
+        with pytest.raises(InputError, match=f"delay is 0 or 1, whole samples, got {delay}"):
+            PID(1e-3, delay=delay)  # type: ignore[arg-type]

@@ -1,0 +1,54 @@
+"""The scripts on dither and stiction windup: what is quick of them at every run, the whole when slow ones run."""
+
+from pathlib import Path
+
+import averaged_dither
+import dither_map
+import numpy as np
+import pytest
+import stiction_windup
+
+
+def test_friction_makes_the_papers_gains_overshoot_by_40_percent() -> None:
+    smooth, sticking = (stiction_windup.stepped(stiction_windup.FAST, stiction_windup.PAPERS, lugre=k) for k in (0, 1))
+    assert smooth.overshoot == pytest.approx(1.4, abs=0.1)
+    assert sticking.overshoot == pytest.approx(40.2, abs=0.3)
+
+
+def test_the_map_at_amplitude_zero_is_the_same_at_every_frequency(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dither_map, "AMPLITUDES", np.array([0.0, 0.5]))
+    monkeypatch.setattr(dither_map, "FREQUENCIES", np.array([40.0, 110.0]))
+    loop = dither_map.controlled()
+    gains = {"pid.Kp": 3.7, "pid.Ki": 82.0, "pid.Kd": 0.23}
+    settled, air = dither_map.mapped(loop, dither_map.filled(loop).with_values(gains))
+    assert settled.shape == air.shape == (2, 2)
+    np.testing.assert_allclose(settled[0, 0], settled[1, 0], equal_nan=True)
+    assert air[0, 0] == pytest.approx(air[1, 0])
+    assert air[0, 1] > air[1, 1] > 0  # the valve passes less of the faster
+
+
+@pytest.mark.slow
+def test_stiction_windup(tmp_path: Path) -> None:
+    job = stiction_windup.run()
+    rows = stiction_windup.main(job)
+    assert list(rows.loc[~rows["holds"].astype(bool), "name"]) == []
+    assert set(stiction_windup.BOUNDS) <= set(rows["name"])
+    stiction_windup.figure(job).savefig(tmp_path / "windup.png")
+
+
+@pytest.mark.slow
+def test_dither_map(tmp_path: Path) -> None:
+    job = dither_map.run()
+    rows = dither_map.main(job)
+    assert list(rows.loc[~rows["holds"].astype(bool), "name"]) == []
+    assert set(dither_map.BOUNDS) <= set(rows["name"])
+    for picture in (dither_map.figure(job), dither_map.responses(job)):
+        picture.savefig(tmp_path / "map.png")
+
+
+@pytest.mark.slow
+def test_averaged_dither(tmp_path: Path) -> None:
+    runs = averaged_dither.run()
+    rows = averaged_dither.main(runs)
+    assert list(rows.loc[~rows["holds"].astype(bool), "name"]) == []
+    averaged_dither.over_frequency(runs).savefig(tmp_path / "error.png")

@@ -1,0 +1,133 @@
+"""The loop in a tuning.toml: forms, delay, dead band, encoder, feedforward."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.forms import Form, SeriesForm, to_parallel
+from pneuopt.control.pid import PID
+from pneuopt.control.sensor import Encoder
+from pneuopt.errors import InputError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb
+from pneuopt.models.linear import SecondOrder
+from pneuopt.nlp.status import Code, Status
+from pneuopt.parameters import ParameterSet
+from pneuopt.tuningfile import read_tuning, write_tuned
+
+PLANT = SecondOrder().system()
+STANDARD = """[pid]
+form = "standard"
+sample_time = "2 ms"
+delay = "1 sample"
+dead_band = "2 mm/s"
+Kp = "2 V*s/m"
+Ti = { value = "500 ms", lower = "50 ms", upper = "2 s", free = true }
+Td = "250 ms"
+N = 10
+b = 0.5
+[feedforward]
+gain = { value = "1 V*s/m", lower = "0 V*s/m", upper = "9 V*s/m", free = true }
+time = "30 ms"
+[[reference]]
+step = "0.1 m/s"
+horizon = "1 s"
+"""
+
+
+@dataclass(frozen=True)
+class Tuned:
+    parameters: ParameterSet
+    certified: pd.DataFrame = field(default_factory=lambda: pd.DataFrame({"0 to 0.1": {"SettlingTime": 0.25}}))
+    status: Status = field(default_factory=lambda: Status(Code.CONVERGED, "certified"))
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "tuning.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_form_is_tuned_in_its_own_gains(tmp_path: Path) -> None:
+    tuning = read_tuning(written(tmp_path, STANDARD), PLANT)
+    pid = PID(2e-3, limits=False, form=Form.STANDARD, delay=1, dead_band=True)
+    assert (tuning.loop.pid, tuning.loop.feedforward) == (pid, Feedforward(0.03))
+    given = tuning.parameters
+    assert given.free_names == ("pid.Ti", "feedforward.gain")
+    assert (given["pid.Ti"].lower, given["pid.Ti"].upper, given.value("pid.dead_band")) == (0.05, 2.0, 2e-3)
+    assert vars(tuning.loop.parallel(given)) == pytest.approx({"Kp": 2.0, "Ki": 4.0, "Kd": 0.5, "Tf": 0.025})
+    result = Tuned(given.with_values({"pid.Ti": 0.25, "feedforward.gain": 2.5}))
+    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", result)
+    again = read_tuning(tmp_path / "tuned.toml", PLANT).parameters
+    assert [again.value(n) for n in given.free_names] == [0.25, 2.5]
+
+
+def test_the_series_form_is_read(tmp_path: Path) -> None:
+    text = STANDARD.replace('"standard"', '"series"').replace("Kp =", "K =").replace("N = 10", 'Tf = "20 ms"')
+    tuning = read_tuning(written(tmp_path, text), PLANT)
+    assert tuning.loop.parallel(tuning.parameters) == to_parallel(SeriesForm(2.0, 0.5, 0.25, 0.02))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            "Ti =",
+            "Ki =",
+            "[pid] Ki does not belong to the standard form, which has Kp, Ti, Td, N, b, c, Tt; say Ti = Kp/Ki",
+        ),
+        (
+            "N = 10",
+            'Tf = "20 ms"',
+            "[pid] Tf does not belong to the standard form, which has Kp, Ti, Td, N, b, c, Tt; say N",
+        ),
+        (
+            '"standard"',
+            '"series"',
+            "[pid] Kp does not belong to the series form, which has K, Ti, Td, Tf, b, c, Tt; say K",
+        ),
+        (
+            '"standard"',
+            '"parallel"',
+            "[pid] Ti does not belong to the parallel form, which has Kp, Ki, Kd, Tf, b, c, Tt; say",
+        ),
+        ("N = 10", "N = 0", "pid.N = 0 would switch the derivative off; the ISA ratio N is 5 to 20, inf unfiltered"),
+        ('Td = "250 ms"', 'Td = "-1 ms"', "[pid] Td: value -0.001 s lies outside its bounds [0, inf]"),
+        ('sample_time = "2 ms"\n', "", "[pid]: PID: a delay of 1 sample needs a sample_time"),
+        ('"1 sample"', '"2 ms"', "[pid] delay: '2 ms' is no number of samples; write delay = \"1 sample\""),
+        ('"1 sample"', "3", "[pid]: PID: delay is 0 or 1, whole samples, got 3"),
+        ('"2 mm/s"', '"-2 mm/s"', "[pid] dead_band: value -0.002 m/s lies outside its bounds [0, inf]"),
+        ('"30 ms"', '"0 ms"', "[feedforward]: Feedforward: time must be at least 1e-06 s, got 0 s"),
+        ("gain =", "gian =", "[feedforward] says no gain; write gain and time"),
+        ('time = "30', 'tine = "30', "[feedforward]: unknown key 'tine'; did you mean 'time'?"),
+    ],
+)
+def test_refuses_a_controller_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in STANDARD
+    path = written(tmp_path, STANDARD.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        read_tuning(path, PLANT)
+    assert str(error.value).startswith(f"{path}: ")
+    assert said in str(error.value)
+
+
+def test_an_encoder_is_what_the_controller_reads(tmp_path: Path) -> None:
+    text = '[pid]\nsample_time = "1 ms"\nKp = "200 N*s/m"\n[[reference]]\nstep = "0.1 m/s"\nhorizon = "1 s"\n[sensor]\n'
+    drive = ForceDrive(Coulomb()).system()
+    tuning = read_tuning(written(tmp_path, text + 'resolution = "10 um"\nfilter = "5 ms"\n'), drive)
+    assert tuning.loop.sensor == Encoder(1e-5, 5e-3)
+    assert (tuning.parameters.value("sensor.resolution"), tuning.parameters.value("sensor.filter")) == (1e-5, 5e-3)
+    for sections, said in (
+        (text + 'resolution = "10 um"\nlag = "5 ms"\n', r"\[sensor\] has a lag or an encoder, not both"),
+        (text + 'resolution = "-10 um"\n', r"\[sensor\]: Encoder: resolution must not be negative"),
+        (text + 'resolution = "10 ms"\n', r"\[sensor\] resolution: unit 'ms' does not measure 'm'"),
+        (text.replace('sample_time = "1 ms"\n', "") + 'resolution = "10 um"\n', "an Encoder is read once a sample"),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_tuning(written(tmp_path, sections), drive)

@@ -1,0 +1,92 @@
+"""What a search samples and searches: the dither's frequency as a gain like any other, and what bounds it."""
+
+import numpy as np
+import pytest
+
+from pneuopt.certify import evaluate
+from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import Ripple, SettlingTime
+from pneuopt.specification import specify
+from pneuopt.tune import tune
+from pneuopt.tuning.candidates import POINTS_A_PERIOD, highest, resolving, spacing, span
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.simulator import Simulator
+
+STEP = Step(0.1, horizon=0.4)
+WIDE = {"dither.amplitude": (0.0, 60.0), "dither.frequency": (20.0, 200.0)}
+
+
+def axis(
+    sample_time: float | None, *, analogue: bool = False, waveform: Waveform = Waveform.SINE
+) -> tuple[ClosedLoop, ParameterSet]:
+    dither = Dither(80.0, analogue=analogue, waveform=waveform)
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=sample_time), dither)
+    values = {"pid.Kp": 300.0, "pid.Ki": 3000.0, "pid.lower": -300.0, "pid.upper": 300.0, "dither.amplitude": 40.0}
+    return loop, loop.parameters.with_values(values)
+
+
+def test_samples_follow_the_highest_frequency_that_is_allowed() -> None:
+    loop, p = axis(None)
+    free = p.with_bounds(WIDE).freed(*WIDE)
+    assert (highest(loop, p), highest(loop, free)) == (80.0, 200.0)
+    assert spacing(loop, STEP, free) <= 1 / (POINTS_A_PERIOD * 200.0) < spacing(loop, STEP, p)
+    assert spacing(*axis(1e-3)[:1], STEP, free) == 1e-3
+    assert resolving(loop, free) == 0.0
+    assert resolving(axis(1e-3, analogue=True)[0], free) >= POINTS_A_PERIOD * 200.0
+
+
+@pytest.mark.parametrize(
+    ("sample_time", "analogue", "waveform"),
+    [
+        (None, False, Waveform.SINE),
+        (None, False, Waveform.TRIANGLE),
+        (1e-3, False, Waveform.TRIANGLE),
+        (1e-3, True, Waveform.SINE),
+    ],
+)
+def test_a_search_over_frequency_sees_what_the_certificate_sees(
+    sample_time: float | None, analogue: bool, waveform: Waveform
+) -> None:
+    loop, p = axis(sample_time, analogue=analogue, waveform=waveform)
+    free = p.with_bounds(WIDE).freed(*WIDE)
+    spec = specify(SettlingTime(0.05), [Ripple(0.1)])
+    space = span(loop, free)
+    simulator = Simulator(loop, [STEP], space, spec=spec)
+    for frequency in (40.0, 200.0):
+        point = np.array([frequency if n.endswith("frequency") else 40.0 for n in space.names])
+        claimed = simulator.table(point, spec)[0]
+        certified = evaluate(loop, STEP, space.filled(point), band=0.05)[STEP.label]
+        assert claimed["SettlingTime"] == pytest.approx(certified["SettlingTime"], abs=1e-3), frequency
+        assert claimed["Overshoot"] == pytest.approx(certified["Overshoot"], abs=0.2), frequency
+        assert claimed["Ripple"] == pytest.approx(certified["Ripple"], rel=0.1), frequency
+
+
+def test_frequency_is_tuned_with_the_rest() -> None:
+    """Ripple falls with the frequency: its limit is met by a faster dither, whose amplitude has a floor here."""
+    loop, p = axis(1e-3)
+    bounds = {"pid.Kp": (100.0, 600.0), "dither.amplitude": (30.0, 60.0), "dither.frequency": (20.0, 200.0)}
+    free = p.with_bounds(bounds).with_values({"dither.frequency": 25.0}).freed(*bounds)
+    method = Screening(members=12, generations=3, refinements=30)
+    best = tune(loop, STEP, free, minimise=SettlingTime(0.05), subject_to=[Ripple(0.03)], method=method)
+    assert best.parameters.value("dither.frequency") > 40.0
+    assert best.certified.loc["Ripple"].max() <= 0.03
+
+
+def test_a_frequency_of_zero_and_an_amplitude_beyond_the_command_are_refused_before_a_search() -> None:
+    loop, p = axis(1e-3)
+    with pytest.raises(InputError, match=r"dither.frequency: its lower bound must be positive, got 0 Hz"):
+        span(loop, p.with_bounds({"dither.frequency": (0.0, 100.0)}).freed("dither.frequency"))
+    with pytest.raises(InputError, match=r"dither.amplitude may reach 400 N, but the command ends at -300 and 300 N"):
+        span(loop, p.with_bounds({"dither.amplitude": (0.0, 400.0)}).freed("dither.amplitude"))
+    valve = ClosedLoop(PneumaticDrive().system(), PID(sample_time=1e-3), Dither(80.0), measured="speed")
+    wide = valve.parameters.with_bounds({"dither.amplitude": (0.0, 8.0)}).freed("dither.amplitude")
+    with pytest.raises(InputError, match=r"may reach 8 V, but the valve ends at -5 and 5 V.*lower its upper bound"):
+        span(valve, wide)

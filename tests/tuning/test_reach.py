@@ -1,0 +1,160 @@
+"""What no gains can mend is refused before anything is searched for, with the number and the remedy."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pneuopt.certify import respond
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.errors import InputError
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.parameters import ParameterSet
+from pneuopt.requirements import (
+    IAE,
+    NoiseGain,
+    Overshoot,
+    PeakControl,
+    Requirement,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    StepEnvelope,
+)
+from pneuopt.tune import tune
+from pneuopt.tuning.screening import Screening
+
+FREE = {"pid.Kp": (1.0, 40.0), "pid.Ki": (5.0, 200.0)}
+CLIP = {"pid.lower": -5.0, "pid.upper": 5.0}
+BRIEF = Screening(members=5, generations=1, bands=(), refinements=0)
+
+
+def cylinder(**dither: Any) -> tuple[ClosedLoop, ParameterSet]:
+    """A stroke of 200 mm, resting in its middle."""
+    loop = ClosedLoop(PneumaticDrive(friction=Stribeck()).system(), PID(sample_time=1e-3), Dither(**dither))
+    return loop, loop.parameters.with_values({"pid.Kp": 5.0, "pid.Ki": 20.0, **CLIP}).with_bounds(FREE).freed(*FREE)
+
+
+def lag(gain: float = 1.0) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-2))
+    given = loop.parameters.with_values({"plant.gain": gain, "pid.Kp": 2.0, "pid.Ki": 10.0, **CLIP})
+    return loop, given.with_bounds(FREE).freed(*FREE)
+
+
+def refusal(
+    model: tuple[ClosedLoop, ParameterSet],
+    step: Step,
+    limits: Sequence[Requirement] = (),
+    minimise: Requirement | None = None,
+) -> str:
+    loop, given = model
+    begun = time.perf_counter()
+    with pytest.raises(InputError) as error:
+        tune(loop, step, given, minimise=minimise or SettlingTime(), subject_to=limits, method=BRIEF)
+    assert time.perf_counter() - begun < 3.0
+    return str(error.value)
+
+
+def test_a_stroke_too_short_names_the_horizon_that_fits() -> None:
+    told = refusal(cylinder(), Step(0.4, at=0.1, horizon=0.6))
+    assert "reference 0 to 0.4: it leads the piston over 200 mm" in told
+    assert "from position 100 mm to the front end stop there are 99.9 mm; end it by horizon = 0.35 s" in told
+    assert "rear end stop" in refusal(cylinder(), Step(-0.4, horizon=0.6))
+
+
+def test_what_fits_the_stroke_is_not_refused() -> None:
+    loop, given = cylinder()
+    tune(loop, Step(0.4, at=0.1, horizon=0.349), given, minimise=IAE(), method=BRIEF, throw=False)
+
+
+def test_a_speed_beyond_the_valve_names_the_fastest() -> None:
+    """The fastest that is named can be held, and what is 2 % faster than the band allows cannot."""
+    loop, given = cylinder()
+    told = refusal((loop, given), Step(9.0, horizon=0.011))
+    assert "supply.pressure = 701325 Pa(a)" in told
+    fastest = float(told.rpartition("held is ")[2].split()[0])
+    low, high = (loop.initial(given, reference=v * fastest)[:1] if v < 1 else v for v in (0.99, 1.03))
+    assert np.isfinite(low).all()
+    with pytest.raises(InputError, match="no steady motion"):
+        loop.initial(given.with_values({"pid.lower": -np.inf, "pid.upper": np.inf}), reference=float(high) * fastest)
+
+
+def test_a_command_beyond_the_clip_or_the_limit_is_named() -> None:
+    """A lag of gain 1 needs as much command as it shall show."""
+    told = refusal(lag(), Step(8.0))
+    assert "holding 7.84 m/s takes 7.84 V, the controller's limits are -5 and 5 V" in told
+    assert "the most that can be held is 5 m/s" in told
+    told = refusal(lag(), Step(4.0), [PeakControl(3.0)])
+    assert "holding 3.92 m/s takes 3.92 V, PeakControl allows 3 V; take a smaller step, or raise it" in told
+    assert "the most that can be held is 3 m/s" in told
+
+
+@pytest.mark.parametrize("gain", [1.0, -1.0])
+def test_gains_of_the_wrong_sign_are_told_whatever_the_plants_sign(gain: float) -> None:
+    loop, given = lag(gain)
+    bounds = {n: (-gain * np.array(ends)) for n, ends in FREE.items()}
+    turned = given | ParameterSet(
+        {n: replace(given[n], value=float(np.mean(b)), lower=min(b), upper=max(b)) for n, b in bounds.items()}
+    )
+    told = refusal((loop, turned), Step(1.0))
+    assert "every gain allowed has the wrong sign" in told
+    assert f"speed {'rises' if gain > 0 else 'falls'} with valve_voltage; turn the sign of the gains' bounds" in told
+
+
+def test_an_integrating_plant_has_a_sign_too() -> None:
+    loop = ClosedLoop(Integrator().system(), PID(limits=False), measured=None)
+    given = loop.parameters.with_values({"pid.Kp": -1.0}).with_bounds({"pid.Kp": (-5.0, -0.1)}).freed("pid.Kp")
+    assert "wrong sign" in refusal((loop, given), Step(1.0))
+
+
+def test_a_dither_above_the_sampling_limit_is_refused_by_its_upper_bound() -> None:
+    loop, given = cylinder(frequency=100.0)
+    wide = given.with_values({"dither.amplitude": 0.5})
+    free = wide | ParameterSet({"dither.frequency": replace(wide["dither.frequency"], lower=50.0, upper=900.0)})
+    told = refusal((loop, free.freed("dither.frequency")), Step(0.2, horizon=0.3))
+    assert "900 Hz cannot be sampled every 1 ms: it must lie below the Nyquist frequency 500 Hz" in told
+
+
+TUBE = ((0.0, -0.1, 1.5), (0.5, 0.7, 0.9))
+CONTRADICTIONS: dict[str, tuple[list[Requirement], str]] = {
+    "settling after the record": ([SettlingTime(max=2.0)], "SettlingTime: max 2 s is more than 1 s after the step can"),
+    "rise after the record": ([RiseTime(3.0)], "lengthen its horizon to 3.158 s, or lower max"),
+    "tube off the band": ([StepEnvelope(TUBE)], "from 0.5 s on the bounds are 0.7 to 0.9, SettlingTime asks for 1 to"),
+    "tube off the start": ([StepEnvelope(((0.0, 0.5, 1.1),))], "at the step itself the bounds are 0.5 to 1.1, but"),
+    "tube above the overshoot": (
+        [StepEnvelope(((0.0, -0.1, 1.5), (0.5, 1.01, 1.3))), Overshoot(0.001), SteadyStateError(0.5)],
+        "from 0.5 s on the lower bound is 1.01, Overshoot allows 1.001",
+    ),
+    "tube after the record": ([StepEnvelope(((2.0, 0.9, 1.1),))], "begins 2 s after the step, the record of"),
+    "noise below the least gain": (
+        [NoiseGain(0.5)],
+        "max 0.5 is below Kp + Kd/Tf, at least 1 within the gains' bounds",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTIONS)
+def test_contradictory_limits_are_told_with_their_numbers(case: str) -> None:
+    limits, message = CONTRADICTIONS[case]
+    assert message in refusal(lag(), Step(1.0), limits)
+
+
+def test_a_start_that_never_settles_is_told_and_searched_from() -> None:
+    """Kp of 40 oscillates at 10 ms of sampling: a lag of 0.1 s allows about 20."""
+    loop, given = lag()
+    lines = list[str]()
+    wild = given.with_values({"pid.Kp": 39.0, "plant.time_constant": 0.1})
+    run = respond(loop, Step(1.0), wild)
+    assert run["speed"][-50:].std() > 0.01
+    method = Screening(members=10, generations=3, refinements=40)
+    best = tune(loop, Step(1.0), wild, minimise=SettlingTime(), method=method, progress=lines.append)
+    assert lines[0] == "with the given gains the loop never settles at 0 to 1, 1 of 1 cases; searching on"
+    assert best.certified.loc["SettlingTime"].max() < 0.5
