@@ -98,9 +98,7 @@ def pneumatic_run(speeds: tuple[tuple[float, float], ...], seed: int) -> dict[st
     given = {n: known.value(n) for n in drive.parameters if n in known} | values
     reference = np.concatenate([np.full(round(1000 * seconds), speed) for speed, seconds in speeds])
     t = np.round(np.arange(len(reference)) * 1e-3, 6)
-    rig = po.Rig(
-        loop, sensors(said), po.Actuator(said["valve_hysteresis"]), po.Encoder(filter=said["speed_filter"])
-    )
+    rig = po.Rig(loop, sensors(said), po.Actuator(said["valve_hysteresis"]), po.Encoder(filter=said["speed_filter"]))
     p = loop.parameters.with_values(given | SPEED_LOOP)
     run = po.record(rig, po.Trajectory(t, {"reference": reference}), p, seed=seed).experiment.trajectory
     columns = {"time [s]": t, "speed_reference [m/s]": reference}

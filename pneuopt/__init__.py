@@ -13,7 +13,7 @@ The concept map, in the order in which data flow:
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
     validate_design(loop, ...)        -> a design on fresh plants: worst, 95th percentile, violations
     judge_dither(loop, steps, tuned)  -> whether the dither is useful, useless or harmful, and why, in numbers
-    find_limit_cycle(t, speed)        -> hunting or crawl in a response or a log: amplitude, frequency, share of standstill
+    find_limit_cycle(t, speed)        -> hunting or crawl in a response or a log: amplitude, frequency, stick share
     evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser
     take_over(loop, x, old, new)      -> the state from which a running loop goes on with new gains, without a bump
     record(Rig(loop, sensors), ...)   -> the log of a rig with stick-slip, hysteresis, sensors; and the truth
@@ -104,6 +104,7 @@ _HOME = {
         "StepEnvelope",
     ),
     "pneuopt.tuning.condensed": ("Condensed",),
+    "pneuopt.tuning.confirmed": ("Confirmed",),
     "pneuopt.tuning.screening": ("Screening",),
     "pneuopt.tuning.two_phase": ("TwoPhase",),
     "pneuopt.certify": ("evaluate", "respond"),

@@ -98,6 +98,7 @@ from pneuopt.system import DiscreteSystem, System, define, discretise
 from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.confirmed import Confirmed
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuningfile import read_tuning, write_tuned
@@ -113,6 +114,7 @@ __all__ = [
     "Asymmetric",
     "ClosedLoop",
     "Condensed",
+    "Confirmed",
     "ControlRate",
     "ConvergenceError",
     "Coulomb",

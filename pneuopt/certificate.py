@@ -84,13 +84,17 @@ class TuningResult:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a search hands over: a point before rounding, what is active there, figures; whether it came to its end."""
+    """What a search hands over: a point before rounding, what is active there, figures; whether it came to its end.
+
+    `told` is for the status of a design that holds.
+    """
 
     point: Array
     status: Status
     active: tuple[str, ...]
     stats: Mapping[str, float]
     is_complete: bool = True
+    told: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +192,7 @@ class Notary:
             else ""
         )
         message = f"certified objective {ours:.6g}, claimed {self.spec.objective(claim):.6g}{agreeing}"
-        return Status(Code.CONVERGED, message)
+        return Status(Code.CONVERGED, f"{message}; {found.told}" if found.told else message)
 
     def _where(self, certified: "pd.DataFrame", metric: str) -> str:
         """The worst case, where there are several."""

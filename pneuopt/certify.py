@@ -22,14 +22,14 @@ from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.simulate import simulate
 from pneuopt.system import Array
 from pneuopt.trajectories import Trajectory
-from pneuopt.tuning.candidates import cut, inputs, measure, spacing
+from pneuopt.tuning.candidates import cut, inputs, measure, readings, spacing
 from pneuopt.tuning.cases import Case, cases
 
 if TYPE_CHECKING:
     import pandas as pd
 
 HUNTING = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
-FINE = 4  # points of the record a sample of the search's
+FINE = 4  # points of the record a reading of the search's
 
 
 def evaluate(
@@ -127,7 +127,7 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     start = inner.initial(parameters, reference=reference.initial, start=reference.start)
     if isinstance(loop, Rig):
         return record(loop, run, parameters, initial=start).truth
-    fine = np.linspace(run.t[0], run.t[-1], FINE * (len(run) - 1) + 1)
+    fine = np.linspace(run.t[0], run.t[-1], FINE * readings(inner, reference) * (len(run) - 1) + 1)
     return simulate(inner, run, parameters, initial=start, t_out=fine)
 
 
@@ -178,9 +178,7 @@ def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command
     return {"FrictionSlope": float(-full.value("load.mass") * (A[v, v] - followed))}
 
 
-def _margins(
-    loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step
-) -> dict[str, float]:
+def _margins(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step) -> dict[str, float]:
     open_loop = cut(loop, parameters, x, command, reference)
     robust = margins(open_loop)
     Kp, Ki, Kd, Tf = linear_gains(loop, loop.numbers(parameters)).full().ravel().tolist()

@@ -151,7 +151,7 @@ def info() -> None:
     from importlib.metadata import version
 
     from pneuopt.compiler import cache_directory, compiler
-    from pneuopt.console import screen, show_pairs
+    from pneuopt.console.terminal import screen, show_pairs
 
     packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
     with _guarded():

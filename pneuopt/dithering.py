@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 AMPLITUDE, OFFSET, FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
+NEXT_TO_NONE = 1e-9  # of the amplitude is none, but averages and end values are read over the same periods
 STICKS = 0.5  # of the static friction: a force below half of it frees nothing in company of a working pressure
 
 
@@ -135,7 +136,7 @@ def judge_dither(
     parameters : ParameterSet
         With the dither; its amplitude is positive.
     without : ParameterSet, optional
-        The design to compare with; its amplitude counts as zero. By default the same gains: what the dither does there.
+        The design to compare with; its dither does not count. By default the same gains: what the dither does there.
         Give the gains of a tuning without dither to see whether it is needed.
     band : float
         Half width of the settling band, a fraction of the step.
@@ -156,7 +157,8 @@ def judge_dither(
     require(loop.dither is not None, "there is no dither to judge: ClosedLoop(plant, pid, Dither())")
     require(full.value(AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")
     plain = full if without is None else full | without
-    plain = plain.with_bounds({AMPLITUDE: (0.0, plain[AMPLITUDE].upper)}).with_values({AMPLITUDE: 0.0})
+    plain = plain.with_bounds({AMPLITUDE: (0.0, plain[AMPLITUDE].upper)})
+    plain = plain.with_values({AMPLITUDE: NEXT_TO_NONE * full.value(AMPLITUDE), FREQUENCY: full.value(FREQUENCY)})
     table = _compared(loop, steps, plain, full, band)
     effect = dither_effect(loop, steps[0], full)
     sizes = [abs(s.size) for s in steps]

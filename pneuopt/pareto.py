@@ -3,7 +3,7 @@
 By epsilon constraint: the first requirement is minimised for a row of limits on the second, from the design that is
 best by the first to the one that is best by the second, which two full tunings find. Each design is the start of its
 neighbours', in both directions, so that a branch of local minima that one end leads into is left for the other's; a
-design that a neighbour beats in both requirements is searched for again from there.
+design that another beats, or one of many points spread over the gains' box, is searched for again from there.
 """
 
 import time
@@ -29,6 +29,7 @@ from pneuopt.specification import Specification, allowing
 from pneuopt.tune import Method, Search, brief, ended_in, pose
 from pneuopt.tuning.candidates import Tell
 from pneuopt.tuning.relaxation import settling
+from pneuopt.tuning.screening import first_population
 from pneuopt.tuning.simulator import each
 from pneuopt.tuning.two_phase import TwoPhase, TwoPhasePath, two_phase_path
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 WIDE = 8.0  # ratio of the ends from which on the limits lie evenly in the logarithm
 ROUNDS = 2  # of searching again for designs that others beat
+SAMPLES = 2000  # points at which all requirements are read: branches that neither end leads to
 BEATEN = 1e-3  # relative, by which another design has to be better
 BESIDE = 1e-3  # weight of the other requirement at an end: of designs that are equally good, the best by the other
 
@@ -160,12 +162,12 @@ class _Front:
             self._follow(self.both.method)
         else:
             for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
-                self._improve(k, start)
-        tried = set[tuple[int, int]]()
+                self._improve(k, self._gains(start))
         for _ in range(ROUNDS):
-            for k, better in [pair for pair in self._beaten() if pair not in tried]:
-                tried.add((k, better))
-                self._improve(k, better)
+            for k in range(1, points - 1):
+                better = self._rival(k)
+                if better is not None:
+                    self._improve(k, better)
 
     def frame(self) -> "pd.DataFrame":
         """What there is so far."""
@@ -250,11 +252,11 @@ class _Front:
     def _search(self, k: int, method: Method) -> Search:
         return self.both.asking(self._limited(self.designs[k].limit), method)
 
-    def _improve(self, k: int, start: int) -> None:
-        """Search for a design from another; the better stays."""
-        begun, old, other = time.perf_counter(), self.designs[k], self.designs[start].result
+    def _improve(self, k: int, start: Array | None) -> None:
+        """Search for a design from given gains; the better stays."""
+        begun, old = time.perf_counter(), self.designs[k]
         search = self._search(k, brief(self.both.method, self.both.method.margin))
-        result = search.run(None if other is None else ended_in(other, search.space))
+        result = search.run(start)
         if result.status.code is Code.INTERRUPTED:
             raise KeyboardInterrupt
         self.both.tell(f"{name(self.second)} {shown(self.second, old.limit):.4g}: {result.status}")
@@ -267,17 +269,29 @@ class _Front:
             return one.status.converged
         return _value(one, self.first) < _value(other, self.first)
 
-    def _beaten(self) -> list[tuple[int, int]]:
-        """Designs that another, which keeps their limit, beats; and the best such other."""
-        good = {k: d.result for k, d in enumerate(self.designs) if d.result is not None and d.result.status.converged}
-        values = {k: (_value(r, self.first), _value(r, self.second)) for k, r in good.items()}
-        found = []
-        for k, design in list(enumerate(self.designs))[1:-1]:
-            own = values[k][0] if k in values else np.inf
-            rivals = [j for j, (a, b) in values.items() if j != k and b <= design.limit and a < own * (1 - BEATEN)]
-            if rivals:
-                found.append((k, min(rivals, key=lambda j: values[j][0])))
-        return found
+    def _gains(self, k: int) -> Array | None:
+        result = self.designs[k].result
+        return None if result is None else ended_in(result, self.both.space)
+
+    def _rival(self, k: int) -> Array | None:
+        """The gains of what beats a design within its limit, another design or a sampled point; None without."""
+        design, space = self.designs[k], self.both.space
+        spec, own = self._limited(design.limit), np.inf
+        if design.result is not None and design.result.status.converged:
+            own = _value(design.result, self.first)
+        found = [d.result for d in self.designs if d is not design and _status(d).converged and d.result is not None]
+        rivals = {_value(r, self.first): ended_in(r, space) for r in found if _value(r, self.second) <= design.limit}
+        points, rows = self._sampled
+        rivals |= {v[name(self.first)]: x for x, v in zip(points, rows, strict=True) if not spec.violated(v)}
+        least = min((v for v in rivals if np.isfinite(v)), default=np.inf)
+        return rivals[least] if least < own * (1 - BEATEN) else None
+
+    @cached_property
+    def _sampled(self) -> tuple[Array, list[dict[str, float]]]:
+        """Points spread over the gains' box, and what the requirements read there."""
+        space, rng = self.both.space, np.random.default_rng(0)
+        points = space.draw(first_population(SAMPLES, space.unit(space.start), rng))
+        return points, each(self.both.simulator.values(points, self.both.spec))
 
     def _row(self, design: Design) -> dict[str, Any]:
         result, pair, space = design.result, (self.first, self.second), self.both.space

@@ -147,7 +147,8 @@ def _check_tube(tube: Bounds, requirements: Sequence[Requirement], band: float) 
     require(begins, f"{told}; let them include 0 there, or begin later")
     for q in requirements:
         near = band if isinstance(q, SettlingTime) else q.max if isinstance(q, SteadyStateError) else None
-        told = f"StepEnvelope: from {last:g} s on the bounds are {low:g} to {up:g}, {name(q)} asks for 1 to within {near}"
+        asked = f"{name(q)} asks for 1 to within {near}"
+        told = f"StepEnvelope: from {last:g} s on the bounds are {low:g} to {up:g}, {asked}"
         require(near is None or (low <= 1 + near and up >= 1 - near), f"{told}; move the bounds, or leave one out")
         if isinstance(q, Overshoot) and q.max is not None:
             t, lower, _ = max(tube, key=lambda row: row[1])

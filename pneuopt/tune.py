@@ -26,6 +26,7 @@ from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space, Tell, span
 from pneuopt.tuning.cases import cases
 from pneuopt.tuning.condensed import Condensed, check_differentiable, condense, is_differentiable
+from pneuopt.tuning.confirmed import Confirmed, check_confirmable, reconsidered
 from pneuopt.tuning.reach import check_reach
 from pneuopt.tuning.relaxation import alone, row, together
 from pneuopt.tuning.screening import Screening, merit, screen
@@ -34,7 +35,7 @@ from pneuopt.tuning.two_phase import TwoPhase, check_exact, is_exact, is_light, 
 
 __all__ = ["TuningResult", "tune"]
 Array = NDArray[np.float64]
-Method = TwoPhase | Screening | Condensed
+Method = TwoPhase | Screening | Condensed | Confirmed
 ATTEMPTS = 3  # margins tried, each twice the one before
 TRIED = 5  # printed gains certified at each margin, at most
 ROUNDS = 3  # of looking around for printed gains that lose next to nothing
@@ -75,7 +76,7 @@ def tune(
     scenarios : mapping of str to mapping, optional
         Plants beside the nominal one, or tolerances of the gains: of `corners`, `samples`, `draws`, `tolerances`, or
         several of them joined with ``|``. The worst over references and scenarios counts.
-    method : TwoPhase, Screening or Condensed, optional
+    method : TwoPhase, Screening, Condensed or Confirmed, optional
         By default the first for one linear plant with a continuous controller that no clip can hold back, if it has
         equations for all that is asked for; else, or where that fails, the last for scenarios or many gains where all
         is differentiable, and the second.
@@ -171,7 +172,11 @@ def _checked(
         require(linear, told)
         require(not scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
         check_exact(spec)
-    if isinstance(method, Condensed):
+    if isinstance(method, Confirmed):
+        require(not scenarios, "Confirmed is for one plant, not for scenarios; use its first= as the method itself")
+        check_confirmable(loop, space, spec)
+    fast = method.first if isinstance(method, Confirmed) else method
+    if isinstance(fast, Condensed):
         check_differentiable(space, spec)
     if method is not None:
         return method
@@ -305,14 +310,21 @@ class Search:
         assert not isinstance(self.method, TwoPhase)
         spec = self.tightened(margin)
         arguments = (simulator, self.notary.references, self.space, spec)
-        if isinstance(self.method, Condensed):
-            found = condense(*arguments, self.method, start, self.tell)
+        method = self.method.first if isinstance(self.method, Confirmed) else self.method
+        if isinstance(method, Condensed):
+            found = condense(*arguments, method, start, self.tell)
         else:
-            found = screen(*arguments, self.method, start, self.tell)
+            found = screen(*arguments, method, start, self.tell)
         values = each(simulator.values(found.point[None], spec))[0]
-        stats = {"simulations": float(found.count), "optimum": spec.objective(values)}
-        status, active = _screened(self.spec, values), _active(self.space, spec, found.point, values)
-        return Found(found.point, status, active, stats, found.is_complete)
+        stats, status = {"simulations": float(found.count)}, _screened(self.spec, values)
+        point, text = found.point, ""
+        if isinstance(self.method, Confirmed) and status.converged and found.is_complete:
+            self.tell("full-space multiple shooting from the search's answer")
+            point, text = reconsidered(simulator, self.notary.references, spec, self.method, point, values)
+            values = each(simulator.values(point[None], spec))[0]
+        stats["optimum"] = spec.objective(values)
+        active = _active(self.space, spec, point, values)
+        return Found(point, status, active, stats, found.is_complete, text)
 
     def _printed(self, simulator: Simulator, found: Found, margin: float) -> Iterator[Array]:
         """The gains as printed; where those break a limit or lose too much, what a last place more or less mends."""

@@ -27,7 +27,7 @@ from pneuopt.tuning.simulator import Simulator
 Array = NDArray[np.float64]
 Ranges = dict[str, tuple[float, float]]
 MARGIN = 0.1  # of the design's figures: what the limits leave
-FLOORS = {"Overshoot": 0.005, "SteadyStateError": 0.002}  # [of the step] for figures that are next to nothing
+FLOORS = {"Overshoot": 0.005, "SteadyStateError": 0.002, "MaxSensitivity": 0.01}  # where there is next to nothing
 GLOBAL, LOCAL, TOP, DIGITS = 800, 400, 10, 4
 ROBUST, OVERSHOOT = 2.0, 0.3  # a design that is more nervous than that is none
 MOST_DRAWS = 20
@@ -229,9 +229,8 @@ def _limited(loop: po.ClosedLoop, rng: np.random.Generator) -> list[str]:
 
 
 def _limit(name: str, value: float) -> Requirement:
-    allowed = value * (1 + MARGIN) + FLOORS.get(name, 0.0)
-    if name == "MaxSensitivity":
-        allowed = 1 + (value - 1) * (1 + MARGIN)
+    least = 1.0 if name == "MaxSensitivity" else 0.0
+    allowed = least + (value - least) * (1 + MARGIN) + FLOORS.get(name, 0.0)
     return getattr(po, name)(max=allowed)  # type: ignore[no-any-return]
 
 

@@ -64,7 +64,8 @@ def run(seeds: list[int], jobs: int, kept: Path | None) -> "pd.DataFrame":
     """A row a problem; those that `kept` already has are not tuned again."""
     import pandas as pd
 
-    rows = pd.read_csv(kept).to_dict("records") if kept is not None and kept.exists() else []
+    read = pd.read_csv(kept).to_dict("records") if kept is not None and kept.exists() else []
+    rows = [{str(k): v for k, v in row.items()} for row in read]
     done = {int(r["seed"]) for r in rows}
     for row in _outcomes([s for s in seeds if s not in done], jobs):
         rows.append(row)

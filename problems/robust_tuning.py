@@ -148,6 +148,7 @@ def _part(name: str, task: Task, seeds: int, more: Callable[[po.ParameterSet], d
         method = po.Condensed(seed=seed)
         runs.append(po.tune(task.loop, task.steps, start, scenarios=task.scenarios, method=method, **asked))
         seconds["robust"] = time.process_time() - begun
+        print(f"{name} seed {seed}: {runs[-1].status}, {seconds['robust']:.1f} s CPU", file=sys.stderr, flush=True)
     runs.sort(key=lambda r: _worst(r.certified, "SettlingTime"))
     designs = {"nominal": nominal, "robust": runs[0]}
     band = getattr(task.minimise, "band", 0.02)

@@ -3,7 +3,8 @@
     python problems/sampled_tuning.py [--samples MS ...] [--json FILE] [--out DIR]
 
 The drive is the benchmark T32 (LuGre friction, a dead zone of 3 %), the step 0.2 m/s from rest. Kp, Ki, Kd, Tf and the
-offset of the command are free; what is minimised is the settling time to 2 %, overshoot at most 5 %, Ms at most 1.6.
+offset of the command are free; what is minimised is the settling time to 2 %, overshoot at most 5 %, Ms at most 1.6;
+the best of three searches counts.
 "continuous" is tuned and run without sampling; "<h>ms.continuous" are its gains in a PID that samples every h with one
 sample of computing delay, "<h>ms.tuned" is tuned as that PID. Every figure is certified, by a simulation that holds the
 command between samples; a loop that never settles shows none. "kept" is 1 where a design keeps all limits and settles.
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 SAMPLES = (1.0, 2.0, 5.0, 10.0)  # [ms]
 DELAY = 1  # [samples]
+SEEDS = (0, 1, 2)
 BAND, OVERSHOOT, SENSITIVITY = 0.02, 0.05, 1.6
 LIMITS = (po.Overshoot(OVERSHOOT), po.MaxSensitivity(SENSITIVITY))
 FREE = {n: r for n, r in RANGES.items() if n != "dither.amplitude"} | {"pid.Tf": (0.002, 0.05)}
@@ -44,7 +46,7 @@ class Run:
     @property
     def settling_time(self) -> float:
         """[s]; NaN where it never settles."""
-        return float(self.certified.loc["SettlingTime"].iloc[0])
+        return float(self.certified.loc["SettlingTime"].to_numpy(dtype=float)[0])
 
     @property
     def is_kept(self) -> bool:
@@ -77,8 +79,13 @@ def benchmark(sample_time: float | None) -> tuple[po.ClosedLoop, po.ParameterSet
 
 
 def _tuned(loop: po.ClosedLoop, given: po.ParameterSet) -> Run:
-    best = po.tune(loop, STEP, given, minimise=po.SettlingTime(band=BAND), subject_to=LIMITS)
-    return Run(loop, best.parameters, best.certified)
+    """The best of some seeds."""
+    found = []
+    for seed in SEEDS:
+        method = po.Screening(seed=seed)
+        best = po.tune(loop, STEP, given, minimise=po.SettlingTime(BAND), subject_to=LIMITS, method=method, throw=False)
+        found.append(Run(loop, best.parameters, best.certified))
+    return min(found, key=lambda r: r.settling_time if r.is_kept else np.inf)
 
 
 def main(runs: dict[str, Run]) -> "pd.DataFrame":

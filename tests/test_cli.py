@@ -13,7 +13,8 @@ from typer.testing import CliRunner, Result
 
 from pneuopt.cli import app
 from pneuopt.commands import identifying, looping
-from pneuopt.console import screen, show_estimates
+from pneuopt.console.fits import show_estimates
+from pneuopt.console.terminal import screen
 from pneuopt.experiments import read_log
 from pneuopt.files import read_drive, read_status
 from pneuopt.models.drive import ForceDrive

@@ -108,12 +108,12 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
     "limit after the record": (
         TUNE,
         edit("tuning.toml", 'overshoot = "10 %"', 'settling_time = { band = "5 %", max = "2 s" }'),
-        "SettlingTime: max 2 s is more than 0.3 s after the step can show (reference 0 to 0.2); lengthen its horizon to",
+        "SettlingTime: max 2 s is more than 0.3 s after the step can show (reference 0 to 0.2); lengthen its horizon",
     ),
     "tube without the reference": (
         TUNE,
         edit("tuning.toml", "[limits]", f"[limits]\n{TUBE}"),
-        "tuning.toml: [minimise] and [limits]: StepEnvelope: from 0.1 s on the bounds are 0.5 to 0.8, SettlingTime asks",
+        "tuning.toml: [minimise] and [limits]: StepEnvelope: from 0.1 s on the bounds are 0.5 to 0.8, SettlingTime",
     ),
     "force beyond the clip": (
         TUNE,

@@ -126,7 +126,7 @@ def test_a_study_of_nothing_but_failures_is_shown_and_drawn(folder: Path) -> Non
 
 
 def test_many_cases_are_shown_by_the_worst(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pneuopt.console.MOST_CASES", 2)
+    monkeypatch.setattr("pneuopt.console.loops.MOST_CASES", 2)
     result = run("study study.toml -o cases.csv")
     assert "the 2 worst of 4 cases by SettlingTime; -o FILE writes all" in result.stdout
     settling = pd.read_csv("cases.csv")[["SettlingTime[0 to 0.2] [s]", "SettlingTime[0 to -0.1] [s]"]].max(axis=1)
@@ -184,3 +184,16 @@ def test_bad_input_gets_one_message_and_writes_nothing(folder: Path, old: str, n
     assert said in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert {p: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def test_tuning_ends_with_what_the_dither_is_worth(folder: Path) -> None:
+    free = 'Kp = { value = "300 N*s/m", lower = "200 N*s/m", upper = "400 N*s/m", free = true }'
+    edit("tuning.toml", 'Kp = "300 N*s/m"', free)
+    dither = '[dither]\nfrequency = "50 Hz"\namplitude = "0.01 N"\n[minimise]\niae = {}\n[limits]'
+    edit("tuning.toml", "[limits]", dither)
+    edit("tuning.toml", 'max = "1 s"', 'max = "200 ms"')
+    result = run("tune drive.toml tuning.toml --json out.json")
+    assert "the dither of 0.01 N at 50 Hz is useless, against the same gains without it" in result.output
+    told = json.loads(Path("out.json").read_text(encoding="utf-8"))["dither"]
+    assert told["usefulness"] == "useless"
+    assert any("price: ripple" in reason for reason in told["reasons"])

@@ -4,10 +4,12 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from pneuopt.console import metric_units, show_gains, show_metrics
+from pneuopt.console.loops import metric_units, show_dither, show_gains, show_metrics
+from pneuopt.console.terminal import screen
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dithering import DitherEffect, DitherVerdict, Usefulness
 from pneuopt.models.linear import FirstOrder
 from pneuopt.requirements import KINDS, MaxComplementarySensitivity, Overshoot, PhaseMargin, Requirement, StepEnvelope
 
@@ -53,3 +55,23 @@ def test_gains_are_shown_in_another_form_too(form: Form, values: dict[str, float
     out = io.StringIO()
     show_gains(Console(file=out, width=80), given, given)
     assert said in out.getvalue()
+
+
+def test_a_dithers_verdict_is_shown_with_its_reasons(capsys: pytest.CaptureFixture[str]) -> None:
+    table = pd.DataFrame({"without": {"Ripple": 0.0}, "with": {"Ripple": 1e-3}})
+    effect = DitherEffect(0.001, 159.0)
+    verdict = DitherVerdict(Usefulness.USELESS, ("nothing changes", "price: air"), table, effect, "the same gains", "V")
+    show_dither(screen(), verdict)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "the dither of 0.001 V at 159 Hz is useless, against the same gains"
+    assert [line.strip() for line in lines[1:]] == ["nothing changes", "price: air"]
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 0.01])
+def test_a_limit_cycle_is_shown_where_there_is_one(amplitude: float, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = {"SettlingTime": 0.1, "LimitCycleAmplitude": amplitude, "LimitCycleFrequency": 2.0, "AirUse": 1.5}
+    loop = ClosedLoop(FirstOrder().system(), PID())
+    show_metrics(screen(), pd.DataFrame({"0 to 1": rows}), loop)
+    out = capsys.readouterr().out
+    assert ("LimitCycleFrequency" in out) == (amplitude > 0)
+    assert "l(ANR)" in out

@@ -40,7 +40,7 @@ def front(sample_time: float | None) -> pd.DataFrame:
     return pareto_front(loop, STEP, given, minimise=PAIR, subject_to=[Overshoot(0.05)], points=5, method=method)
 
 
-@pytest.mark.parametrize("sample_time", [None, 2e-3])
+@pytest.mark.parametrize("sample_time", [None, pytest.param(2e-3, marks=pytest.mark.slow)])
 def test_no_design_is_beaten_by_brute_force(sample_time: float | None) -> None:
     """Of 60 x 60 gains none is better in both by more than 3 % of the settling time, the searches' margin."""
     loop, given = oscillator(sample_time)
@@ -51,10 +51,10 @@ def test_no_design_is_beaten_by_brute_force(sample_time: float | None) -> None:
     assert (found["error"] == "").all()
     for _, design in found.iterrows():
         rivals = values["SettlingTime"][good & (values["MaxSensitivity"] <= design["MaxSensitivity"])]
-        assert design["SettlingTime"] <= rivals.min() * 1.03
+        assert design["SettlingTime"] <= rivals.min(initial=np.inf) * 1.03
 
 
-@pytest.mark.parametrize("sample_time", [None, 2e-3])
+@pytest.mark.parametrize("sample_time", [None, pytest.param(2e-3, marks=pytest.mark.slow)])
 def test_a_front_is_a_front_and_certified(sample_time: float | None) -> None:
     found, (loop, given) = front(sample_time), oscillator(sample_time)
     assert len(found) == 5
@@ -68,11 +68,11 @@ def test_a_front_is_a_front_and_certified(sample_time: float | None) -> None:
     assert abs(middle["SettlingTime"] - middle["claimed SettlingTime"]) < 1e-3
 
 
-def test_a_front_is_drawn(tmp_path: object) -> None:
-    picture = plot_front(front(2e-3), {"SettlingTime": "s", "MaxSensitivity": ""})
+def test_a_front_is_drawn() -> None:
+    picture = plot_front(front(None), {"SettlingTime": "s", "MaxSensitivity": ""})
     (axes,) = picture.axes
     line = axes.lines[0]
-    np.testing.assert_array_equal(line.get_xdata(), front(2e-3)["MaxSensitivity"])
+    np.testing.assert_array_equal(line.get_xdata(), front(None)["MaxSensitivity"])
     assert axes.get_ylabel() == "SettlingTime [s]"
 
 

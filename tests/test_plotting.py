@@ -249,7 +249,8 @@ def test_friction_along_a_run_is_what_the_balance_of_forces_leaves() -> None:
     z = {q.name: ca.SX.sym(q.name) for q in LuGre().states}
     v, values = ca.SX.sym("v"), {n: ca.SX(q.value) for n, q in LuGre().parameters.items()}
     force = ca.Function("force", [v, *z.values()], [g(v, z, {}, values).value])
-    assert friction_force(drive.system(), run, p) == pytest.approx(np.array(force(speed, bristle)).ravel(), abs=0.02)  # end stops
+    expected = np.array(force(speed, bristle)).ravel()
+    assert friction_force(drive.system(), run, p) == pytest.approx(expected, abs=0.02)  # the end stops reach so far
 
 
 def test_steps_show_what_goes_on_inside_where_it_is_known() -> None:

@@ -17,7 +17,8 @@ from pneuopt.commands.shared import (
     warn_of,
     write_csv,
 )
-from pneuopt.console import progress, screen, show_estimates, show_fit, show_selection, show_status, show_verdict
+from pneuopt.console.fits import show_estimates, show_fit, show_selection, show_verdict
+from pneuopt.console.terminal import progress, screen, show_status
 from pneuopt.errors import InputError, require
 from pneuopt.experiments import Experiment, read_log, split
 from pneuopt.files import Drive, read_drive, write_fit

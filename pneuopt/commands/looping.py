@@ -23,18 +23,16 @@ from pneuopt.commands.shared import (
     read_loop,
     write_csv,
 )
-from pneuopt.console import (
-    progress,
-    screen,
+from pneuopt.console.loops import (
     show_dither,
     show_gains,
     show_metrics,
     show_rejected,
     show_relaxations,
     show_requirements,
-    show_status,
     show_validation,
 )
+from pneuopt.console.terminal import progress, screen, show_status
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dithering import judge_dither
@@ -143,6 +141,10 @@ def _show_tuned(console: "Console", asked: Tuning, before: ParameterSet, result:
     show_gains(console, before, result.parameters)
     show_metrics(console, result.certified, asked.loop, before=_before(asked, before), limits=asked.subject_to)
     show_requirements(console, result.requirements, result.active, asked.loop)
+    slopes = [v for n, v in result.stats.items() if n.startswith("friction_slope")]
+    if slopes:
+        ends = " to ".join(dict.fromkeys(f"{v:.4g}" for v in (min(slopes), max(slopes))))
+        console.print(f"margins are read with the slope that friction has where a step ends: {ends} N*s/m")
     tables: dict[str, Any] = {}
     validation = _validation(asked, before, result)
     if validation is not None:
@@ -150,6 +152,8 @@ def _show_tuned(console: "Console", asked: Tuning, before: ParameterSet, result:
         tables["validation"] = records(validation.summary)
     if asked.loop.dither_period(result.parameters) is not None:
         tables |= _judged(console, asked, result.parameters)
+    elif "dither.amplitude" in result.parameters.free_names:
+        console.print("the dither's amplitude is 0: the tuning found no use for it")
     return tables
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.console import screen, show_written
+from pneuopt.console.terminal import screen, show_written
 from pneuopt.files import read_drive, read_status
 from pneuopt.identify import IdentificationResult
 from pneuopt.nlp.status import Code, Status

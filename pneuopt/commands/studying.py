@@ -20,7 +20,8 @@ from pneuopt.commands.shared import (
     read_loop,
     warn_of,
 )
-from pneuopt.console import SMALLEST_IS_WORST, metric_units, progress, screen, show_cases
+from pneuopt.console.loops import SMALLEST_IS_WORST, metric_units, show_cases
+from pneuopt.console.terminal import progress, screen
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import InputError, check_known, require
 from pneuopt.output import records, write_text

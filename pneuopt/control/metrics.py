@@ -8,13 +8,12 @@ from math import nan
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.control.means import TAIL, end_mean, period_mean, tail
 from pneuopt.errors import require
 
 Array = NDArray[np.float64]
 
-PERIODS_AT_END = 5
 PERIODS_INSIDE = 2  # of the dither, at least, of a response that has settled
-TAIL = 0.05
 INTEGRALS = ("IAE", "ISE", "ITAE")
 
 Envelope = Sequence[tuple[float, float, float]]
@@ -196,7 +195,7 @@ def batch_metrics(
         **({} if scale is None else _deviations(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
         "SteadyStateError": 100 * np.abs(reference_final - steady) / abs(size),
-        **({"Ripple": np.ptp(_tail(raw, dither_period).y, axis=1)} if _asked(only, "Ripple") else {}),
+        **({"Ripple": np.ptp(tail(raw.t, raw.y, dither_period)[1], axis=1)} if _asked(only, "Ripple") else {}),
         **_integrals(smooth, reference_final, size, only),
         **_enveloped(smooth, initial if scale is None else reference_final - size, size, envelope),
         **_effort(t, control, start, sample_time, len(raw.y), only),
@@ -235,58 +234,6 @@ def _averaged(record: _Record, initial: float, period: float) -> Array:
         f"the record of {record.t[-1]:g} s is too short to average over {period:g} s; simulate longer",
     )
     return period_mean(record.t, record.y, initial, period, record.t[record.t <= last])
-
-
-def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
-    """Centred mean over one period of signals that are linear between samples, and `initial` before the first.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-    y : ndarray, shape (m, n)
-    initial : float
-    period : float
-        [s]
-    at : ndarray, shape (k,)
-        Instants, half a period from the end at most [s].
-
-    Returns
-    -------
-    ndarray, shape (m, k)
-    """
-    record = _Record(t, y)
-    steps = 0.5 * np.diff(t) * (y[:, 1:] + y[:, :-1])
-    whole = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
-    ends = (_integral(record, whole, initial, at + side * period / 2) for side in (1, -1))
-    mean: Array = (next(ends) - next(ends)) / period
-    return mean
-
-
-def end_mean(t: Array, y: Array, period: float | None) -> Array:
-    """The final values as `step_metrics` reads them, shape (m,): the last sample, or the mean over the last periods."""
-    return y[:, -1] if period is None else _mean(_tail(_Record(t, y), period))
-
-
-def _integral(record: _Record, whole: Array, initial: float, at: Array) -> Array:
-    """From the step to `at`, of the signal that is linear between samples and `initial` before the first one."""
-    t, y = record.t, record.y
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    ahead = at - t[k]
-    inside: Array = whole[:, k] + ahead * (y[:, k] + 0.5 * ahead * (y[:, k + 1] - y[:, k]) / (t[k + 1] - t[k]))
-    return np.where(at < t[0], initial * (at - t[0]), inside)
-
-
-def _tail(record: _Record, period: float | None) -> _Record:
-    t, y = record.t, record.y
-    duration = TAIL * (t[-1] - t[0]) if period is None else period * min(PERIODS_AT_END, int((t[-1] - t[0]) / period))
-    begin = t[-1] - duration
-    k = min(max(int(np.searchsorted(t, begin, side="right")) - 1, 0), len(t) - 2)
-    first = y[:, [k]] + (begin - t[k]) / (t[k + 1] - t[k]) * (y[:, [k + 1]] - y[:, [k]])
-    return _Record(np.append(begin, t[t > begin]), np.concatenate([first, y[:, t > begin]], axis=1))
-
-
-def _mean(record: _Record) -> Array:
-    return np.asarray(np.trapezoid(record.y, record.t, axis=1) / (record.t[-1] - record.t[0]))
 
 
 def _rise(record: _Record, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:

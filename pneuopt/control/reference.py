@@ -75,7 +75,7 @@ class Step:
 
     @property
     def whole(self) -> float:
-        """What fractions are of: the step's size, with its sign, or what stands for it [unit of the measured signal]."""
+        """What fractions are of: the step's size with its sign, or what stands for it [unit of the measured signal]."""
         return self.size or self.scale or abs(self.initial)
 
     @property

@@ -23,7 +23,7 @@ from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 EXPANDED = 200_000  # scalar operations up to which flattening the whole graph to scalars pays
-NEAR = 1e-6  # barrier and distances from bounds with which a solution's neighbour is begun: 4 iterations for 18
+NEAR = 1e-4  # barrier and distances from bounds with which a solution's neighbour is begun: 8 iterations where 18 were
 _PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 
 

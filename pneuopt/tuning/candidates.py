@@ -150,9 +150,7 @@ def span(loop: ClosedLoop, parameters: ParameterSet) -> Space:
             f"{n} is free within [{p.lower:g}, {p.upper:g}] {p.unit}: it needs two finite bounds, "
             f"parameters.with_bounds({{{n!r}: (lower, upper)}}), or fix it",
         )
-        require(
-            n not in divisors or p.lower > 0, f"{n}: its lower bound must be positive, got {p.lower:g} {p.unit}"
-        )
+        require(n not in divisors or p.lower > 0, f"{n}: its lower bound must be positive, got {p.lower:g} {p.unit}")
         if n == "dither.amplitude":
             _check_amplitude(full)
         require(

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.codegen import Rollout
-from pneuopt.control.metrics import PERIODS_INSIDE, TAIL
+from pneuopt.control.means import TAIL
+from pneuopt.control.metrics import PERIODS_INSIDE
 from pneuopt.nlp.sqp import Groups, Point
 from pneuopt.requirements import ROBUSTNESS, Overshoot, SettlingTime, SteadyStateError, read
 from pneuopt.specification import Specification

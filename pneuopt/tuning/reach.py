@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_response
-from pneuopt.control.metrics import TAIL
+from pneuopt.control.means import TAIL
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.rest import find_rest, sliding

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pneuopt.control.metrics import TAIL
+from pneuopt.control.means import TAIL
 from pneuopt.control.reference import Step
 from pneuopt.requirements import AT_LEAST, Requirement, SettlingTime, bound, most, name
 from pneuopt.specification import Specification

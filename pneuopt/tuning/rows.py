@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.consumption import LITRES, NORMAL_DENSITY
-from pneuopt.control.metrics import Envelope, end_mean
+from pneuopt.control.means import end_mean
+from pneuopt.control.metrics import Envelope
 from pneuopt.requirements import (
     IAE,
     ISE,

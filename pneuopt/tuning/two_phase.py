@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_grid, sensitivity_terms
-from pneuopt.control.metrics import TAIL
+from pneuopt.control.means import TAIL
 from pneuopt.control.reference import Step, disturbing
 from pneuopt.errors import require
 from pneuopt.nlp.full_space import FullSpace, Problem, follow, prepare, solve_from

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -51,7 +53,8 @@ def test_both_waves_begin_at_zero_rise_and_have_amplitude_for_their_peak(wavefor
     at = np.linspace(-0.05, 0.1, 3001)
     found = np.array([float(wave(k)) for k in at])
     assert (found.max(), found.min()) == pytest.approx((0.3, -0.3), abs=1e-9)
-    assert float(wave(0.0)) == pytest.approx(0.0, abs=1e-12) and float(wave(1e-3)) > 0
+    assert float(wave(0.0)) == pytest.approx(0.0, abs=1e-12)
+    assert float(wave(1e-3)) > 0
     np.testing.assert_allclose(found, 0.3 * waveform.at(2 * np.pi * 20.0 * at), atol=1e-12)
     np.testing.assert_allclose(found[:2001], found[1000:], atol=1e-9)  # a period of 50 ms later
 
@@ -73,9 +76,9 @@ def test_the_simulation_sees_a_triangles_corners(analogue: bool) -> None:
     run = simulate(loop, Trajectory(t, {"reference": np.zeros(len(t))}), given)
     gain, T = (given.value(n) for n in plant.parameters)
     y, corners = 0.0, np.arange(-0.0125, 0.5, 0.025)
-    for k, (a, b) in enumerate(zip(t, t[1:], strict=False)):
+    for k, (a, b) in enumerate(pairwise(t)):
         cuts = [a, *corners[(corners > a + 1e-9) & (corners < b - 1e-9)], b]
-        for c, d in zip(cuts, cuts[1:], strict=False):
+        for c, d in pairwise(cuts):
             u0, u1 = (0.4 * float(Waveform.TRIANGLE.at(2 * np.pi * 20.0 * s)) for s in (c, d))
             s = gain * (u1 - u0) / (d - c)
             y = gain * u1 - s * T + (y - gain * u0 + s * T) * np.exp(-(d - c) / T)

@@ -2,29 +2,50 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import benchmark_tuning
+import numpy as np
 import pytest
-from benchmark_tuning import Run
+from benchmark_tuning import Clock, Run, Study
+from numpy.typing import NDArray
 
 
 def test_a_run_that_never_settles_is_the_worst() -> None:
     good, lost = Run(0.05, 0.06, 3.0, 1.0, 100, 99), Run(0.05, math.nan, 4.0, 1.0, 100, 96)
-    rows = benchmark_tuning.main(
-        {"8_corners": {"condensed": [good, lost, lost], "de.x3": [good, good, good], "screening": [good]}}
-    ).set_index("name")
-    assert rows.loc["8_corners.condensed.median", "value"] == math.inf
-    assert not rows.loc["8_corners.condensed.median", "holds"]
-    assert not rows.loc["8_corners.de_x3_over_ours", "holds"]
-    assert rows.loc["8_corners.condensed.fresh.within_5", "value"] == 96
-    assert rows.loc["8_corners.screening.best", "value"] == pytest.approx(0.06)
+    runs = {"10_corners": {"condensed": [good, lost, lost], "de.x1": [good, good, good]}}
+    study = Study(runs, {}, {"10_corners": {"de": [2.0, math.inf, math.inf]}})
+    rows = benchmark_tuning.main(study).set_index("name")
+    assert rows.loc["10_corners.condensed.median", "value"] == math.inf
+    assert not rows.loc["10_corners.condensed.median", "holds"]
+    assert rows.loc["10_corners.condensed.fresh.within_5", "value"] == 96
+    assert rows.loc["10_corners.de.x1.best", "value"] == pytest.approx(0.06)
+    assert rows.loc["10_corners.de.reach", "value"] == math.inf
+    assert rows.loc["10_corners.condensed.at_median_of_de", "value"] == pytest.approx(100 / 3)
+
+
+def test_the_clock_stops_at_the_goal_and_keeps_what_was_there_before() -> None:
+    best = iter([0.3, 0.2, 0.1])
+
+    class Simulated:
+        def respond(self, points: NDArray[np.float64], band: float) -> SimpleNamespace:  # noqa: ARG002
+            value = np.full(len(points), next(best))
+            return SimpleNamespace(values={"SettlingTime": value, "Overshoot": 0 * value, "Excess": 0 * value})
+
+    clock = Clock(Simulated(), (0.0, 0.0, 60.0), 0.15)  # type: ignore[arg-type]
+    clock.merits(np.array([[3.0]]))
+    clock.merits(np.array([[2.0]]))
+    with pytest.raises(StopIteration):
+        clock.merits(np.array([[1.0]]))
+    assert clock.best == pytest.approx(0.1)
+    assert 0 < clock.reached < 60
 
 
 @pytest.mark.slow
 def test_one_plant_is_tuned_and_certified(tmp_path: Path) -> None:
-    found, traces = benchmark_tuning.run(["5_nominal"], 1)
-    (best,) = found["5_nominal"]["condensed"]
+    study = benchmark_tuning.run(["5_nominal"], 1, 3.0)
+    (best,) = study.runs["5_nominal"]["condensed"]
     assert best.settling_time <= 0.075
     assert best.overshoot <= 5.0
     assert best.settling_time == pytest.approx(best.claimed, abs=3e-3)
-    benchmark_tuning.figure(found, traces).savefig(tmp_path / "picture.png")
+    benchmark_tuning.figure(study).savefig(tmp_path / "picture.png")

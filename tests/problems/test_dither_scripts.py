@@ -10,7 +10,9 @@ import stiction_windup
 
 
 def test_friction_makes_the_papers_gains_overshoot_by_40_percent() -> None:
-    smooth, sticking = (stiction_windup.stepped(stiction_windup.FAST, stiction_windup.PAPERS, lugre=k) for k in (0, 1))
+    smooth, sticking = (
+        stiction_windup.stepped(stiction_windup.FAST, stiction_windup.PAPERS, lugre=k) for k in (False, True)
+    )
     assert smooth.overshoot == pytest.approx(1.4, abs=0.1)
     assert sticking.overshoot == pytest.approx(40.2, abs=0.3)
 

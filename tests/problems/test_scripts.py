@@ -6,6 +6,7 @@ import b32
 import b32_partial
 import emps
 import pandas as pd
+import pareto
 import pytest
 import real_logs
 import rig_demo
@@ -102,3 +103,12 @@ def test_t32(tmp_path: Path) -> None:
     assert failed(t32.main(job)) == []
     t32.figure(job).savefig(tmp_path / "merit.png")
     assert (tmp_path / "merit.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_pareto(tmp_path: Path) -> None:
+    job = pareto.run()
+    assert failed(pareto.main(job)) == []
+    for name, picture in pareto.figures(job).items():
+        picture.savefig(tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000

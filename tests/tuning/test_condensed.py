@@ -12,16 +12,36 @@ from pneuopt.control.reference import Step
 from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
-from pneuopt.models.linear import Integrator
+from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.nlp.status import Code
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
+from pneuopt.requirements import (
+    IAE,
+    ISE,
+    ITAE,
+    ControlRate,
+    GainMargin,
+    MaxComplementarySensitivity,
+    MaxSensitivity,
+    NoiseGain,
+    Overshoot,
+    PeakControl,
+    PhaseMargin,
+    Requirement,
+    Ripple,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    StepEnvelope,
+)
 from pneuopt.scenarios import Scenarios, corners, tolerances
 from pneuopt.specification import specify
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.confirmed import Confirmed
 from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
 
 STEP = Step(1.0, horizon=2.0)
@@ -68,6 +88,68 @@ def test_slopes_are_those_of_finite_differences(dither: Dither | None) -> None:
         off = np.abs(slopes - point.slopes[:, k])
         assert np.quantile(off, 0.99) < 2e-3 * scale, k
         assert np.median(off) < 1e-5 * scale, k
+
+
+TUBE = StepEnvelope(((0.0, -0.2, 1.3), (0.1, 0.7, 1.2)), max=1.0)
+FURTHER: list[Requirement] = [IAE(), ISE(), ITAE(), TUBE, ControlRate(), MaxComplementarySensitivity(), NoiseGain()]
+FURTHER += [GainMargin(), PhaseMargin()]
+
+
+@pytest.mark.parametrize("requirement", FURTHER, ids=lambda q: type(q).__name__)
+def test_further_kinds_are_read_as_the_metrics_and_have_their_slopes(requirement: Requirement) -> None:
+    loop, given = friction_loop(Dither(80.0))
+    spec = specify({requirement: 1.0})
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], span(loop, given), {}, spec)
+    posed = Linearised(simulator, differentiated(simulator), spec, 1000, 1.0)
+    n = len(posed.bounds) - 1
+    z = np.append(np.full(n, 0.45), 0.5)
+    (point,) = posed.evaluate(z[None])
+    measured = simulator.values(simulator.space.draw(z[None, :-1]), spec)[type(requirement).__name__]
+    assert point.merit == pytest.approx(float(measured[0]), rel=5e-3)
+    k = int(np.argmax(np.where(point.group == 0, point.values, -np.inf)))
+    for i in range(n):
+        nudge = 1e-5 * (np.arange(n + 1) == i)
+        above, below = posed.evaluate(np.array([z + nudge, z - nudge]))
+        slope = (above.values[k] - below.values[k]) / 2e-5
+        assert point.slopes[k, i] == pytest.approx(slope, rel=2e-2, abs=2e-3 * np.abs(point.slopes[k]).max() + 1e-9), i
+
+
+def test_an_integral_is_minimised_within_limits() -> None:
+    loop, given = friction_loop()
+    best = tune(loop, Step(0.1, horizon=0.4), given, minimise=ITAE(), subject_to=[ControlRate(4e4), TUBE], method=QUICK)
+    assert best.status.converged
+    assert best.certified.loc["ControlRate"].max() <= 4e4
+    assert best.certified.loc["StepEnvelope"].max() <= 1.0
+
+
+@pytest.mark.parametrize("requirement", [RiseTime(), Ripple()])
+def test_what_has_no_slope_is_named_with_the_remedy(requirement: Requirement) -> None:
+    loop, given = friction_loop(Dither(80.0))
+    with pytest.raises(InputError, match=rf"no gradient for {type(requirement).__name__}; use method=Screening"):
+        tune(loop, Step(0.1), given, minimise=requirement, method=QUICK)
+
+
+@pytest.mark.slow
+def test_full_space_confirms_the_search_or_betters_it() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
+    limits = [Overshoot(0.05), PeakControl(4.0)]
+    rough, fine = Screening(members=6, generations=1, refinements=0), Screening(members=20, generations=6)
+    found = [
+        tune(loop, STEP, given, minimise=SettlingTime(), subject_to=limits, method=method)
+        for method in (rough, Confirmed(rough), Confirmed(fine))
+    ]
+    first, better, same = (r.certified.loc["SettlingTime"].max() for r in found)
+    assert "full space: bettered from" in found[1].status.message
+    assert better < 0.99 * first
+    assert "full space: confirmed, a local optimum within" in found[2].status.message
+    assert better == pytest.approx(same, rel=0.01)
+
+
+def test_full_space_refuses_what_it_cannot_see() -> None:
+    loop, given = friction_loop(Dither(80.0))
+    with pytest.raises(InputError, match="continuous controller"):
+        tune(loop, Step(0.1), given, minimise=SettlingTime(), method=Confirmed())
 
 
 def test_the_best_settling_time_is_the_one_that_is_measured() -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate
+from pneuopt.certify import evaluate, respond
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -13,7 +13,7 @@ from pneuopt.control.reference import Step
 from pneuopt.errors import InputError, UnknownNameError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.models.linear import Integrator
+from pneuopt.models.linear import Integrator, SecondOrder
 from pneuopt.parameters import ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
 from pneuopt.scenarios import Factor, Scenarios, applied, corners, samples, tolerances
@@ -160,3 +160,20 @@ def test_racing_finds_what_facing_every_case_finds_and_runs_less() -> None:
         plain = screen(simulator, references, space, spec, method, space.start, lambda _: None)
     assert np.array_equal(raced.point, plain.point)
     assert few < 0.8 * sum(lanes)
+
+
+def test_a_search_sees_what_happens_between_two_samples() -> None:
+    """A plant that rings with a period of three samples peaks between two, twice as far over as at any."""
+    loop = ClosedLoop(SecondOrder().system(), PID(sample_time=0.02, limits=False))
+    values = {"plant.natural_frequency": 100.0, "plant.damping": 0.2, "pid.Kp": 0.1, "pid.b": 8.0}
+    given = loop.parameters.with_values(values | {"pid.Ki": 9.0}).with_bounds({"pid.Ki": (1.0, 30.0)}).freed("pid.Ki")
+    space, step = span(loop, given), Step(0.2, horizon=0.8)
+    points = np.array([[9.0], [10.0]])
+    found = Simulator(loop, [step], space).respond(points, 0.02)
+    for k, point in enumerate(points):
+        parameters = space.filled(point)
+        proof, fine = evaluate(loop, step, parameters)[step.label], respond(loop, step, parameters)
+        at_samples = fine["speed"][:: round(0.02 / (fine.t[1] - fine.t[0]))]
+        assert proof["Overshoot"] > 1.5 * 100 * (at_samples.max() / 0.2 - 1)
+        assert found.table("Overshoot")[k, 0] == pytest.approx(proof["Overshoot"], abs=0.1)
+        assert found.table("SettlingTime")[k, 0] == pytest.approx(proof["SettlingTime"], abs=1e-4)

@@ -1,0 +1,100 @@
+"""What an identification shows: estimates, what the logs do not tell, the models compared, the agreement."""
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.text import Text
+
+from pneuopt.console.terminal import figure, new_table
+from pneuopt.identifiability import Verdict
+from pneuopt.scrutiny import NOT_TOLD
+from pneuopt.selection import ModelSelection
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_ROWS = 12  # of a table of logs
+
+
+def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
+    """Value and 95 % confidence interval of each free parameter.
+
+    Parameters
+    ----------
+    console : Console
+    estimates : DataFrame
+        Of an `IdentificationResult`.
+    """
+    table = new_table("parameter", "value", "95 % confidence interval", "unit", "")
+    for parameter, row in estimates.iterrows():
+        value, interval = _interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
+        value = "-" if row["note"] == NOT_TOLD else value
+        table.add_row(str(parameter), value, interval, str(row["unit"]), str(row["note"]))
+    console.print(table)
+
+
+def show_verdict(console: Console, verdict: Verdict | None) -> None:
+    """What the logs do not tell, why, and what run would; nothing if nothing is amiss."""
+    for sentence in verdict.sentences if verdict else ():
+        console.print(sentence, soft_wrap=True)
+
+
+def show_selection(console: Console, chosen: ModelSelection) -> None:
+    """The recommendation and its reason, then a row a candidate."""
+    console.print(Text(chosen.reason, style="bold green"), soft_wrap=True)
+    table = new_table("model", "free", "BIC above best", "contains", "p of chance", "")
+    for row in chosen.table.reset_index(names="model").to_dict(orient="records"):
+        figures = [str(row["free"]), figure(row["bic_above"], 4), str(row["contains"]), figure(row["p_value"], 2)]
+        note = "" if row["converged"] else "not converged"
+        table.add_row(str(row["model"]), *figures, note or (f"{NOT_TOLD}: {row['untold']}" if row["untold"] else ""))
+    console.print(table)
+
+
+def show_fit(console: Console, fit: "pd.DataFrame") -> None:
+    """Agreement of each log and channel; of many logs the median and the worst.
+
+    Parameters
+    ----------
+    console : Console
+    fit : DataFrame
+        Of an `IdentificationResult`, or from `validate`.
+    """
+    if len(fit) > MOST_ROWS:
+        _show_many(console, fit)
+        return
+    table = new_table("log", "channel", "NRMSE [%]", "RMSE", "unit")
+    for row in fit.reset_index().to_dict(orient="records"):
+        figures = [figure(100 * row["nrmse"], 4), figure(row["rmse"], 4)]
+        table.add_row(str(row["log"]), str(row["channel"]), *figures, str(row["unit"]))
+    console.print(table)
+
+
+def _show_many(console: Console, fit: "pd.DataFrame") -> None:
+    table = new_table("channel", "logs", "NRMSE [%]: median", "worst", "in log", "RMSE: median", "unit")
+    flat = fit.reset_index()
+    for channel in flat["channel"].unique():
+        rows = flat[flat["channel"] == channel].sort_values("nrmse", na_position="first")
+        worst, middle = rows.iloc[-1], rows[["nrmse", "rmse"]].median()
+        figures = [figure(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"])]
+        rmse = figure(middle["rmse"], 4)
+        table.add_row(str(channel), str(len(rows)), *figures, str(worst["log"]), rmse, str(worst["unit"]))
+    console.print(table)
+
+
+def _interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
+    if math.isfinite(low) and math.isinf(high):
+        return figure(value, 4), f"above {figure(low, 4)}"
+    if math.isinf(low) and math.isfinite(high):
+        return figure(value, 4), f"below {figure(high, 4)}"
+    if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
+        return figure(value, 4), "not determined"
+    return _to_spread(value, spread), f"{_to_spread(low, spread)} to {_to_spread(high, spread)}"
+
+
+def _to_spread(value: float, spread: float) -> str:
+    """As many digits as two of the standard error say."""
+    if not 0 < spread < math.inf or value == 0 or not spread < abs(value):
+        return figure(value, 4)
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(spread)) + 2
+    return f"{value:#.{min(digits, 12)}g}".rstrip(".")

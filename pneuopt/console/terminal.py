@@ -1,0 +1,93 @@
+"""The terminal: a progress line, how a run ended, the files it wrote, and what every table shares."""
+
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Column, Table
+from rich.text import Text
+
+from pneuopt.nlp.least_squares import Progress as Tell
+from pneuopt.nlp.status import Status
+
+
+def screen(*, error: bool = False) -> Console:
+    """Standard output, or standard error; nothing is read as markup, for names of logs have brackets."""
+    return Console(file=sys.stderr if error else sys.stdout, markup=False, highlight=False, emoji=False)
+
+
+@contextmanager
+def progress(label: str, *, quiet: bool) -> Iterator[Tell]:
+    """A line that shows the latest news and the time; nothing where standard error is no terminal, or if quiet.
+
+    Parameters
+    ----------
+    label : str
+        Shown until there is news.
+    quiet : bool
+
+    Yields
+    ------
+    callable
+        Takes a line of text.
+    """
+    console = screen(error=True)
+    silent = quiet or not console.is_terminal
+    clock = TimeElapsedColumn(table_column=Column(min_width=7))
+    news = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
+    columns = SpinnerColumn(), clock, news
+    with Progress(*columns, console=console, transient=True, disable=silent) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda text: bar.update(task, description=text)
+
+
+def show_status(console: Console, status: Status) -> None:
+    """How it ended, before anything else."""
+    console.print(Text(str(status), style="bold green" if status.converged else "bold red"), soft_wrap=True)
+
+
+def show_written(console: Console, paths: Sequence[Any]) -> None:
+    """The files that were written."""
+    for path in paths:
+        console.print(f"wrote {path}", soft_wrap=True)
+
+
+def show_pairs(console: Console, pairs: Mapping[str, object]) -> None:
+    """Names and what they are, a line each."""
+    width = max(len(n) for n in pairs)
+    for key, value in pairs.items():
+        console.print(f"{key:<{width}}  {value}", soft_wrap=True)
+
+
+def new_table(*columns: str) -> Table:
+    """An empty table; texts stand left, numbers right."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, header_style="bold")
+    for column in columns:
+        text = column in (
+            "parameter",
+            "requirement",
+            "relaxed alone",
+            "model",
+            "contains",
+            "log",
+            "channel",
+            "certified",
+            "rejected",
+            "best so far",
+            "unit",
+            "in log",
+            "",
+        )
+        whole = column in ("certified", "rejected", "best so far")
+        table.add_column(column, justify="left" if text else "right", overflow="fold", no_wrap=whole)
+    return table
+
+
+def figure(value: float, digits: int) -> str:
+    """A number for a table, "-" where there is none."""
+    return "-" if math.isnan(value) else f"{value:.{digits}g}"

@@ -1,0 +1,94 @@
+"""A linear loop tuned exactly: do random starts agree, and how long does differential evolution take to get there?
+
+    python problems/linear_tuning.py [--json FILE] [--out DIR]
+
+The paper's loop at half gain, Kp, Ki, Kd and Tf free: settling to 0.1 %, overshoot at most 0.02 %, peak control at most
+1.225 V, Ms at most 1.2. `TwoPhase` from twenty starts, nineteen of them random; from one, its problem's preparation
+counted, it is timed against SciPy's differential evolution (defaults, polish off) on the same loop's warm compiled
+simulator, until that comes to the same optimum (0.1 %, as starts agree), or for ten times the CPU time. "near" is its
+time to 1 %.
+"""
+
+import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from claims import Claim, arguments, finish, frame
+from numpy.typing import NDArray
+from paper_tables import PAPERS_PID, PID_1, _closed_loop
+from scipy.optimize import differential_evolution
+
+import pneuopt as po
+from pneuopt.specification import specify
+from pneuopt.tuning.candidates import span
+from pneuopt.tuning.screening import merit
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.two_phase import TwoPhase, solve_two_phase
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Array = NDArray[np.float64]
+BOUNDS = {"Kp": (0.0, 2.0), "Ki": (PAPERS_PID.Ki, 10.0), "Kd": (0.0, 0.1), "Tf": (0.005, 0.1)}
+SPEC = specify(po.SettlingTime(0.001), [po.Overshoot(2e-4), po.PeakControl(1.225), po.MaxSensitivity(1.2)])
+STEP = po.Step(1.0, horizon=1.0)
+METHOD = TwoPhase(starts=1)
+STARTS, CAP, SAME, NEAR = 20, 10.0, 1e-3, 0.01
+TIGHT = SPEC.tightened(METHOD.margin, METHOD.margin / 300)
+
+
+def main() -> "DataFrame":
+    loop, given = _closed_loop(PID_1)
+    given = given.with_values({"dither.amplitude": 0.0}) if "dither.amplitude" in given else given
+    given = (
+        given.fixed("*").with_bounds({f"pid.{n}": b for n, b in BOUNDS.items()}).freed(*(f"pid.{n}" for n in BOUNDS))
+    )
+    space = span(loop, given)
+    many = solve_two_phase(loop, [STEP], space, TIGHT, replace(METHOD, starts=STARTS), lambda _: None)
+    begun = time.process_time()
+    best = solve_two_phase(loop, [STEP], space, TIGHT, METHOD, lambda _: None).best
+    spent, optimum = time.process_time() - begun, best.stats["cost"]
+    simulator = Simulator(loop, [STEP], space, spec=SPEC)
+    trace = evolved(simulator, optimum * (1 + SAME), CAP * spent)
+    same, near = (next((t for t, v in trace if v <= optimum * (1 + k)), inf) / spent for k in (SAME, NEAR))
+    return frame(
+        [
+            Claim("starts_agreeing", many.agreeing, f"of {STARTS}", None, ">= 19"),
+            Claim("optimum", optimum, "s"),
+            Claim("two_phase.cpu", spent, "s"),
+            Claim("de.best", trace[-1][1], "s", optimum),
+            Claim("de.near", near, "times two_phase's CPU time"),
+            Claim("de.reach", same, "times two_phase's CPU time", None, ">= 5"),
+        ]
+    )
+
+
+def evolved(simulator: Simulator, goal: float, limit: float) -> list[tuple[float, float]]:
+    """Differential evolution's best merits [s] over CPU time [s], up to the goal or the limit."""
+    space, trace = simulator.space, list[tuple[float, float]]()
+    simulator.values(space.draw(np.full((8, len(space.names)), 0.5)), TIGHT)  # compiled and warm
+    begun = time.process_time()
+
+    def cost(unit: Array) -> Array:
+        points = space.draw(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
+        merits = merit(simulator.values(points, TIGHT), TIGHT, STEP.horizon)
+        best = min(trace[-1][1] if trace else inf, float(merits.min()))
+        trace.append((time.process_time() - begun, best))
+        if best <= goal or trace[-1][0] > limit:
+            raise StopIteration
+        return merits
+
+    settings: dict[str, Any] = {"vectorized": True, "updating": "deferred", "polish": False, "maxiter": 100000}
+    solve: Any = differential_evolution  # its stub knows scalar costs only
+    with suppress(StopIteration):
+        solve(cost, [(0.0, 1.0)] * len(space.names), seed=0, x0=space.unit(space.start), **settings)
+    return trace
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__).parse_args()
+    sys.exit(finish(main(), options))
