@@ -128,14 +128,14 @@ def simulate(
 @app.command()
 def study(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning and the axes of a grid.")
+        Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning, and a grid's axes or a front.")
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
     plot: Plot = None,
     quiet: Quiet = False,
 ) -> None:
-    """Certify a loop over loads, pressures, or any parameter; status 1 if a case fails or never settles."""
+    """Certify a loop over a grid of any parameters, or tune it along a Pareto front; status 1 if a case fails."""
     with _guarded():
         from pneuopt.commands.shared import Outputs
         from pneuopt.commands.studying import run_study

@@ -94,14 +94,8 @@ static inline Lanes v_tanh(Lanes a) {
 }
 
 /* sin a = (-1)^k sin r with a = k pi + r, pi in three parts of which k times the first two are exact; its series up to
-   r^21. Beyond a million radians, and of what is no number, the C library's own, a lane at a time. */
+   r^21. A lane beyond a million radians, or that is no number, gets the C library's own, and only that lane. */
 static inline Lanes v_sin(Lanes a) {
-  int near = 1;
-  for (int i = 0; i < LANES; i++) near &= fabs(a[i]) < 1e6;
-  if (!near) {
-    for (int i = 0; i < LANES; i++) a[i] = sin(a[i]);
-    return a;
-  }
   Lanes shifted = a * 3.18309886183790671538e-01 + ALL(WHOLE), k = shifted - ALL(WHOLE);
   Lanes r = ((a - k * 3.14159250259399414062e+00) - k * 1.50995788317231927068e-07) - k * 1.07806057163162381058e-14;
   Lanes q = r * r, w = q * q, even, odd; /* the factors of q, q^3, .. and of q^2, q^4, .. */
@@ -111,7 +105,10 @@ static inline Lanes v_sin(Lanes a) {
   odd = odd * w - 1.0 / 5040.0, even = even * w + 1.0 / 362880.0;
   odd = odd * w - 1.0 / 6.0, even = even * w + 1.0 / 120.0;
   r = r + r * q * (odd + q * even);
-  return (Lanes)((Mask)r ^ ((Mask)shifted << 63));
+  r = (Lanes)((Mask)r ^ ((Mask)shifted << 63));
+  for (int i = 0; i < LANES; i++)
+    if (!(fabs(a[i]) < 1e6)) r[i] = sin(a[i]);
+  return r;
 }
 
 #else

@@ -23,10 +23,11 @@ from pneuopt.control.reference import Step
 from pneuopt.errors import ConvergenceError, require
 from pneuopt.nlp.status import Code, Solution, Status
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import Requirement, name, shown
+from pneuopt.requirements import Requirement, bound, bounded, most, name, shown
 from pneuopt.scenarios import NOMINAL, Scenarios
+from pneuopt.search import Method, Search, brief, ended_in
 from pneuopt.specification import Specification, allowing
-from pneuopt.tune import Method, Search, brief, ended_in, pose
+from pneuopt.tune import pose
 from pneuopt.tuning.candidates import Tell
 from pneuopt.tuning.relaxation import settling
 from pneuopt.tuning.screening import first_population
@@ -53,6 +54,7 @@ def pareto_front(
     subject_to: Sequence[Requirement] = (),
     scenarios: Scenarios = NOMINAL,
     points: int = 15,
+    until: float | None = None,
     method: Method | None = None,
     progress: Tell | None = None,
 ) -> "pd.DataFrame":
@@ -63,9 +65,11 @@ def pareto_front(
     loop, references, parameters, subject_to, scenarios, method, progress
         As for `tune`.
     minimise : (Requirement, Requirement)
-        Two kinds; a bound of theirs is a limit as well.
+        Two kinds; a bound of theirs is a limit as well, that of the second where the front begins.
     points : int
-        Designs, the two ends included; at least 3.
+        Designs, the two ends included; at least 2.
+    until : float, optional
+        The bound of the second with which the front ends; by default the best that it can be.
 
     Returns
     -------
@@ -75,12 +79,12 @@ def pareto_front(
         `Overshoot.max` is one); "claimed" and a name, by the search; "limit", what the second was held to; the gains;
         "solver_seconds", where a solver follows the front of a linear loop; "seconds"; "error", empty where the
         design is certified, else the reason, and the figures are missing. One row where one design is best by both.
-        Ctrl-C leaves the designs found so far, the others as rows with that reason.
+        Ctrl-C leaves the designs found so far, the others as rows with the reason "interrupted".
 
     Raises
     ------
     InputError
-        As `tune`; if both requirements are of one kind.
+        As `tune`; if both requirements are of one kind, or the front would end before it begins.
     ConvergenceError
         If an end of the front cannot be found; `solution` is its `TuningResult`.
 
@@ -97,9 +101,12 @@ def pareto_front(
     """
     first, second = minimise
     require(name(first) != name(second), f"both requirements are {name(first)}; a front needs two kinds")
-    require(points >= 3, f"a front needs at least 3 points, got {points}")
+    require(points >= 2, f"a front needs at least 2 points, got {points}")
+    last = None if until is None else most(bounded(second, until))
+    told = f"a front from {name(second)} {bound(second)} until {until} ends before it begins"
+    require(last is None or last < most(second), told)
     both = pose(loop, references, parameters, {first: 1.0, second: 1.0}, subject_to, scenarios, method, progress)
-    front = _Front(both, first, second)
+    front = _Front(both, first, second, last)
     with suppress(KeyboardInterrupt):
         front.find(points)
     return front.frame()
@@ -131,13 +138,22 @@ class _Front:
     both: Search
     first: Requirement
     second: Requirement
+    last: float | None
     designs: list[Design] = field(default_factory=list)
 
     def find(self, points: int) -> None:
         """All designs; again where one between the ends shows that an end was none."""
-        ends = [self._end(self.first), self._end(self.second)]
+        self.designs = [Design(nan)] * points
+        for k, q in ((0, self.first), (-1, self.second)):
+            self.designs[k] = self._end(q)
+        ends = [self.designs[0], self.designs[-1]]
         for _ in range(ROUNDS):
-            self._between(ends, points)
+            done = self.designs
+            try:
+                self._between(ends, points)
+            except KeyboardInterrupt:
+                self.designs = max((self.designs, done), key=_count)
+                raise
             better = [self._best(self.first), self._best(self.second)]
             if better == ends or len(self.designs) == 1:
                 break
@@ -147,6 +163,8 @@ class _Front:
     def _best(self, requirement: Requirement) -> Design:
         """The best design by one requirement; an end unless another is clearly better."""
         end = self.designs[0 if requirement is self.first else -1]
+        if requirement is self.second and self.last is not None:
+            return end
         good = [d for d in self.designs if d.result is not None and d.result.status.converged]
         best = min(good, key=lambda d: _value(_found(d), requirement))
         return best if _value(_found(best), requirement) < _value(_found(end), requirement) * (1 - BEATEN) else end
@@ -159,7 +177,7 @@ class _Front:
             return
         self.designs = [ends[0], *(Design(limit) for limit in _spread(high, low, points)[1:-1]), ends[1]]
         if isinstance(self.both.method, TwoPhase):
-            self._follow(self.both.method)
+            self._follow()
         else:
             for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
                 self._improve(k, self._gains(start))
@@ -180,14 +198,18 @@ class _Front:
         begun, pair = time.perf_counter(), (self.first, self.second)
         weights = {q: self._weight(q) * (1.0 if q is requirement else BESIDE) for q in pair}
         spec = replace(self.both.spec, weights=weights, limits=settling(self.both.spec, self.both.notary.references))
+        held = requirement is self.second and self.last is not None
+        if self.last is not None and held:
+            spec = self._limited(self.last)
         method, point = self.both.method, None
         if start is not None:  # a search over wide bands would lose it
             method, point = brief(method, method.margin), ended_in(start, self.both.space)
-        result = self.both.asking(spec, method).run(point)
+        result = _uninterrupted(self.both.asking(spec, method).run(point))
         if not result.status.converged:
-            told = f"no front: its end, {name(requirement)} as small as the limits allow, is {result.status}"
-            raise ConvergenceError(told, result)
-        return Design(_value(result, self.second), result, time.perf_counter() - begun)
+            which = "at its last limit" if held else "as good as the limits allow"
+            raise ConvergenceError(f"no front: its end, {name(requirement)} {which}, is {result.status}", result)
+        limit = self.last if self.last is not None and held else _value(result, self.second)
+        return Design(limit, result, time.perf_counter() - begun)
 
     def _weight(self, requirement: Requirement) -> float:
         """That makes a requirement of the order of the horizon, as the searches' penalties are."""
@@ -207,33 +229,41 @@ class _Front:
         weights = {self.first: self._weight(self.first)}
         return replace(self.both.spec, weights=weights, limits=(*others, allowing(self.second, limit)))
 
-    def _follow(self, method: TwoPhase) -> None:
+    def _follow(self) -> None:
         """With a solver along the limits; where what is found does not survive printing, again with more margin."""
-        search = self.both.asking(self._limited(self.designs[1].limit), method)
-        notary, todo = search.notary, list(range(1, len(self.designs) - 1))
-        spec = search.tightened(method.margin)
-        path = two_phase_path(notary.loop, notary.references, search.space, spec, method)
-        for margin in (method.margin, 2 * method.margin, 4 * method.margin):
-            asked = [self._search(k, method) for k in todo]
-            found = self._tracked(path, [own.tightened(margin) for own in asked])
+        todo = list(range(1, len(self.designs) - 1))
+        for margin in self._margins:
+            asked = [self._search(k, self.both.method) for k in todo]
+            found = self._tracked([own.tightened(margin) for own in asked]) if todo else []
             for k, own, solution in zip(todo, asked, found, strict=True):
                 self._certify(k, own, solution, margin)
                 self.both.tell(f"design {k + 1} of {len(self.designs)}: {_status(self.designs[k])}")
             todo = [k for k in todo if not _status(self.designs[k]).converged]
-            if not todo:
-                break
 
-    def _tracked(self, path: TwoPhasePath, specs: Sequence[Specification]) -> list[Solution]:
+    @property
+    def _margins(self) -> tuple[float, ...]:
+        """Of the limits, one after the other where a design does not survive printing."""
+        return tuple(self.both.method.margin * factor for factor in (1, 2, 4))
+
+    @cached_property
+    def _path(self) -> TwoPhasePath:
+        """The problem, differentiated once, of which all designs are solutions."""
+        method, search = self.both.method, self._search(1, self.both.method)
+        assert isinstance(method, TwoPhase)
+        spec, notary = search.tightened(method.margin), search.notary
+        return two_phase_path(notary.loop, notary.references, search.space, spec, method)
+
+    def _tracked(self, specs: Sequence[Specification]) -> list[Solution]:
         """From the first end; where the other end is on another branch, from there, too, and the better.
 
         Two tracks that agree next to the second end are one.
         """
         space, ends = self.both.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
         starts = [ended_in(result, space) for result in ends]
-        found = path.follow(starts[0], specs)
-        other = path.follow(starts[1], specs[-1:])
+        found = self._path.follow(starts[0], specs)
+        other = self._path.follow(starts[1], specs[-1:])
         if _cost(other[0]) < _cost(found[-1]) * (1 - BEATEN):
-            other = path.follow(starts[1], specs[::-1])
+            other = self._path.follow(starts[1], specs[::-1])
         for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
             spent = found[k].stats["seconds"] + back.stats["seconds"]
             better = back if _cost(back) < _cost(found[k]) else found[k]
@@ -242,27 +272,45 @@ class _Front:
 
     def _certify(self, k: int, search: Search, solution: Solution, margin: float) -> None:
         begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
+        result = self._printed(search, solution, margin)
+        seconds = old.seconds + spent + time.perf_counter() - begun
+        self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
+
+    def _printed(self, search: Search, solution: Solution, margin: float) -> TuningResult:
+        """A solution as printed, with its certificate."""
+        if solution.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
         point = np.array([solution.parameters.value(n) for n in search.space.names])
         found = Found(point, solution.status, tuple(solution.multipliers), {"optimum": solution.stats["cost"]})
         good = solution.status.converged
-        result = search.certified(found, margin) if good else search.notary.result(search.simulator, found, point)
-        seconds = old.seconds + spent + time.perf_counter() - begun
-        self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
+        return search.certified(found, margin) if good else search.notary.result(search.simulator, found, point)
 
     def _search(self, k: int, method: Method) -> Search:
         return self.both.asking(self._limited(self.designs[k].limit), method)
 
     def _improve(self, k: int, start: Array | None) -> None:
         """Search for a design from given gains; the better stays."""
-        begun, old = time.perf_counter(), self.designs[k]
-        search = self._search(k, brief(self.both.method, self.both.method.margin))
-        result = search.run(start)
-        if result.status.code is Code.INTERRUPTED:
-            raise KeyboardInterrupt
-        self.both.tell(f"{name(self.second)} {shown(self.second, old.limit):.4g}: {result.status}")
-        seconds = old.seconds + time.perf_counter() - begun
+        begun, old, follows = time.perf_counter(), self.designs[k], isinstance(self.both.method, TwoPhase)
+        if follows and start is not None:
+            result, spent = self._resolved(k, start)
+        else:
+            search, spent = self._search(k, brief(self.both.method, self.both.method.margin)), 0.0
+            result = _uninterrupted(search.run(start))
         kept = old.result if old.result is not None and not self._is_better(result, old.result) else result
-        self.designs[k] = replace(old, result=kept, seconds=seconds)
+        seconds, solver_seconds = old.seconds + time.perf_counter() - begun, old.solver_seconds + spent
+        self.designs[k] = replace(old, result=kept, seconds=seconds, solver_seconds=solver_seconds)
+        self.both.tell(f"{name(self.second)} {shown(self.second, old.limit):.4g}: {result.status}")
+
+    def _resolved(self, k: int, start: Array) -> tuple[TuningResult, float]:
+        """The solver's answer from given gains, with more margin where it does not survive printing; its seconds."""
+        search, spent, result = self._search(k, self.both.method), 0.0, None
+        for margin in self._margins:
+            (solution,) = self._path.follow(start, [search.tightened(margin)])
+            result, spent = self._printed(search, solution, margin), spent + solution.stats["seconds"]
+            if result.status.converged:
+                break
+        assert result is not None
+        return result, spent
 
     def _is_better(self, one: TuningResult, other: TuningResult) -> bool:
         if not one.status.converged or not other.status.converged:
@@ -305,13 +353,25 @@ class _Front:
         }
         gains = {n: nan if result is None or not good else result.parameters.value(n) for n in space.names}
         costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
-        error = "" if good else str(_status(design))
+        error = "" if good else Code.INTERRUPTED.value if result is None else str(result.status)
         return {**figures, "limit": shown(self.second, design.limit), **gains, **costs, "error": error}
 
 
 def _found(design: Design) -> TuningResult:
     assert design.result is not None
     return design.result
+
+
+def _uninterrupted(result: TuningResult) -> TuningResult:
+    """The same; Ctrl-C, which a search turns into its best so far, ends a front."""
+    if result.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    return result
+
+
+def _count(designs: Sequence[Design]) -> int:
+    """How many of them are certified."""
+    return sum(_status(design).converged for design in designs)
 
 
 def _status(design: Design) -> Status:

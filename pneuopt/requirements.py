@@ -6,10 +6,10 @@ with its slope at that speed. A gain or phase margin has a `min`; as a term its 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf
-from typing import TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -356,6 +356,12 @@ def shown(requirement: Requirement, value: float) -> float:
 def bound(requirement: Requirement) -> float | None:
     """The limit as the user writes it, `max` or `min`."""
     return requirement.min if isinstance(requirement, AT_LEAST) else requirement.max
+
+
+def bounded(requirement: Requirement, limit: float | None) -> Requirement:
+    """The same with another limit, as the user writes it, `max` or `min`, by copy."""
+    key: dict[str, Any] = {"min" if isinstance(requirement, AT_LEAST) else "max": limit}
+    return replace(requirement, **key)
 
 
 def name(requirement: Requirement) -> str:

@@ -1,4 +1,4 @@
-"""study.toml: which drive and tuning, over which axes, and what to show of it."""
+"""study.toml: which drive and tuning, over which axes or between which two requirements, and what to show of it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,13 +10,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.errors import InputError, check_known, require
 from pneuopt.parameters import ParameterSet
+from pneuopt.requirementfile import read_bound
 from pneuopt.tomlfile import read_toml
 from pneuopt.units import read_value, scale_of, unit_of
 
-_KEYS = {"study": ("drive", "tuning"), "metrics": ("band", "show")}
+_KEYS = {
+    "study": ("drive", "tuning"),
+    "metrics": ("band", "show"),
+    "pareto": ("between", "points", "lower", "upper"),
+}
 _RANGE = ("from", "to", "steps")
 _EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
 _SHOWN = ("SettlingTime", "Overshoot")
+_PAIR = 'between = ["settling_time", "peak_control"]'
+_POINTS = 9  # of a front, where the file says none
 
 
 @dataclass(frozen=True)
@@ -33,6 +40,8 @@ class Study:
         Half width of the settling band, a fraction of the step; None: as the tuning says.
     show : tuple of str
         The metrics on screen and in the figure.
+    pareto : mapping of str to object, optional
+        A front is asked for in place of a grid: as written; `read_pareto` reads it.
     """
 
     path: Path
@@ -41,6 +50,7 @@ class Study:
     axes: Mapping[str, Any]
     band: float | None
     show: tuple[str, ...]
+    pareto: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -69,6 +79,25 @@ class Axis:
         return (np.asarray(values, dtype=float) - self.offset) / self.factor
 
 
+@dataclass(frozen=True)
+class Pareto:
+    """A front between two requirements.
+
+    Attributes
+    ----------
+    between : tuple of str
+        Their keys, as in a tuning.toml; the second is limited step by step.
+    points : int
+    lower, upper : float or None
+        From where to where the second one goes, in the SI unit of its bound; None: as the tuning and the drive allow.
+    """
+
+    between: tuple[str, str]
+    points: int
+    lower: float | None
+    upper: float | None
+
+
 def read_study(path: str | Path) -> Study:
     """Read a study; the files that it names are not opened.
 
@@ -92,11 +121,14 @@ def read_study(path: str | Path) -> Study:
     for name, keys in _KEYS.items():
         check_known("key", said.get(name, {}), keys, f"{path}: [{name}]")
     axes, metrics = _axes(said.get("axes", {})), said.get("metrics", {})
-    require(bool(axes), f'{path}: no axis; add [axes] with "load.mass" = {_EXAMPLE}')
+    for name in ("axes", "metrics"):
+        alone = name not in said or "pareto" not in said
+        require(alone, f"{path}: [{name}] belongs to a grid, [pareto] to a front; leave one of them out")
+    require(bool(axes) or "pareto" in said, f'{path}: no axis; add [axes] with "load.mass" = {_EXAMPLE}')
     band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
     require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
     drive, tuning = (_file(said.get("study", {}), key, path) for key in _KEYS["study"])
-    return Study(path, drive, tuning, axes, band, _shown(metrics, path))
+    return Study(path, drive, tuning, axes, band, _shown(metrics, path), said.get("pareto"))
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[Axis, ...]:
@@ -120,6 +152,43 @@ def read_axes(study: Study, parameters: ParameterSet) -> tuple[Axis, ...]:
     return tuple(
         _axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}") for name, entry in study.axes.items()
     )
+
+
+def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
+    """Read the front that a study asks for.
+
+    Parameters
+    ----------
+    study : Study
+        With `pareto`.
+    units : mapping of str to str
+        Of `bound_units`.
+
+    Returns
+    -------
+    Pareto
+
+    Raises
+    ------
+    InputError
+        If a requirement is unknown or there twice, or a value cannot be read.
+    """
+    said, where = study.pareto or {}, f"{study.path}: [pareto]"
+    pair, points = said.get("between"), said.get("points", _POINTS)
+    two = isinstance(pair, list) and len(pair) == 2 and all(isinstance(key, str) for key in pair)
+    require(two, f"{where} between must name two requirements, {_PAIR}" + ("" if pair is None else f", got {pair}"))
+    first, second = (str(key) for key in pair or ())
+    check_known("requirement", (first, second), units, f"{where} between")
+    require(first != second, f"{where} between names {first} twice; a front needs two requirements, {_PAIR}")
+    counts = isinstance(points, int) and not isinstance(points, bool) and points >= 2
+    require(counts, f"{where} points is the number of designs, at least 2, got {points!r}")
+    given = [key for key in ("lower", "upper") if key in said]
+    ends = {key: read_bound(second, said[key], units[second], f"{where} {key}") for key in given}
+    for key, value in ends.items():
+        require(value > 0, f"{where} {key}: {second} must be positive, got {said[key]!r}")
+    ordered = len(ends) < 2 or ends["lower"] < ends["upper"]
+    require(ordered, f"{where} lower, {said.get('lower')}, is not below upper, {said.get('upper')}")
+    return Pareto((first, second), points, ends.get("lower"), ends.get("upper"))
 
 
 def _axes(said: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

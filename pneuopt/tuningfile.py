@@ -1,6 +1,5 @@
 """tuning.toml: the controller, what may be tuned, the steps to follow and what counts; tuned.toml is made from it."""
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,12 +10,13 @@ import tomlkit
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import UnitError, check_known, require
+from pneuopt.errors import check_known, require
 from pneuopt.loopfile import SECTIONS, TUNABLE, checked, read_loop, value_of
 from pneuopt.nlp.status import Status
 from pneuopt.output import plain, write_text
 from pneuopt.parameters import ParameterSet
-from pneuopt.requirements import AT_LEAST, KINDS, Bounds, Requirement
+from pneuopt.requirementfile import KEYS, bound_units, read_bound
+from pneuopt.requirements import AT_LEAST, Bounds, Requirement
 from pneuopt.scenariofile import read_fresh, read_scenarios
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.specification import specify
@@ -33,7 +33,6 @@ RESULTS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
 _SECTIONS = (*SECTIONS, "reference", "minimise", "limits", "scenarios")
-_REQUIREMENTS = {re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in KINDS}
 _OWN: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
 
@@ -192,7 +191,7 @@ def _disturbance(said: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
 
 def _minimise(said: Sections, path: str | Path) -> dict[Requirement, float]:
     where = f"{path}: [minimise]"
-    check_known("requirement", said.get("minimise", {}), _REQUIREMENTS, where)
+    check_known("requirement", said.get("minimise", {}), KEYS, where)
     weights = {}
     for key, entry in said.get("minimise", {}).items():
         spot = f"{where} {key}"
@@ -206,41 +205,18 @@ def _minimise(said: Sections, path: str | Path) -> dict[Requirement, float]:
 
 def _limits(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Requirement, ...]:
     where = f"{path}: [limits]"
-    check_known("requirement", said.get("limits", {}), _REQUIREMENTS, where)
-    units, found = _units(loop), []
+    check_known("requirement", said.get("limits", {}), KEYS, where)
+    units, found = bound_units(loop), []
     for key, given in said.get("limits", {}).items():
         spot = f"{where} {key}"
-        bound = "min" if issubclass(_REQUIREMENTS[key], AT_LEAST) else "max"
+        bound = "min" if issubclass(KEYS[key], AT_LEAST) else "max"
         entry = given if isinstance(given, dict) else {bound: given}
         check_known("key", entry, (bound, *_own(key)), spot)
         require(bound in entry or key == "step_envelope", f"{spot} says no {bound}")
         at = f"{spot} {bound}" if entry is given else spot
-        limit = {bound: _bound(key, entry[bound], units.get(key, "1"), at)} if bound in entry else {}
+        limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
         found.append(_requirement(key, entry, limit, spot))
     return tuple(found)
-
-
-def _units(loop: ClosedLoop) -> dict[str, str]:
-    """The units of what is not a number alone."""
-    command, measured = loop.command.unit, loop.feedback.unit.partition("(")[0]
-    times = dict.fromkeys(("settling_time", "rise_time", "iae", "ise"), "s")
-    return times | {
-        "itae": "s^2",
-        "ripple": measured,
-        "air_use": "l",
-        "peak_control": command,
-        "control_rate": f"{command}/s",
-        "phase_margin": "deg",
-        "noise_gain": f"{command}/({measured})",
-    }
-
-
-def _bound(key: str, given: Any, unit: str, where: str) -> float:
-    if key == "air_use":
-        normal = isinstance(given, str) and given.strip().endswith("(ANR)")
-        require(normal, f'{where}: {given!r}: air is counted at 20 degC and 100 kPa (ANR): "2 l(ANR)"', UnitError)
-        given = given.strip().removesuffix("(ANR)")
-    return read_value(given, unit, where=where)
 
 
 def _requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], where: str) -> Requirement:
@@ -249,7 +225,7 @@ def _requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float |
         own["bounds"] = _bounds(entry.get("bounds"), f"{where} bounds")
     elif "band" in entry:
         own["band"] = value_of(entry, "band", "1", where)
-    return checked(lambda: _REQUIREMENTS[key](**own), where)
+    return checked(lambda: KEYS[key](**own), where)
 
 
 def _bounds(said: Any, where: str) -> Bounds:

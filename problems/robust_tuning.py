@@ -42,13 +42,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FRESH, FRESH_SEED, DRAWN = 100, 999, 12
+FRESH, FRESH_SEED, DRAWN = 100, 999, 40
 OFF = {f"pid.{n}": 0.01 for n in ("Kp", "Ki", "Kd", "Tf")}
 LINEAR_RANGES = {"pid.Kp": (0.0, 2.0), "pid.Ki": (paper_tables.PAPERS_PID.Ki, 10.0), "pid.Kd": (0.0, 0.1)}
 LINEAR_RANGES |= {"pid.Tf": (0.005, 0.1), "dither.offset": (-0.15, 0.15)}
 FRICTION = tuple(f"friction.{n}" for n in ("coulomb", "static", "viscous"))
 SPREADS: dict[str | tuple[str, ...], float] = {"load.mass": 0.3, FRICTION: 0.3, "supply.pressure": 0.1}
 LOGGED = 1000  # samples of the log that is fitted
+ROWS = {"SettlingTime": ("settling_time", "s"), "Overshoot": ("overshoot", "%")}
+ROWS |= {"PeakControl": ("peak_control", "V"), "MaxSensitivity": ("max_sensitivity", "1")}
 LEAST = f">= {0.95 * FRESH:g}"
 COLOURS = {"nominal": ORANGE, "robust": BLUE}
 
@@ -166,36 +168,36 @@ def main(parts: dict[str, Part]) -> "pd.DataFrame":
     for name, part in parts.items():
         nominal, robust = (_worst(part.on_scenarios[n], "SettlingTime") for n in ("nominal", "robust"))
         for label, found in part.designs.items():
-            held = label == "robust"
-            limits = {q: f"<= {_shown(q)}" for q in part.task.subject_to} if held else {}
+            is_robust = label == "robust"
+            limits = {q: f"<= {_shown(q)}" for q in part.task.subject_to} if is_robust else {}
             claims += design(f"{name}.{label}", found.parameters, found.certified.iloc[:, : len(part.task.steps)])
             claims += _on_scenarios(f"{name}.{label}", part.on_scenarios[label], limits)
-            claims += _on_fresh(f"{name}.{label}", part.validated[label], LEAST if held else "")
+            claims += _on_fresh(f"{name}.{label}", part.validated[label], LEAST if is_robust else "")
             claims.append(Claim(f"{name}.{label}.cpu", part.seconds[label], "s"))
         claims += part.further
         if np.isfinite(nominal):
-            claims.append(Claim(f"{name}.robust_over_nominal", robust / nominal, "1", None, "<= 1"))
+            held = "<= 1" if name == "linear" else ""  # elsewhere robust pays for limits that the nominal one breaks
+            claims.append(Claim(f"{name}.robust_over_nominal", robust / nominal, "1", None, held))
     return frame(claims)
 
 
 def _on_scenarios(name: str, found: "pd.DataFrame", limits: Mapping[Requirement, str]) -> list[Claim]:
     """The certified worst over the scenarios; NaN where one of them never settles."""
     bounds = {type(q).__name__: bound for q, bound in limits.items()}
-    rows = {"SettlingTime": ("settling_time", "s"), "Overshoot": ("overshoot", "%")}
-    rows |= {"PeakControl": ("peak_control", "V"), "MaxSensitivity": ("max_sensitivity", "1")}
     return [
         Claim(f"{name}.worst.{row}", _worst(found, metric), unit, None, bounds.get(metric, ""))
-        for metric, (row, unit) in rows.items()
+        for metric, (row, unit) in ROWS.items()
     ]
 
 
 def _on_fresh(name: str, found: po.DesignValidation, least: str) -> list[Claim]:
     claims = []
     for metric, row in found.summary.iterrows():
+        label, unit = ROWS[str(metric)]
         kept = len(found.plants) - int(row["violations"])
-        claims.append(Claim(f"{name}.fresh.{metric}.kept", kept, "1", None, least))
-        claims.append(Claim(f"{name}.fresh.{metric}.p95", float(row["p95"])))
-        claims.append(Claim(f"{name}.fresh.{metric}.worst", float(row["certified"])))
+        claims.append(Claim(f"{name}.fresh.{label}.kept", kept, "1", None, least))
+        claims.append(Claim(f"{name}.fresh.{label}.p95", float(row["p95"]), unit))
+        claims.append(Claim(f"{name}.fresh.{label}.worst", float(row["certified"]), unit))
     return claims
 
 

@@ -7,13 +7,16 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli import app
 from pneuopt.commands import studying
+from pneuopt.pareto import pareto_front
 from pneuopt.study import sweep
+from pneuopt.tuning.screening import Screening
 
 DRIVE = """
 [drive]
@@ -50,6 +53,16 @@ load.mass = ["2 kg", "4000 g"]
 load.force = { from = "0 N", to = "50 N", steps = 2 }
 """
 LINE = "study study.toml -o cases.csv --json cases.json --plot map.png"
+FRONT = """
+[study]
+drive = "drive.toml"
+tuning = "tuning.toml"
+[pareto]
+between = ["overshoot", "peak_control"]
+lower = "80 N"
+points = 3
+"""
+FRONT_LINE = "study front.toml -o front.csv --json front.json --plot front.png"
 
 
 @pytest.fixture
@@ -62,6 +75,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     with ThreadPoolExecutor(1) as executor:
         monkeypatch.setattr(studying, "sweep", partial(sweep, executor=executor))
         yield tmp_path
+
+
+@pytest.fixture
+def front(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The files of a front, with a method that is good enough for two gains."""
+    for gain, unit, (value, low, up) in (("Kp", "N*s/m", (300, 100, 500)), ("Ki", "N/m", (5000, 1000, 8000))):
+        free = f'{{ value = "{value} {unit}", lower = "{low} {unit}", upper = "{up} {unit}", free = true }}'
+        edit("tuning.toml", f'{gain} = "{value} {unit}"', f"{gain} = {free}")
+    edit("tuning.toml", "[limits]", '[limits]\npeak_control = "120 N"')
+    edit("tuning.toml", 'max = "1 s"', 'max = "250 ms"')
+    (folder / "front.toml").write_text(FRONT, encoding="utf-8")
+    monkeypatch.setattr(studying, "pareto_front", partial(pareto_front, method=Screening(12, 6, (), 40)))
+    return folder
 
 
 def run(line: str) -> Result:
@@ -197,3 +223,90 @@ def test_tuning_ends_with_what_the_dither_is_worth(folder: Path) -> None:
     told = json.loads(Path("out.json").read_text(encoding="utf-8"))["dither"]
     assert told["usefulness"] == "useless"
     assert any("price: ripple" in reason for reason in told["reasons"])
+
+
+def test_a_front_is_shown_written_and_drawn(front: Path) -> None:
+    edit("front.toml", "overshoot", "settling_time")
+    result = run(FRONT_LINE)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert lines[0] == "3 designs between SettlingTime and PeakControl: all certified"
+    assert max(map(len, lines)) <= 80
+    designs = pd.read_csv("front.csv")
+    assert (designs["PeakControl [N]"] <= designs["limit [N]"] * (1 + 1e-9)).all()
+    assert designs["limit [N]"].iloc[-1] == 80.0
+    assert designs["limit [N]"].iloc[0] <= 120.0
+    assert designs["SettlingTime [s]"].is_monotonic_increasing
+    assert designs["pid.Kp [N*s/m]"].between(100, 500).all()
+    assert all(f"{value:.4g}" in result.stdout for value in designs["SettlingTime [s]"])
+    said = json.loads(Path("front.json").read_text(encoding="utf-8"))
+    assert said["verdict"] == lines[0]
+    assert [d["SettlingTime"] for d in said["designs"]] == pytest.approx(designs["SettlingTime [s]"])
+    assert said["units"] == {"SettlingTime": "s", "PeakControl": "N", "pid.Kp": "N*s/m", "pid.Ki": "N/m"}
+    assert {"sha256[front.toml]", "sha256[drive.toml]", "sha256[tuning.toml]"} == said["provenance"].keys()
+    assert Path("front.png").stat().st_size > 10_000
+
+
+def table(*errors: str) -> pd.DataFrame:
+    """A front with designs that are not certified."""
+    good = np.array([error == "" for error in errors])
+    figures = {n: np.where(good, value, np.nan) for n, value in {"Overshoot": 0.012, "PeakControl": 99.0}.items()}
+    limits = {"limit": np.linspace(120.0, 80.0, len(errors)), "pid.Kp": np.where(good, 300.0, np.nan)}
+    claims = {f"claimed {n}": value for n, value in figures.items()}
+    return pd.DataFrame({**figures, **claims, **limits, "pid.Ki": figures["Overshoot"], "error": errors})
+
+
+@pytest.mark.parametrize(
+    ("errors", "status", "verdict"),
+    [
+        (("", "NOT converged: no", ""), 1, "1 not certified"),
+        (("NOT converged: no", "NOT converged: no"), 1, "2 not certified"),
+        (("", "interrupted", "interrupted"), 130, "2 interrupted"),
+        (("", "NOT converged: no", "interrupted"), 130, "1 interrupted, 1 not certified"),
+    ],
+)
+def test_designs_that_fail_are_rows_of_a_front(
+    front: Path, monkeypatch: pytest.MonkeyPatch, errors: tuple[str, ...], status: int, verdict: str
+) -> None:
+    monkeypatch.setattr(studying, "pareto_front", lambda *_, **__: table(*errors))
+    result = run(FRONT_LINE)
+    assert result.exit_code == status
+    assert result.stdout.startswith(f"{len(errors)} designs between Overshoot and PeakControl: {verdict}\n")
+    assert result.stdout.count("NOT converged: no") == errors.count("NOT converged: no")
+    designs = pd.read_csv("front.csv", keep_default_na=False)
+    assert designs["error"].tolist() == list(errors)
+    assert [str(share) for share in designs["Overshoot [%]"]] == ["" if error else "1.2" for error in errors]
+    assert Path("front.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("peak_control", "peek_control", "[pareto] between: unknown requirement 'peek_control'; did you mean 'peak_"),
+        ("80 N", "80 mm", "front.toml: [pareto] lower: unit 'mm' does not measure 'N'"),
+        ("80 N", "130 N", "[pareto] lower, 130 N, is not below the 120 N that tuning.toml allows under [limits]"),
+        ('"overshoot"', '"step_envelope"', "[pareto] between: the tuning says no bounds for step_envelope; add them"),
+        ('peak_control"]', 'max_sensitivity"]', "[pareto] lower: unit 'N' does not measure '1'"),
+        (
+            'peak_control"]\nlower = "80 N"',
+            'max_sensitivity"]\nupper = 0.5',
+            "[pareto] upper: MaxSensitivity: max must be above 1",
+        ),
+        ("drive.toml", "front.json", "front.json: is an input of this command"),
+    ],
+)
+def test_a_bad_front_gets_one_message_and_writes_nothing(front: Path, old: str, new: str, said: str) -> None:
+    edit("front.toml", old, new)
+    before = {p: p.read_bytes() for p in front.iterdir()}
+    result = run(FRONT_LINE)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: ")
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert {p: p.read_bytes() for p in front.iterdir()} == before
+
+
+def test_a_front_without_a_free_gain_says_so(front: Path) -> None:
+    Path("tuning.toml").write_text(TUNING, encoding="utf-8")
+    edit("tuning.toml", "[limits]", '[limits]\npeak_control = "120 N"')
+    assert "tuning.toml: no gain is free; mark what to tune with free = true" in run(FRONT_LINE).stderr

@@ -1,6 +1,7 @@
 """Fronts: no design is beaten by brute force by more than stated, and what fails stays as a row."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -87,12 +88,45 @@ def test_requirements_that_agree_make_a_point() -> None:
     assert len(found) == 1
 
 
+def few(**options: Any) -> pd.DataFrame:
+    loop, given = oscillator(1e-2)
+    pair, method = (SettlingTime(), MaxSensitivity(1.5)), Screening(12, 4, (), 40)
+    known: dict[str, Any] = {"minimise": pair, "subject_to": [Overshoot(0.05)], "points": 3, "method": method}
+    return pareto_front(loop, STEP, given, **known | options)
+
+
+def test_a_front_begins_and_ends_where_it_is_told() -> None:
+    found = few(until=1.3, points=2)
+    assert (found["error"] == "").all()
+    assert 1.3 < found["limit"][0] <= 1.5
+    assert found["limit"][1] == 1.3
+    assert (found["MaxSensitivity"] <= found["limit"] * (1 + 1e-9)).all()
+    assert found["SettlingTime"].is_monotonic_increasing
+
+
+@pytest.mark.parametrize(("words", "kept"), [("generation 8", [0, 2]), ("generation", [])])
+def test_ctrl_c_keeps_what_is_done(words: str, kept: list[int]) -> None:
+    """Between the ends, and on the way to the first end, where not even the limits are known."""
+
+    def interrupt(line: str) -> None:
+        if words in line:
+            raise KeyboardInterrupt
+
+    found = few(until=1.3, progress=interrupt)
+    assert len(found) == 3
+    assert [k for k, error in enumerate(found["error"]) if error == ""] == kept
+    assert (found["error"].drop(kept) == "interrupted").all()
+    assert found["SettlingTime"].notna().tolist() == [k in kept for k in range(3)]
+
+
 def test_bad_input_is_named() -> None:
     loop, given = oscillator(2e-3)
     with pytest.raises(InputError, match="both requirements are Overshoot; a front needs two kinds"):
         pareto_front(loop, STEP, given, minimise=(Overshoot(), Overshoot(0.1)))
-    with pytest.raises(InputError, match="at least 3 points, got 2"):
-        pareto_front(loop, STEP, given, minimise=PAIR, points=2)
+    with pytest.raises(InputError, match="at least 2 points, got 1"):
+        pareto_front(loop, STEP, given, minimise=PAIR, points=1)
+    with pytest.raises(InputError, match=r"a front from MaxSensitivity 1.4 until 1.5 ends before it begins"):
+        pareto_front(loop, STEP, given, minimise=(SettlingTime(), MaxSensitivity(1.4)), until=1.5)
     limits, method = [GainMargin(1e6)], Screening(8, 2, (), 20)
-    with pytest.raises(ConvergenceError, match="no front: its end, SettlingTime as small as the limits allow, is NOT"):
+    with pytest.raises(ConvergenceError, match="no front: its end, SettlingTime as good as the limits allow, is NOT"):
         pareto_front(loop, STEP, given, minimise=PAIR, subject_to=limits, method=method)

@@ -4,7 +4,7 @@ import pytest
 
 from pneuopt.errors import InputError
 from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.studyfile import Axis, read_axes, read_study
+from pneuopt.studyfile import Axis, Pareto, read_axes, read_pareto, read_study
 
 RIG = ParameterSet(
     {
@@ -21,6 +21,18 @@ tuning = "../tuned.toml"
 "supply.pressure" = ["4 bar(g)", "5 bar(g)", "601.325 kPa(a)"]   # gauge, as on the regulator
 "load.mass" = { from = "2 kg", to = "8000 g", steps = 4 }
 """
+
+FRONT = """
+[study]
+drive = "fit.toml"
+tuning = "tuning.toml"
+[pareto]
+between = ["settling_time", "peak_control"]
+points = 5
+lower = "2 V"
+upper = "5000 mV"
+"""
+UNITS = {"settling_time": "s", "peak_control": "V", "overshoot": "1", "air_use": "l"}
 
 
 @pytest.fixture
@@ -55,6 +67,20 @@ def test_names_may_stand_without_quotes_and_metrics_be_chosen(file: Path) -> Non
     assert (study.band, study.show) == (0.05, ("Overshoot", "Ripple"))
 
 
+def front(file: Path, text: str) -> Pareto:
+    file.write_text(text, encoding="utf-8")
+    return read_pareto(read_study(file), UNITS)
+
+
+def test_a_front_names_two_requirements_and_the_range_of_the_second(file: Path) -> None:
+    assert front(file, FRONT) == Pareto(("settling_time", "peak_control"), 5, 2.0, 5.0)
+    short = FRONT.partition("points")[0]
+    assert front(file, short) == Pareto(("settling_time", "peak_control"), 9, None, None)
+    assert front(file, short.replace('peak_control"]', 'overshoot"]\nupper = "5 %"')).upper == 0.05
+    assert front(file, short.replace('peak_control"]', 'air_use"]\nupper = "2 l(ANR)"')).upper == 2.0
+    assert read_study(file).axes == {}
+
+
 BAD = {
     "section": (("[axes]", "[axis]"), "study.toml: unknown section 'axis'; did you mean 'axes'"),
     "key": (("tuning =", "tunning ="), r"\[study\]: unknown key 'tunning'; did you mean 'tuning'"),
@@ -87,4 +113,33 @@ def test_bad_input_gets_one_message(file: Path, case: str) -> None:
     assert old in STUDY
     with pytest.raises(InputError, match=said) as error:
         axes(file, STUDY.replace(old, new, 1))
+    assert str(error.value).startswith(str(file))
+
+
+BAD_FRONT = {
+    "key": (("points", "pints"), r"\[pareto\]: unknown key 'pints'; did you mean 'points'"),
+    "requirement": (
+        ("peak_control", "peek_control"),
+        r"\[pareto\] between: unknown requirement 'peek_control'; did you",
+    ),
+    "twice": (("settling_time", "peak_control"), r"\[pareto\] between names peak_control twice; a front needs two"),
+    "one": (('"settling_time", ', ""), r"\[pareto\] between must name two requirements, between = .*, got"),
+    "none": (("between =", "#"), r"\[pareto\] between must name two requirements"),
+    "points": (("= 5\n", "= 1\n"), r"\[pareto\] points is the number of designs, at least 2, got 1"),
+    "no number": (("= 5\n", "= true\n"), r"\[pareto\] points is the number of designs, at least 2, got True"),
+    "unit": (("2 V", "2 s"), r"\[pareto\] lower: unit 's' does not measure 'V'"),
+    "no unit": (('"2 V"', "2"), r"\[pareto\] lower: 2 has no unit"),
+    "sign": (("2 V", "-2 V"), r"\[pareto\] lower: peak_control must be positive, got '-2 V'"),
+    "order": (("2 V", "6 V"), r"\[pareto\] lower, 6 V, is not below upper, 5000 mV"),
+    "grid": (("[pareto]", "[axes]\nload.mass = [1.0]\n[pareto]"), r"\[axes\] belongs to a grid, \[pareto\] to a front"),
+    "metrics": (("[pareto]", '[metrics]\nband = "1 %"\n[pareto]'), r"\[metrics\] belongs to a grid"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FRONT)
+def test_a_bad_front_gets_one_message(file: Path, case: str) -> None:
+    (old, new), said = BAD_FRONT[case]
+    assert old in FRONT
+    with pytest.raises(InputError, match=said) as error:
+        front(file, FRONT.replace(old, new, 1))
     assert str(error.value).startswith(str(file))

@@ -1,6 +1,7 @@
 """What a tuning, a simulation or a study of loops shows: gains, metrics, limits, the dither, cases."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 MOST_REFERENCES = 3  # beside each other
 MOST_CASES, MOST_REASONS = 40, 5  # of a study
+MOST_GAINS = 6  # of a front, on 80 columns
 SMALLEST_IS_WORST = ("GainMargin", "PhaseMargin")
 
 
@@ -186,6 +188,37 @@ def show_cases(console: Console, table: "pd.DataFrame", axes: Mapping[str, str],
         console.print(f"failed ({count} of {len(table)}): {reason}", soft_wrap=True)
 
 
+def show_front(
+    console: Console, table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str]
+) -> None:
+    """A front, a row a design, of those that are not certified the limit; then the reasons.
+
+    Parameters
+    ----------
+    console : Console
+    table : DataFrame
+        A column a requirement and a gain, "limit" and "error".
+    requirements, gains : mapping of str to str
+        The two requirements, the limited one last, and the gains, with their units.
+    """
+    first, second = requirements
+    shown = dict(list(gains.items())[:MOST_GAINS])
+    grid = new_table(*(_stacked(n, unit) for n, unit in {**requirements, **shown}.items()))
+    grid.padding = (0, 1, 0, 0)
+    relation = ">=" if second in (kind.__name__ for kind in AT_LEAST) else "<="
+    for row in table.to_dict(orient="records"):
+        figures = [figure(row[n], 4) for n in (first, second)]
+        if row["error"]:
+            word = INTERRUPTED if row["error"] == INTERRUPTED else "failed"
+            figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {figure(row['limit'], 4)}"]
+        grid.add_row(*figures, *(_gain(row[n]) for n in shown))
+    console.print(grid)
+    if len(shown) < len(gains):
+        console.print(f"{len(shown)} of {len(gains)} gains; -o FILE writes all")
+    for row in table[~table["error"].isin(["", INTERRUPTED])].to_dict(orient="records"):
+        console.print(f"failed ({second} {relation} {figure(row['limit'], 4)}): {row['error']}", soft_wrap=True)
+
+
 def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
     """The metrics that are shown, in that order, with their units."""
     return {
@@ -212,6 +245,17 @@ def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
         "FrictionSlope": "N*s/m",
         "NoiseGain": f"{loop.command.unit}/({loop.feedback.unit})",
     }
+
+
+def _gain(value: float) -> str:
+    """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
+    return f"{float(figure(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else figure(value, 4)
+
+
+def _stacked(column: str, unit: str) -> str:
+    """A heading in narrow lines, "Peak / Control / [V]" or "pid. / Kp / [V*s/m]"."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", column)
+    return words if unit in ("", "1") else f"{words}\n[{unit}]"
 
 
 def _tells(metric: str, metrics: "pd.DataFrame", loop: ClosedLoop) -> bool:

@@ -35,7 +35,7 @@ def plot_front(table: "pd.DataFrame", requirements: Mapping[str, str]) -> "Figur
     (first, up), (second, along) = requirements.items()
     figure, ((axes,),) = axes_grid(1, 1, (3.4,), width=6.5)
     axes.plot(table[second].to_numpy(), table[first].to_numpy(), "o-", color=BLUE, ms=5, label="certified designs")
-    failed = table.loc[table["error"] != "", "limit"]
+    failed = table.loc[table["error"] != "", "limit"].dropna()
     for k, limit in enumerate(failed):
         axes.axvline(float(limit), color=RED, lw=1.0, ls=":", label=None if k else "no design certified")
     axes.set(xlabel=_labelled(second, along), ylabel=_labelled(first, up))

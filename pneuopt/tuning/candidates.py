@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 STABLE = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
 MOST_SUBSTEPS = 100
+MOST_AROUND = 625  # points: all that differ by two last places or less in four gains
 POINTS = 1000  # samples of a response where the loop has no sample time
 READINGS, FEWEST_READINGS, MOST_READINGS = 1000, 2, 16  # of a sampled loop: so many a horizon, and a sample
 POINTS_A_PERIOD = 20  # of a continuous dither; at six, its average claimed 47 ms on T32 where 63 are certified
@@ -97,6 +98,7 @@ class Space:
 
         Examples
         --------
+        >>> from pneuopt.parameters import Parameter
         >>> gains = ParameterSet({"pid.Kp": Parameter(0.39661, "1", 0.0, 1.0, free=True)})
         >>> space = Space(gains, ("pid.Kp",))
         >>> space.printed(space.start, 4).item(), space.neighbours(np.array([0.3966]), 4).ravel().tolist()
@@ -115,6 +117,17 @@ class Space:
             sides = (_rounded(value + n * _place(value, digits), digits) for n in (-1, 1)) if value else ()
             found += [np.where(np.arange(len(printed)) == k, v, printed) for v in sides if low <= v <= up]
         return np.reshape(found, (-1, len(printed)))
+
+    def around(self, printed: Array, digits: int) -> Array:
+        """The points that differ from a printed one by up to two last places in every coordinate, shape (m, n)."""
+        n, sides = len(printed), np.arange(-2, 3)
+        few = len(sides) ** n <= MOST_AROUND
+        drawn = np.random.default_rng(0).integers(-2, 3, (MOST_AROUND, n))
+        offsets = np.array(list(itertools.product(sides, repeat=n))) if few else np.unique(drawn, axis=0)
+        places = np.array([_place(value, digits) for value in printed.tolist()])
+        points = [[_rounded(v, digits) for v in row] for row in (printed + offsets * places).tolist()]
+        low, up = self.bounds.T
+        return np.array([point for point in points if np.all((point >= low) & (point <= up))]).reshape(-1, n)
 
 
 def _place(value: float, digits: int) -> float:

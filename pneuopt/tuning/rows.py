@@ -167,10 +167,11 @@ def _peak(lanes: Lanes) -> Rows:
 
 
 def _rate(lanes: Lanes) -> Rows:
-    """From sample to sample; a sampled controller's are those of the grid."""
-    h, since = lanes.grid.spacing, slice(lanes.grid.after, None)
+    """From sample to sample, of a sampled controller over its own sample."""
+    h, since = lanes.grid.sample_time or lanes.grid.spacing, slice(lanes.grid.after, None)
+    k = max(1, round(h / lanes.grid.spacing))
     u, slopes = lanes.y[:, since, CONTROL], lanes.dy[:, since, CONTROL]
-    return lanes.largest(np.diff(u, axis=1) / h, np.diff(slopes, axis=1) / h)
+    return lanes.largest((u[:, k:] - u[:, :-k]) / h, (slopes[:, k:] - slopes[:, :-k]) / h)
 
 
 def _enveloped(lanes: Lanes) -> Rows:

@@ -107,7 +107,8 @@ class Simulator:
         """The same with some of the cases, by copy."""
         part = copy.copy(self)
         part.cases, part._rest = tuple(self.cases[k] for k in chosen), [self._rest[k] for k in chosen]
-        part._grid_of = self._grid_of[list(chosen)]
+        used, part._grid_of = np.unique(self._grid_of[list(chosen)], return_inverse=True)
+        part.grids, part.substeps = [self.grids[g] for g in used], [self.substeps[g] for g in used]
         return part
 
     def by_grid(self) -> list[Mask]:

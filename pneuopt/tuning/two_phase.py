@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 KINDS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
 LARGEST = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
 SETTLING = "SettlingTime"
+BAND = "band.share"  # of the settling band as transcribed: a number that a continuation may move
 MOST_STEPS = 12  # between two nodes; the paper's loop takes 3, a lag with dead time and wide bounds 50
 SAME = 1e-3  # relative difference of two optima that count as one
 
@@ -151,25 +152,28 @@ class TwoPhasePath:
     problem : Problem
     names : tuple of str
         The gains.
+    band : float
+        The settling band as transcribed.
     """
 
     problem: Problem
     names: tuple[str, ...]
+    band: float
 
     def follow(self, start: Array, specs: Sequence[Specification]) -> list[Solution]:
         """Solve for one after the other, the first from gains of shape (n,)."""
         parameters = self.problem.graph.transcription.parameters
         gains = dict(zip(self.names, start.tolist(), strict=True))
-        path = [{name(q): most(q) for q in spec.limits} for spec in specs]
+        path = [{name(q): most(q) for q in spec.limits} | {BAND: spec.band / self.band} for spec in specs]
         return follow(self.problem, parameters.with_values(gains), path)
 
 
 def two_phase_path(
     loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
 ) -> TwoPhasePath:
-    """Prepare a problem whose limits, but not the settling band, will move; `spec` already tightened."""
+    """Prepare a problem whose limits and settling band will move; `spec` already tightened."""
     transcription = transcribe(loop, references, space, spec, method)
-    return TwoPhasePath(prepare(transcription, method.solver, follows=True), space.names)
+    return TwoPhasePath(prepare(transcription, method.solver, follows=True), space.names, spec.band)
 
 
 def transcribe(
@@ -204,7 +208,8 @@ def _extra(references: Sequence[Step], spec: Specification) -> ParameterSet:
     given = {
         SETTLING: Parameter(
             0.5 * most if free or not spec.concerns(SettlingTime) else most, "s", 1e-3 * most, most, free=free
-        )
+        ),
+        BAND: Parameter(1.0, "1"),
     }
     for kind in KINDS:
         if spec.weight(kind) > 0:
@@ -294,7 +299,8 @@ def _path_limits(
 
     found = []
     if spec.concerns(SettlingTime):
-        found += [limit("settling band", error, -spec.band, spec.band, w, (settled,)) for w in (Where.NODES, Where.END)]
+        inside, both_ends = error / p[at(BAND)], (Where.NODES, Where.END)
+        found += [limit("settling band", inside, -spec.band, spec.band, w, (settled,)) for w in both_ends]
     beyond = error if reference.is_step else ca.vertcat(error, -error)
     found += below(Overshoot, beyond, Where.NODES, both)
     found += below(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,))

@@ -117,6 +117,7 @@ def read_off(
     if period is not None:
         averaged = Window(period, grid.spacing).means(signal[:, since], y[:, since, INTEGRAL], reference.initial)
     settings: Any = {"start": reference.at, "about": About.REFERENCE, "dither_period": period, "averaged": averaged}
+    settings["sample_time"] = grid.sample_time
     settings["scale"] = None if reference.is_step else reference.whole
     given = (grid.t, signal, reference.final, reference.initial)
     control = y[:, :, CONTROL]

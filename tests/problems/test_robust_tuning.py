@@ -12,6 +12,6 @@ def test_the_drive_is_robust_on_fresh_plants(tmp_path: Path) -> None:
     rows = robust_tuning.main({"drive": part})
     assert rows["holds"].all()
     kept = rows.set_index("name")["value"]
-    assert kept["drive.robust.fresh.Overshoot.kept"] >= 95
+    assert kept["drive.robust.fresh.overshoot.kept"] >= 95
     assert kept["drive.robust.worst.overshoot"] < kept["drive.nominal.worst.overshoot"]
     robust_tuning.figure(part, 0.02).savefig(tmp_path / "picture.png")

@@ -1,0 +1,69 @@
+"""Requirements as files name them: `settling_time` and so on, and their bounds with units."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.errors import UnitError, require
+from pneuopt.requirements import KINDS, Requirement
+from pneuopt.units import read_value
+
+KEYS: Mapping[str, type[Requirement]] = {
+    re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in KINDS
+}
+"""By its key each kind of requirement."""
+
+
+def bound_units(loop: ClosedLoop) -> dict[str, str]:
+    """The unit of each requirement's bound, by key; "1" of what is a number alone.
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.friction import Viscous
+    >>> units = bound_units(ClosedLoop(ForceDrive(Viscous()).system(), PID()))
+    >>> units["peak_control"], units["ripple"], units["overshoot"]
+    ('N', 'm/s', '1')
+    """
+    command, measured = loop.command.unit, loop.feedback.unit.partition("(")[0]
+    times = dict.fromkeys(("settling_time", "rise_time", "iae", "ise"), "s")
+    return (
+        dict.fromkeys(KEYS, "1")
+        | times
+        | {
+            "itae": "s^2",
+            "ripple": measured,
+            "air_use": "l",
+            "peak_control": command,
+            "control_rate": f"{command}/s",
+            "phase_margin": "deg",
+            "noise_gain": f"{command}/({measured})",
+        }
+    )
+
+
+def read_bound(key: str, given: Any, unit: str, where: str) -> float:
+    """Read a requirement's bound.
+
+    Parameters
+    ----------
+    key : str
+    given : object
+        As written: "5 %", "150 N", 1.4, "2 l(ANR)".
+    unit : str
+        Of `bound_units`.
+    where : str
+        What the message of an error begins with.
+
+    Raises
+    ------
+    UnitError
+        If it cannot be read.
+    """
+    if key == "air_use":
+        normal = isinstance(given, str) and given.strip().endswith("(ANR)")
+        require(normal, f'{where}: {given!r}: air is counted at 20 degC and 100 kPa (ANR): "2 l(ANR)"', UnitError)
+        given = given.strip().removesuffix("(ANR)")
+    return read_value(given, unit, where=where)
