@@ -13,6 +13,7 @@ from pneuopt.control.limit_cycle import LEAST, SETTLED, find_limit_cycle
 from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import margins, noise_gain
+from pneuopt.control.means import period_mean
 from pneuopt.control.metrics import Envelope
 from pneuopt.control.reference import Step
 from pneuopt.errors import ModelError
@@ -67,9 +68,9 @@ def evaluate(
         LimitCycleFrequency [Hz] and StickShare where it hunts, of a pneumatic drive AirUse [l(ANR)] and ValveTravel
         [half travels], then, not for a rig,
         MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin [deg] and NoiseGain [command's
-        unit/measured unit] of the loop linearised about the state in which the response ends, with the slope that
-        friction has at that speed, of drives that have a load FrictionSlope [N s/m]; infinite, and the margins NaN,
-        where that loop is unstable.
+        unit/measured unit] of the loop linearised about the state and command in which the response ends, under
+        dither their means over its last period, with the slope that friction has at that speed, of drives that have a
+        load FrictionSlope [N s/m]; infinite, and the margins NaN, where that loop is unstable.
 
     Raises
     ------
@@ -141,9 +142,23 @@ def _certified(
     metrics |= consumed(inner, parameters, response, case.reference.at)
     if isinstance(loop, Rig):
         return metrics
-    x = np.array([response[q.name][-1] for q in inner.plant.states])
-    metrics |= friction_slope(inner, parameters, x, float(response["control"][-1]))
-    return metrics | _margins(inner, parameters, x, float(response["control"][-1]), case.reference)
+    x, command = point_of_operation(inner, parameters, response)
+    metrics |= friction_slope(inner, parameters, x, command)
+    return metrics | _margins(inner, parameters, x, command, case.reference)
+
+
+def point_of_operation(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory) -> tuple[Array, float]:
+    """The plant's state, shape (n_plant_states,), and the command in which a response ends.
+
+    Under dither they are means over its last period: at an instant they depend on the dither's phase.
+    """
+    rows = np.array([response[n] for n in (*(q.name for q in loop.plant.states), "control")])
+    period = loop.dither_period(parameters) or np.inf
+    if period <= response.t[-1] - response.t[0]:
+        ends = period_mean(response.t, rows, 0.0, period, np.array([response.t[-1] - period / 2]))[:, 0]
+    else:
+        ends = rows[:, -1]
+    return ends[:-1], float(ends[-1])
 
 
 def hunting(loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory) -> dict[str, float]:

@@ -94,7 +94,8 @@ def pareto_front(
     >>> from pneuopt.models.linear import FirstOrder
     >>> from pneuopt.requirements import PeakControl, SettlingTime
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
-    >>> given = loop.parameters.with_bounds({"pid.Kp": (1.0, 20.0), "pid.Ki": (10.0, 200.0)}).freed("pid.Kp", "pid.Ki")
+    >>> given = loop.parameters.with_values({"pid.Kp": 4.0, "pid.Ki": 50.0})
+    >>> given = given.with_bounds({"pid.Kp": (1.0, 20.0), "pid.Ki": (10.0, 200.0)}).freed("pid.Kp", "pid.Ki")
     >>> front = pareto_front(loop, Step(1.0), given, minimise=(SettlingTime(), PeakControl()), points=4)
     >>> bool(front["SettlingTime"].is_monotonic_increasing), bool(front["PeakControl"].is_monotonic_decreasing)
     (True, True)

@@ -4,9 +4,11 @@
 
 The paper's loop at half gain, Kp, Ki, Kd and Tf free: settling to 0.1 %, overshoot at most 0.02 %, peak control at most
 1.225 V, Ms at most 1.2. `TwoPhase` from twenty starts, nineteen of them random; from one, its problem's preparation
-counted, it is timed against SciPy's differential evolution (defaults, polish off) on the same loop's warm compiled
-simulator, until that comes to the same optimum (0.1 %, as starts agree), or for ten times the CPU time. "near" is its
-time to 1 %.
+counted, it is timed against SciPy's differential evolution (defaults, but no polish and no tolerance to stop at; three
+seeds, the median) on the same loop's warm compiled simulator, for ten times the CPU time at most, inf if that ends it.
+
+The claim of five times holds for the same optimum, to 0.1 %, as starts agree: "de.reach". It says nothing of a rougher
+answer: "de.near", the evolution's time to 1 %, was 1.7 times when this was written.
 """
 
 import sys
@@ -14,6 +16,7 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from math import inf
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +41,7 @@ SPEC = specify(po.SettlingTime(0.001), [po.Overshoot(2e-4), po.PeakControl(1.225
 STEP = po.Step(1.0, horizon=1.0)
 METHOD = TwoPhase(starts=1)
 STARTS, CAP, SAME, NEAR = 20, 10.0, 1e-3, 0.01
+SEEDS = (0, 1, 2)
 TIGHT = SPEC.tightened(METHOD.margin, METHOD.margin / 300)
 
 
@@ -53,21 +57,26 @@ def main() -> "DataFrame":
     best = solve_two_phase(loop, [STEP], space, TIGHT, METHOD, lambda _: None).best
     spent, optimum = time.process_time() - begun, best.stats["cost"]
     simulator = Simulator(loop, [STEP], space, spec=SPEC)
-    trace = evolved(simulator, optimum * (1 + SAME), CAP * spent)
-    same, near = (next((t for t, v in trace if v <= optimum * (1 + k)), inf) / spent for k in (SAME, NEAR))
+    traces = [evolved(simulator, optimum * (1 + SAME), CAP * spent, seed) for seed in SEEDS]
+    same, near = (median([reached(trace, optimum * (1 + k)) for trace in traces]) / spent for k in (SAME, NEAR))
     return frame(
         [
             Claim("starts_agreeing", many.agreeing, f"of {STARTS}", None, ">= 19"),
             Claim("optimum", optimum, "s"),
             Claim("two_phase.cpu", spent, "s"),
-            Claim("de.best", trace[-1][1], "s", optimum),
+            Claim("de.best", median([trace[-1][1] for trace in traces]), "s", optimum),
             Claim("de.near", near, "times two_phase's CPU time"),
             Claim("de.reach", same, "times two_phase's CPU time", None, ">= 5"),
         ]
     )
 
 
-def evolved(simulator: Simulator, goal: float, limit: float) -> list[tuple[float, float]]:
+def reached(trace: list[tuple[float, float]], goal: float) -> float:
+    """When a trace came to the goal [s CPU]; inf: not at all."""
+    return next((seconds for seconds, best in trace if best <= goal), inf)
+
+
+def evolved(simulator: Simulator, goal: float, limit: float, seed: int) -> list[tuple[float, float]]:
     """Differential evolution's best merits [s] over CPU time [s], up to the goal or the limit."""
     space, trace = simulator.space, list[tuple[float, float]]()
     simulator.values(space.draw(np.full((8, len(space.names)), 0.5)), TIGHT)  # compiled and warm
@@ -82,10 +91,11 @@ def evolved(simulator: Simulator, goal: float, limit: float) -> list[tuple[float
             raise StopIteration
         return merits
 
-    settings: dict[str, Any] = {"vectorized": True, "updating": "deferred", "polish": False, "maxiter": 100000}
+    settings: dict[str, Any] = {"vectorized": True, "updating": "deferred", "polish": False, "maxiter": 10**9}
+    settings |= {"tol": 0, "atol": 0}
     solve: Any = differential_evolution  # its stub knows scalar costs only
     with suppress(StopIteration):
-        solve(cost, [(0.0, 1.0)] * len(space.names), seed=0, x0=space.unit(space.start), **settings)
+        solve(cost, [(0.0, 1.0)] * len(space.names), seed=seed, x0=space.unit(space.start), **settings)
     return trace
 
 

@@ -37,7 +37,7 @@ def oscillator(sample_time: float | None) -> tuple[ClosedLoop, ParameterSet]:
 @cache
 def front(sample_time: float | None) -> pd.DataFrame:
     loop, given = oscillator(sample_time)
-    method: Method = TwoPhase((20, 25), starts=2) if sample_time is None else Screening(24, 10, (0.1,), 150)
+    method: Method = TwoPhase((20, 25), starts=1) if sample_time is None else Screening(24, 10, (0.1,), 150)
     return pareto_front(loop, STEP, given, minimise=PAIR, subject_to=[Overshoot(0.05)], points=5, method=method)
 
 

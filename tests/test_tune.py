@@ -323,6 +323,22 @@ def test_the_search_reads_what_the_certificate_reads() -> None:
                 assert ours == pytest.approx(theirs, rel=2e-2, abs=2e-3, nan_ok=True), (name, step)
 
 
+@pytest.mark.parametrize("sample_time", [None, 1e-3])
+def test_margins_under_dither_do_not_depend_on_its_phase(sample_time: float | None) -> None:
+    """Records that end a quarter of a period apart, where friction falls with speed: one figure, the search's too."""
+    loop, parameters = friction_loop(sample_time)
+    given = parameters.with_values({"dither.amplitude": 40.0, "pid.Kp": 200.0, "pid.Ki": 5000.0})
+    space, found = span(loop, given), list[float]()
+    for quarter in range(4):
+        step = Step(0.05, horizon=0.4 + quarter * 0.25 / 80.0 if sample_time is None else 0.4 + quarter * 3e-3)
+        proof = evaluate(loop, step, given)[step.label]["MaxSensitivity"]
+        spec = specify(SettlingTime(), [MaxSensitivity(1.6)])
+        read = Simulator(loop, [step], space).values(space.start[None], spec)["MaxSensitivity"]
+        assert read[0] == pytest.approx(proof, rel=1e-3)
+        found.append(proof)
+    assert max(found) == pytest.approx(min(found), rel=2e-3)
+
+
 def test_printed_gains_come_first_and_neighbours_differ_in_one_last_place() -> None:
     loop, parameters = friction_loop()
     space = span(loop, parameters)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.certify import evaluate, respond
+from pneuopt.certify import evaluate, point_of_operation, respond
 from pneuopt.commands.shared import (
     INTERRUPTED,
     Columns,
@@ -220,8 +220,7 @@ def _loop_figures(asked: Tuning, parameters: ParameterSet, before: ParameterSet 
 
 
 def _cut(loop: ClosedLoop, parameters: ParameterSet, run: Trajectory) -> Linearisation:
-    x = np.array([run[q.name][-1] for q in loop.plant.states])
-    return cut(loop, parameters, x, float(run["control"][-1]))
+    return cut(loop, parameters, *point_of_operation(loop, parameters, run))
 
 
 def numbered(path: Path, count: int) -> list[Path]:

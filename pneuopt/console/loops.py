@@ -142,7 +142,7 @@ def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop)
     """A requirement a row: what it comes to on fresh plants, and how many break its limit."""
     units = metric_units(loop)
     console.print(f"validated on {len(found.plants)} fresh plants, the worst of each requirement certified")
-    table = new_table("", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
+    table = new_table("fresh plants", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
     for row in found.summary.reset_index(names="metric").to_dict(orient="records"):
         metric = str(row["metric"])
         figures = [_metric(metric, row[n]) for n in ("median", "p95", "worst", "certified")]

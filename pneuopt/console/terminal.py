@@ -71,6 +71,7 @@ def new_table(*columns: str) -> Table:
         text = column in (
             "parameter",
             "requirement",
+            "fresh plants",
             "relaxed alone",
             "model",
             "contains",
@@ -83,7 +84,7 @@ def new_table(*columns: str) -> Table:
             "in log",
             "",
         )
-        whole = column in ("certified", "rejected", "best so far")
+        whole = column in ("certified", "rejected", "best so far", "fresh plants")
         table.add_column(column, justify="left" if text else "right", overflow="fold", no_wrap=whole)
     return table
 

@@ -7,7 +7,7 @@ How a tuner limits the maximum sensitivity Ms::
     terms(p) >= 1 / Ms**2                                    # p in the order of loop.parameters: numbers, SX or MX
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from math import inf, nan
 from typing import Any
@@ -18,12 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
-from pneuopt.codegen import compiled
 from pneuopt.control.linear_loop import delayed, linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.errors import ModelError, require
 from pneuopt.parameters import ParameterSet
-from pneuopt.system import Array, Linearisation, names
+from pneuopt.system import Array, Linearisation
 
 ComplexArray = NDArray[np.complex128]
 
@@ -131,7 +130,7 @@ def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float
     Kp, _, Kd, Tf = gains
 
     def control(w: Array) -> ComplexArray:
-        a, b = _controller(gains, w)
+        a, b = controller_parts(gains, w)
         return np.asarray((a + 1j * b) / (1 + frequency_response(open_loop, w)))
 
     return _peak(control, frequency_grid(open_loop), Kp + Kd / Tf)[0]
@@ -160,7 +159,7 @@ def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> Comple
     require(single, f"one input and one output expected, got D of shape {linearisation.D.shape}", ModelError)
     w = np.asarray(omega, dtype=float)
     require(bool(np.all(w > 0)), "frequencies must be positive [rad/s]")
-    return np.asarray(_solved(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0] + linearisation.D[0, 0])
+    return np.asarray(solved(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0] + linearisation.D[0, 0])
 
 
 def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
@@ -212,129 +211,19 @@ def sensitivity_terms(
     p = ca.SX.sym("p", len(loop.parameters))
     Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
-    a, b = _controller((Kp, Ki, Kd, Tf), ws)
+    a, b = controller_parts((Kp, Ki, Kd, Tf), ws)
     terms = (1 + a * re - b * im) ** 2 + (a * im + b * re) ** 2
     return ca.Function("sensitivity_terms", [p], [terms], ["p"], ["terms"])
 
 
-def robustness(
-    loop: ClosedLoop, omega: ArrayLike
-) -> Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]:
-    """Margins and the like on a grid of frequencies, for many gains and operating points at once.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    omega : array_like, shape (n,)
-        [rad/s], positive, increasing.
-
-    Returns
-    -------
-    callable
-        ``(p, x, command, only) -> found``, shapes (m, n_parameters) in the order of ``loop.parameters``,
-        (m, n_plant_states) and (m,); the plant's other inputs are zero. Found is of shape (m,) for each name in `only`:
-        "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in `Margins`, crossings
-        interpolated, and "NoiseGain". What is impossible is not checked.
-    """
-    w = np.asarray(omega, dtype=float)
-    plants = _plants(loop, w)
-
-    def read(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
-        Kp, Ki, Kd, Tf = linear_gains(loop, p.T).full()[..., None]
-        a, b = _controller((Kp, Ki, Kd, Tf), w)
-        C = a + 1j * b
-        L = plants(p, x, commands) * C
-        with np.errstate(all="ignore"):
-            found = {n: _OF_LOOP[n](L) for n in only if n in _OF_LOOP}
-        if "NoiseGain" in only:
-            found["NoiseGain"] = np.maximum(np.abs(C / (1 + L)).max(axis=1), np.abs(Kp + Kd / Tf)[:, 0])
-        return found
-
-    return read
-
-
-def _plants(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], ComplexArray]:
-    """Responses of the plant with sensor and hold, shape (m, n)."""
-    plant = loop.plant
-    x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
-    command, output = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
-    xdot, y = plant.ode(0, x, u, q)
-    scale = ca.DM([s.nominal for s in plant.states])  # which makes the eigenvectors' matrix well conditioned
-    inward, outward = ca.diag(1 / scale), ca.diag(scale)
-    A, B = (inward @ ca.jacobian(xdot, v) for v in (x, u[command]))
-    C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
-    matrices = compiled(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
-    n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
-    shapes, own = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
-
-    def responses(p: Array, x: Array, commands: Array) -> ComplexArray:
-        us = np.zeros((len(p), u.numel()))
-        us[:, command] = commands
-        found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
-        A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
-        P = (_responses(A, B, C, w) + D) * delayed(w, loop.dead_time)
-        return np.asarray(P / (1 + 1j * w * np.reshape(loop.sensor_lag(p.T), (-1, 1))))
-
-    return responses
-
-
-def _gain_margins(L: ComplexArray) -> Array:
-    """Crossings of -180 deg are interpolated in phase and logarithm of gain."""
-    phase, gain = np.angle(-L), np.log(np.abs(L))
-    at, crossing = _interpolated(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
-    return np.asarray(np.exp(_smallest(np.where(crossing, -at, inf))))
-
-
-def _phase_margins(L: ComplexArray) -> Array:
-    """Crossings of gain one, likewise."""
-    phase, gain = np.unwrap(np.angle(-L), axis=1), np.log(np.abs(L))
-    at, crossing = _interpolated(gain, phase)
-    return np.degrees(_smallest(np.where(crossing, (at + np.pi) % (2 * np.pi) - np.pi, inf)))
-
-
-def _interpolated(values: Array, others: Array, allowed: Any = True) -> tuple[Array, NDArray[np.bool_]]:
-    """The others where the values cross zero, linear between neighbours, and whether they do."""
-    step = np.diff(values, axis=1)
-    crossing = (values[:, :-1] * values[:, 1:] <= 0) & (step != 0) & allowed
-    share = -values[:, :-1] / np.where(crossing, step, 1.0)
-    return others[:, :-1] + share * np.diff(others, axis=1), crossing
-
-
-def _smallest(rows: Array) -> Array:
-    """The entry of each row that is smallest in size."""
-    return np.asarray(rows[np.arange(len(rows)), np.argmin(np.abs(rows), axis=1)])
-
-
-_OF_LOOP: dict[str, Callable[[ComplexArray], Array]] = {
-    "MaxSensitivity": lambda L: 1 / np.abs(1 + L).min(axis=1),
-    "MaxComplementarySensitivity": lambda L: np.abs(L / (1 + L)).max(axis=1),
-    "GainMargin": _gain_margins,
-    "PhaseMargin": _phase_margins,
-}
-
-
-def _responses(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
-    """``C (jw I - A)^-1 B`` of m systems by partial fractions, shape (m, n); solved where those are inexact."""
-    try:
-        poles, V = np.linalg.eig(A)
-        parts = (C[:, None] @ V)[:, 0] * np.linalg.solve(V, B[..., None].astype(complex))[..., 0]
-    except np.linalg.LinAlgError:
-        return _solved(A, B, C, w)
-    found: ComplexArray = (parts[:, None] / (1j * w[:, None] - poles[:, None])).sum(axis=-1)
-    probe = [0, len(w) // 2, len(w) - 1]
-    off = np.abs(found[:, probe] / _solved(A, B, C, w[probe]) - 1)
-    bad = ~(off < 1e-6).all(axis=1)
-    found[bad] = _solved(A[bad], B[bad], C[bad], w)
-    return found
-
-
-def _solved(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
-    resolvent = 1j * w[:, None, None] * np.eye(A.shape[-1]) - A[:, None]
+def solved(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
+    """``C (jw I - A)^-1 B`` of m systems, shape (m, n), at frequencies of shape (n,), the same for all, or (m, n)."""
+    resolvent = 1j * w[..., None, None] * np.eye(A.shape[-1]) - A[:, None]
     x = np.linalg.solve(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
     return np.asarray((C[:, None, None] @ x)[..., 0, 0])
 
 
-def _controller(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
+def controller_parts(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
     """Real and imaginary part of the PID's response, numbers or symbols; gains Kp, Ki, Kd, Tf."""
     Kp, Ki, Kd, Tf = gains
     lag = 1 / (1 + (Tf * w) ** 2)

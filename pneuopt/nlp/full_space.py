@@ -23,7 +23,8 @@ from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 EXPANDED = 200_000  # scalar operations up to which flattening the whole graph to scalars pays
-NEAR = 1e-4  # barrier and distances from bounds with which a solution's neighbour is begun: 8 iterations where 18 were
+NEAR = 1e-5  # barrier and distances from bounds with which a solution's neighbour is begun: 9 iterations where 18 were
+FARTHEST = 1.5  # of a path's last step, how far its direction is trusted
 _PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 
 
@@ -141,7 +142,7 @@ def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | 
 
 
 def follow(problem: Problem, start: ParameterSet, path: Sequence[Mapping[str, float]]) -> list[Solution]:
-    """Solve along a path of fixed parameters, each problem from its neighbour's solution and multipliers.
+    """Solve along a path of fixed parameters, each problem from its neighbours' solutions, carried on along the path.
 
     Parameters
     ----------
@@ -160,17 +161,28 @@ def follow(problem: Problem, start: ParameterSet, path: Sequence[Mapping[str, fl
     if problem.warm is None:
         raise ModelError("the problem was not prepared to be followed: prepare(..., follows=True)")
     transcription, warm = problem.graph.transcription, replace(problem, solver=problem.warm)
-    (low, up), found, last = variable_bounds(transcription), list[Solution](), None
+    (low, up), found, done = variable_bounds(transcription), list[Solution](), list[tuple[Array, dict[str, Array]]]()
     for step in path:
         q = np.array([p.value for p in start.with_values(step).values()])
-        if last is None:
+        if not done:
             w = np.clip(np.concatenate([to_unknowns(transcription, q), *node_guesses(transcription, q, ())]), low, up)
             solution, raw = _solved(problem, w, q)
         else:
-            solution, raw = _solved(warm, last["x"], q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
-        last = raw if solution.status.converged else last
+            last = done[-1][1]
+            w = np.clip(_ahead(done[-2:], q), low, up)
+            solution, raw = _solved(warm, w, q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
+        done += [(q, raw)] if solution.status.converged else []
         found.append(solution)
     return found
+
+
+def _ahead(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) -> Array:
+    """The unknowns at q from up to two solutions: the last one, carried on as far as q is along their difference."""
+    (before, x), (last, y) = ((known, raw["x"]) for known, raw in (done[0], done[-1]))
+    step = last - before
+    length = float(step @ step)
+    share = min(max(float(step @ (q - last)) / length, 0.0), FARTHEST) if length else 0.0
+    return np.asarray(y + share * (y - x))
 
 
 def _solved(

@@ -119,7 +119,17 @@ class Space:
         return np.reshape(found, (-1, len(printed)))
 
     def around(self, printed: Array, digits: int) -> Array:
-        """The points that differ from a printed one by up to two last places in every coordinate, shape (m, n)."""
+        """The points that differ from a printed one by up to two last places in every coordinate, shape (m, n).
+
+        Of more than `MOST_AROUND` a random share.
+
+        Examples
+        --------
+        >>> from pneuopt.parameters import Parameter
+        >>> space = Space(ParameterSet({"pid.Kp": Parameter(0.4, "1", 0.0, 0.4001, free=True)}), ("pid.Kp",))
+        >>> space.around(space.start, 4).ravel().tolist()
+        [0.3998, 0.3999, 0.4, 0.4001]
+        """
         n, sides = len(printed), np.arange(-2, 3)
         few = len(sides) ** n <= MOST_AROUND
         drawn = np.random.default_rng(0).integers(-2, 3, (MOST_AROUND, n))

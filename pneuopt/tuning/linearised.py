@@ -220,7 +220,9 @@ class Linearised:
         error, by_gain = lanes.error
         rows_of = {kind: reader(lanes) for kind, reader in READ.items() if self._spec.concerns(kind)}
         if self._spec.concerns(ROBUSTNESS):
-            ends = found.x_end[sound], found.y[sound, -1, CONTROL]
+            ends = self._simulator.points_of_operation(
+                p[sound], case[sound], found.x_end[sound], found.y[sound, -1, CONTROL]
+            )
             rows_of |= self._robust(p, sound, ends, points[rows], case)
         return Reading(
             np.where(sound[:, None], error, np.inf),

@@ -14,14 +14,14 @@ from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
 from pneuopt.errors import require
-from pneuopt.requirements import ROBUSTNESS, most, name
+from pneuopt.requirements import ROBUSTNESS, SettlingTime, most, name
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.simulator import Index, Mask, Responses, Simulator
 from pneuopt.tuning.watching import LOST, unsettled
 
 Array = NDArray[np.float64]
-PENALTY = 20.0  # weight of a limit's relative violation, in units of the objective's scale
+PENALTY = 20.0  # weight of a limit's relative violation beside that of never settling
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,11 @@ def _refine(best: Array, judge: Judge, most: int) -> None:
 
 
 def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
-    """The objective and a penalty on what the limits forbid; graded where nothing settles, so that a search can start.
+    """The objective where all limits are kept; elsewhere more than that, graded by how much they are missed by.
+
+    So limits come first, whatever unit the objective has: K. Deb, An efficient constraint handling method for genetic
+    algorithms, Comput. Methods Appl. Mech. Engrg. 186 (2000) 311-338. What never settles misses a settling time that
+    is minimised, by more the further from the reference it ends, so that a search can start.
 
     Parameters
     ----------
@@ -256,14 +260,15 @@ def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Arr
         The horizon, which stands for the settling time of what never settles [s].
     """
     filled = {n: np.where(np.isfinite(value), value, LOST) for n, value in values.items()}
-    late = unsettled(scale, filled["Excess"])
-    filled["SettlingTime"] = np.where(np.isfinite(values["SettlingTime"]), filled["SettlingTime"], late)
+    settles, late = np.isfinite(values["SettlingTime"]), unsettled(scale, filled["Excess"])
+    filled["SettlingTime"] = np.where(settles, filled["SettlingTime"], late)
+    missed = np.where(settles, 0.0, late / scale) if spec.weight(SettlingTime) else np.zeros_like(late)
+    for q in spec.limits:
+        missed += PENALTY * np.maximum(0.0, filled[name(q)] / most(q) - 1)
     total = np.zeros_like(late)
     for q, weight in spec.weights.items():
         total += weight * filled[name(q)]
-    for q in spec.limits:
-        total += PENALTY * scale * np.maximum(0.0, filled[name(q)] / most(q) - 1)
-    return np.minimum(total, LOST)
+    return np.where(missed > 0, LOST * (1 + missed), np.minimum(total, LOST))
 
 
 def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:

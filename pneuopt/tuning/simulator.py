@@ -1,7 +1,7 @@
 """`Simulator`: how many candidates respond to the references, at once and compiled, and what is read off them."""
 
 import copy
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import robustness
 from pneuopt.control.reference import Step
+from pneuopt.control.robustness import robustness
 from pneuopt.parameters import ParameterSet
 from pneuopt.requirements import AT_LEAST, ROBUSTNESS, read
 from pneuopt.scenarios import NOMINAL, Scenarios
@@ -88,7 +88,7 @@ class Simulator:
         omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
         if len(self.margins) > 1:  # unlike the sensitivity's peak, crossings lie where a slow integral puts them
             omega = np.concatenate([np.geomspace(3e-5, 0.29, 60) * slowest, omega])
-        self._robustness = robustness(loop, omega)
+        self.robustness = robustness(loop, omega)  # about what `points_of_operation` gives
 
     def coarse(self, spec: Specification, bands: Sequence[float] = ()) -> "Simulator":
         """The same for a search on its way, by copy: half as many samples, and nothing read but what `spec` asks.
@@ -163,9 +163,33 @@ class Simulator:
         margins = {n: table[0] for n, table in responses.margins(np.ones(1, dtype=bool)).items()}
         return each({n: responses.table(n)[0] for n in self.read} | margins)
 
-    def robustness(self, p: Array, x_end: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
-        """Margins on a grid, about the states in which the responses end."""
-        return self._robustness(p, x_end[:, : len(self.loop.plant.states)], commands, only)
+    def points_of_operation(self, p: Array, case: Index, x_end: Array, commands: Array) -> tuple[Array, Array]:
+        """The plant's states and commands in which lanes end; under dither their means over its last period.
+
+        A search keeps no states on the way: the period after the end is run, and what it drifts by is taken off.
+        """
+        x, u = x_end[:, : len(self.loop.plant.states)].copy(), commands.copy()
+        for period, rows in self.periods(p, np.ones(len(p), dtype=bool)):
+            for g in np.unique(self._grid_of[case[rows]]).tolist() if period is not None else ():
+                own = np.flatnonzero(rows & (self._grid_of[case] == g))
+                means = self._period_after(self.grids[g], x_end[own], p[own], period or 0.0)
+                tame = np.isfinite(means).all(axis=1)
+                x[own[tame]], u[own[tame]] = means[tame, :-1], means[tame, -1]
+        return x, u
+
+    def _period_after(self, grid: Grid, x_end: Array, p: Array, period: float) -> Array:
+        """Means of the plant's states and the command over the period after the end, less the drift in one."""
+        held = self.loop.pid.sample_time is not None
+        n = max(1, round(period / grid.spacing)) if held else POINTS_A_PERIOD
+        h = grid.spacing if held else period / n
+        u = np.tile(grid.u[-1], (len(p), n + 1, 1))
+        t, steps = (np.tile(a, (len(p), 1)) for a in (grid.t[-1] + h * np.arange(n + 1), [h] * n + [0.0]))
+        with np.errstate(all="ignore"):
+            found = self._rollout.run(x_end, u, p, t, steps, substeps=substeps(self._rate, h), states=True)
+            assert found.x is not None
+            plant, control = found.x[:, :, : len(self.loop.plant.states)], found.y[:, :, CONTROL, None]
+            along = np.concatenate([plant, control], axis=2)
+            return np.asarray(np.trapezoid(along, axis=1) / n - (along[:, -1] - along[:, 0]))
 
     def lanes(self, points: Array, rows: Index, case: Index) -> tuple[Array, Array]:
         """Parameters and start states of lanes, each a candidate's row and a case."""
@@ -250,11 +274,8 @@ class Simulator:
 
     def _visited(self, k: int) -> list[Array]:
         """Some states along the response of the given gains, and the rest."""
-        grid, start, p = (
-            self.grids[k],
-            self.starts(k, self.space.start[None]),
-            self.space.vectors(self.space.start[None]),
-        )
+        grid, given = self.grids[k], self.space.start[None]
+        start, p = self.starts(k, given), self.space.vectors(given)
         u, t, h = (a[None] for a in grid.padded(len(grid.t)))
         found = self._rollout.run(start, u, p, t, h, substeps=MOST_SUBSTEPS, states=True).x
         assert found is not None
@@ -326,10 +347,13 @@ class Responses:
         measured, names = self._measured, self._simulator.margins
         absent = {k.__name__: np.nan for k in AT_LEAST}
         found = {n: np.full(len(measured.sound), absent.get(n, np.inf)) for n in names}
-        wanted = measured.sound & rows[np.nonzero(self._lanes)[0]]
+        row, case = np.nonzero(self._lanes)
+        wanted = measured.sound & rows[row]
         if wanted.any():
+            p = self._p[wanted]
             ends = measured.x_end[wanted], measured.command[wanted]
-            for n, value in self._simulator.robustness(self._p[wanted], *ends, names).items():
+            points = self._simulator.points_of_operation(p, case[wanted], *ends)
+            for n, value in self._simulator.robustness(p, *points, names).items():
                 found[n][wanted] = value
         return {n: self.spread(value)[rows] for n, value in found.items()}
 

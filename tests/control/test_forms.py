@@ -22,9 +22,10 @@ from pneuopt.control.forms import (
     to_standard,
 )
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_response, robustness, sensitivity_terms
+from pneuopt.control.margins import frequency_response, sensitivity_terms
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.control.robustness import robustness
 from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck

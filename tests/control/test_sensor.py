@@ -5,9 +5,10 @@ import pytest
 from pneuopt.certify import evaluate, respond
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
-from pneuopt.control.margins import frequency_response, margins, robustness
+from pneuopt.control.margins import frequency_response, margins
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.control.robustness import robustness
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.errors import InputError, ModelError
 from pneuopt.instruments import Sensor

@@ -10,6 +10,8 @@ import pytest
 from benchmark_tuning import Clock, Run, Study
 from numpy.typing import NDArray
 
+from pneuopt.tuning.candidates import span
+
 
 def test_a_run_that_never_settles_is_the_worst() -> None:
     good, lost = Run(0.05, 0.06, 3.0, 1.0, 100, 99), Run(0.05, math.nan, 4.0, 1.0, 100, 96)
@@ -22,6 +24,25 @@ def test_a_run_that_never_settles_is_the_worst() -> None:
     assert rows.loc["10_corners.de.x1.best", "value"] == pytest.approx(0.06)
     assert rows.loc["10_corners.de.reach", "value"] == math.inf
     assert rows.loc["10_corners.condensed.at_median_of_de", "value"] == pytest.approx(100 / 3)
+    assert rows.loc["10_corners.condensed.reach_of_de", "value"] == math.inf
+    runs["10_corners"]["condensed"] = [good, good, lost]
+    rows = benchmark_tuning.main(study).set_index("name")
+    assert rows.loc["10_corners.condensed.reach_of_de", "value"] == 1.0
+
+
+def test_differential_evolution_uses_its_time_though_its_members_are_alike() -> None:
+    calls = 0
+
+    class Flat:
+        def merits(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+            nonlocal calls
+            calls += 1
+            if calls == 9:
+                raise StopIteration
+            return 1.0 + 1e-6 * points[:, 0]
+
+    benchmark_tuning.evolve(Flat(), span(*benchmark_tuning.posed(5)), 0, {})  # type: ignore[arg-type]
+    assert calls == 9
 
 
 def test_the_clock_stops_at_the_goal_and_keeps_what_was_there_before() -> None:

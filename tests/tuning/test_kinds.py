@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.linalg import expm
 
 from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
@@ -166,3 +167,33 @@ def test_margins_hold_on_every_scenarios_plant() -> None:
     margins = [column(found.certified, case)["PhaseMargin"] for case in ("0 to 1", "0 to 1 [stronger]")]
     assert min(margins) >= 50.0
     assert margins[1] < margins[0]
+
+
+def least_peak(time_constant: float, overshoot: float, settled: float) -> float:
+    """Of a lag of gain one under PI control, by stepping its exact discretisation over a fine grid of both gains."""
+    Kp, Ki = (g.ravel() for g in np.meshgrid(np.linspace(0.5, 3.0, 101), np.linspace(5.0, 30.0, 101)))
+    h, n, A = 1e-3, 500, np.zeros((len(Kp), 3, 3))
+    A[:, 0] = np.stack([-(1 + Kp), Ki, Kp], axis=1) / time_constant
+    A[:, 1] = [-1.0, 0.0, 1.0]
+    step, x = expm(A * h), np.tile([0.0, 0.0, 1.0], (len(Kp), 1))
+    peak, highest, last = Kp.copy(), np.zeros(len(Kp)), np.zeros(len(Kp))
+    for k in range(1, n + 1):
+        x = (step @ x[..., None])[..., 0]
+        peak = np.maximum(peak, np.abs(Kp * (1 - x[:, 0]) + Ki * x[:, 1]))
+        highest = np.maximum(highest, x[:, 0])
+        last = np.where(np.abs(x[:, 0] - 1) > 0.02, k * h, last)
+    return float(peak[(highest <= 1 + overshoot) & (last <= settled)].min())
+
+
+def test_limits_come_first_whatever_the_objective_is_measured_in() -> None:
+    """Peak control of tens of thousands: it is the smallest that keeps both limits, not the smallest there is."""
+    loop, unit = ClosedLoop(FirstOrder().system(), PID(limits=False)), 1e4
+    values = {"plant.gain": 1 / unit, "plant.time_constant": 0.1, "pid.Kp": 0.2 * unit, "pid.Ki": 2 * unit}
+    bounds = {"pid.Kp": (0.1 * unit, 5 * unit), "pid.Ki": (unit, 60 * unit)}
+    given = loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
+    limits: list[Requirement] = [Overshoot(0.02), SettlingTime(max=0.15)]
+    found = tune(loop, Step(1.0, horizon=0.5), given, minimise=PeakControl(), subject_to=limits, method=FAST)
+    certified = column(found.certified)
+    assert certified["Overshoot"] <= 2.0
+    assert certified["SettlingTime"] <= 0.15
+    assert certified["PeakControl"] == pytest.approx(unit * least_peak(0.1, 0.02, 0.15), rel=0.03)

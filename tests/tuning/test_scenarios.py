@@ -21,12 +21,14 @@ from pneuopt.specification import specify
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.cases import cases
+from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Judge, Screening, screen
 from pneuopt.tuning.simulator import Responses, Simulator
 from pneuopt.tuning.two_phase import TwoPhase
 
 STEP = Step(1.0, horizon=2.0)
 QUICK = Screening(members=10, generations=6, refinements=60)
+GRADIENTS = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
 
 
 def integrator() -> tuple[ClosedLoop, ParameterSet]:
@@ -52,7 +54,8 @@ def test_the_certificate_has_a_column_a_case_and_the_analytic_times() -> None:
         assert found[column]["SettlingTime"] == pytest.approx(math.log(50) / (5 * gain), rel=1e-3)
 
 
-def test_the_slowest_plant_decides_the_gain() -> None:
+@pytest.mark.parametrize("method", [QUICK, GRADIENTS], ids=["screening", "condensed"])
+def test_the_slowest_plant_decides_the_gain(method: Screening | Condensed) -> None:
     """Settling within 0.4 s at a gain of 0.8 takes Kp = ln 50/0.32; no more, for the peak is minimised."""
     loop, given = integrator()
     best = tune(
@@ -62,7 +65,7 @@ def test_the_slowest_plant_decides_the_gain() -> None:
         minimise=PeakControl(),
         subject_to=[SettlingTime(0.02, max=0.4)],
         scenarios=corners(given, {"plant.gain": 0.2}),
-        method=QUICK,
+        method=method,
     )
     assert best.parameters.value("pid.Kp") == pytest.approx(math.log(50) / 0.32, rel=0.01)
     slowest = best.certified["0 to 1 [plant.gain low]"]["SettlingTime"]

@@ -1,0 +1,170 @@
+"""Margins and peaks of many loops at once, as a search reads them; `margins` has those of one, to machine precision."""
+
+from collections.abc import Callable, Collection
+from math import inf
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pneuopt.codegen import compiled
+from pneuopt.control.linear_loop import delayed, linear_gains
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.margins import ComplexArray, controller_parts, solved
+from pneuopt.system import Array, names
+
+ZOOMS, ZOOMED = 3, 9  # grids about a coarse peak, each within two steps of the last, and their frequencies
+
+
+def robustness(
+    loop: ClosedLoop, omega: ArrayLike
+) -> Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]:
+    """Margins and the like on a grid of frequencies, for many gains and operating points at once.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    omega : array_like, shape (n,)
+        [rad/s], positive, increasing.
+
+    Returns
+    -------
+    callable
+        ``(p, x, command, only) -> found``, shapes (m, n_parameters) in the order of ``loop.parameters``,
+        (m, n_plant_states) and (m,); the plant's other inputs are zero. Found is of shape (m,) for each name in `only`:
+        "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in `Margins`, crossings
+        interpolated, and "NoiseGain"; peaks refined between the grid's frequencies. What is impossible is not checked.
+    """
+    w = np.asarray(omega, dtype=float)
+    plants = _plants(loop, w)
+
+    def read(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
+        Kp, Ki, Kd, Tf = linear_gains(loop, p.T).full()[..., None]
+        plant = plants(p, x, commands)
+
+        def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
+            a, b = controller_parts((Kp, Ki, Kd, Tf), w)
+            return plant(w) * (a + 1j * b), a + 1j * b
+
+        L, C = responses(w)
+        with np.errstate(all="ignore"):
+            found = {n: crossing(L) for n, crossing in _CROSSINGS.items() if n in only}
+            found |= {n: _refined(size, responses, w, size(L, C)) for n, size in _PEAKS.items() if n in only}
+        if "NoiseGain" in only:
+            found["NoiseGain"] = np.maximum(found["NoiseGain"], np.abs(Kp + Kd / Tf)[:, 0])
+        if "MaxSensitivity" in only:  # at infinity the loop is open
+            found["MaxSensitivity"] = np.maximum(found["MaxSensitivity"], 1.0)
+        return found
+
+    return read
+
+
+def _refined(
+    size: Callable[[ComplexArray, ComplexArray], Array],
+    responses: Callable[[Array], tuple[ComplexArray, ComplexArray]],
+    omega: Array,
+    on_grid: Array,
+) -> Array:
+    """The largest size of a response on a grid and, ever finer, about its two highest peaks there, shape (m,)."""
+    m, last = len(on_grid), len(omega) - 1
+    edged = np.pad(on_grid, ((0, 0), (1, 1)), constant_values=-inf)
+    is_peak = (on_grid >= edged[:, :-2]) & (on_grid >= edged[:, 2:])
+    k = np.argpartition(np.where(is_peak, -on_grid, 0.0), 1, axis=1)[:, :2]
+    low, high = np.log(omega[np.maximum(k - 1, 0)]), np.log(omega[np.minimum(k + 1, last)])
+    largest, rows = on_grid.max(axis=1), np.arange(m)
+    for _ in range(ZOOMS):
+        grids = low[..., None] + (high - low)[..., None] * np.linspace(0.0, 1.0, ZOOMED)
+        sizes = size(*responses(np.exp(grids.reshape(m, -1)))).reshape(grids.shape)
+        peak, at = sizes.max(axis=2).argmax(axis=1), sizes.argmax(axis=2)
+        largest = np.fmax(largest, sizes.max(axis=(1, 2)))
+        chosen, at = grids[rows, peak], at[rows, peak]
+        low, high = chosen[rows, np.maximum(at - 1, 0), None], chosen[rows, np.minimum(at + 1, ZOOMED - 1), None]
+    return np.asarray(largest)
+
+
+def _plants(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], Callable[[Array], ComplexArray]]:
+    """Responses of the plant with sensor and hold at frequencies of shape (n,) or (m, n); `w` are typical ones."""
+    plant = loop.plant
+    x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
+    command, output = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
+    xdot, y = plant.ode(0, x, u, q)
+    scale = ca.DM([s.nominal for s in plant.states])  # which makes the eigenvectors' matrix well conditioned
+    inward, outward = ca.diag(1 / scale), ca.diag(scale)
+    A, B = (inward @ ca.jacobian(xdot, v) for v in (x, u[command]))
+    C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
+    matrices = compiled(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
+    n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
+    shapes, own = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
+
+    def linearised(p: Array, x: Array, commands: Array) -> Callable[[Array], ComplexArray]:
+        us = np.zeros((len(p), u.numel()))
+        us[:, command] = commands
+        found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
+        A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
+        plant, lag = _responses(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
+        return lambda w: np.asarray((plant(w) + D) * delayed(w, loop.dead_time) / (1 + 1j * w * lag))
+
+    return linearised
+
+
+def _gain_margins(L: ComplexArray) -> Array:
+    """Crossings of -180 deg are interpolated in phase and logarithm of gain."""
+    phase, gain = np.angle(-L), np.log(np.abs(L))
+    at, crossing = _interpolated(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
+    return np.asarray(np.exp(_smallest(np.where(crossing, -at, inf))))
+
+
+def _phase_margins(L: ComplexArray) -> Array:
+    """Crossings of gain one, likewise."""
+    phase, gain = np.unwrap(np.angle(-L), axis=1), np.log(np.abs(L))
+    at, crossing = _interpolated(gain, phase)
+    return np.degrees(_smallest(np.where(crossing, (at + np.pi) % (2 * np.pi) - np.pi, inf)))
+
+
+def _interpolated(values: Array, others: Array, allowed: Any = True) -> tuple[Array, NDArray[np.bool_]]:
+    """The others where the values cross zero, linear between neighbours, and whether they do."""
+    step = np.diff(values, axis=1)
+    crossing = (values[:, :-1] * values[:, 1:] <= 0) & (step != 0) & allowed
+    share = -values[:, :-1] / np.where(crossing, step, 1.0)
+    return others[:, :-1] + share * np.diff(others, axis=1), crossing
+
+
+def _smallest(rows: Array) -> Array:
+    """The entry of each row that is smallest in size."""
+    return np.asarray(rows[np.arange(len(rows)), np.argmin(np.abs(rows), axis=1)])
+
+
+_CROSSINGS: dict[str, Callable[[ComplexArray], Array]] = {"GainMargin": _gain_margins, "PhaseMargin": _phase_margins}
+_PEAKS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
+    "MaxSensitivity": lambda L, _: 1 / np.abs(1 + L),
+    "MaxComplementarySensitivity": lambda L, _: np.abs(L / (1 + L)),
+    "NoiseGain": lambda L, C: np.abs(C / (1 + L)),
+}
+
+
+def _responses(A: Array, B: Array, C: Array, typical: Array) -> Callable[[Array], ComplexArray]:
+    """``C (jw I - A)^-1 B`` of m systems by partial fractions, shape (m, n); solved where those are inexact.
+
+    At frequencies of shape (n,), the same for all, or (m, n).
+    """
+    try:
+        poles, V = np.linalg.eig(A)
+        parts = (C[:, None] @ V)[:, 0] * np.linalg.solve(V, B[..., None].astype(complex))[..., 0]
+    except np.linalg.LinAlgError:
+        return lambda w: solved(A, B, C, w)
+
+    def summed(w: Array) -> ComplexArray:
+        return np.asarray((parts[:, None] / (1j * w[..., None] - poles[:, None])).sum(axis=-1))
+
+    probe = typical[[0, len(typical) // 2, len(typical) - 1]]
+    with np.errstate(all="ignore"):  # a response of zero, a closed valve's, is solved for
+        bad = ~(np.abs(summed(probe) / solved(A, B, C, probe) - 1) < 1e-6).all(axis=1)
+
+    def found(w: Array) -> ComplexArray:
+        sums = summed(w)
+        if bad.any():
+            sums[bad] = solved(A[bad], B[bad], C[bad], np.broadcast_to(w, sums.shape)[bad])
+        return sums
+
+    return found
