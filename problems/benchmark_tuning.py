@@ -17,7 +17,7 @@ hypercube or Sobol; SciPy's mutation and recombination, or (0.3, 0.9) and 0.9. A
 4 s on seed 301, the best three 14 s, as condensed then took, on seeds 300-302: medians 0.0477 (`OWN`), 0.0479 (best1bin
 in its place) and 0.0484 s (that with Sobol). The early rounds favour what is fast at once.
 
-"reach" is the median of the evolution's times to the median that condensed claims, inf where a seed's cap came first,
+"reach" is the median of the evolution's times to the median that condensed claims, the cap where it came first,
 over condensed's median time to its end. The other way, "reach_of" is the median of condensed's times to the evolution's
 certified median (x1), inf for a seed that ends above it, over the same; a seed counts with its whole time, when it was
 there is not known. "at_median_of" is the share of seeds that end there.
@@ -176,7 +176,7 @@ def compete(study: Study, name: str, seeds: int, cap: float) -> None:
             for k, point in zip(TIMES, [*clock.kept, *[clock.point] * len(TIMES)], strict=False):
                 note(f"{method}.x{k}", seed, point, k * spent)
             study.traces.setdefault(name, []).append(clock)
-            reach.setdefault(method, []).append(clock.reached / spent)
+            reach.setdefault(method, []).append(min(clock.reached / spent, max(cap, *TIMES)))
 
 
 def posed(gains: int) -> tuple[po.ClosedLoop, po.ParameterSet]:
