@@ -32,6 +32,7 @@ import t32
 from claims import Claim, arguments, design, finish, frame
 
 import pneuopt as po
+from pneuopt.control.means import period_mean
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.requirements import Requirement
@@ -220,7 +221,7 @@ def figure(part: Part, band: float) -> "Figure":
     picture, ((*fans, times),) = axes_grid(1, 3, (3.4,), width=12.0)
     for axes, (label, found) in zip(fans, part.designs.items(), strict=True):
         _draw_fan(axes, part.task, found.parameters, band, COLOURS[label])
-        axes.set_title(f"{label}: {len(part.task.fresh)} fresh plants", fontsize=9)
+        axes.set_title(f"{label}: every third of {len(part.task.fresh)} fresh plants", fontsize=9)
         settled = np.sort(part.validated[label].plants["SettlingTime"].to_numpy(dtype=float))
         share = 100 * np.arange(1, len(settled) + 1) / len(settled)
         times.step(settled, share, where="post", color=COLOURS[label], label=label)
@@ -232,12 +233,16 @@ def figure(part: Part, band: float) -> "Figure":
 
 
 def _draw_fan(axes: "Axes", task: Task, parameters: po.ParameterSet, band: float, colour: str) -> None:
-    """The first step on every third fresh plant; the band is where it shall settle."""
+    """The first step on every third fresh plant, averaged over the dither; the band is where it shall settle."""
     step = task.steps[0]
     for values in itertools.islice(task.fresh.values(), 0, None, 3):
-        run = po.respond(task.loop, step, applied(parameters, values))
-        error = 100 * (run[task.loop.feedback.name] - step.final) / step.size
-        axes.plot(run.t, error, color=colour, lw=0.6, alpha=0.5)
+        own = applied(parameters, values)
+        run = po.respond(task.loop, step, own)
+        t, signal = run.t, run[task.loop.feedback.name]
+        if period := task.loop.dither_period(own):
+            t = t[t <= t[-1] - period / 2]
+            signal = period_mean(run.t, signal[None], step.initial, period, t)[0]
+        axes.plot(t, 100 * (signal - step.final) / step.size, color=colour, lw=0.6, alpha=0.5)
     axes.axhspan(-100 * band, 100 * band, color=GREY, alpha=0.3, lw=0)
     axes.set(xlabel="time [s]", xlim=(0, 0.8 * step.horizon), ylim=(-600 * band, 600 * band))
 
