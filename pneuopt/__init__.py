@@ -29,9 +29,9 @@ from types import ModuleType
 from typing import Any
 
 _HOME = {
-    "pneuopt.errors": ("ConvergenceError", "InputError", "PhysicsWarning", "PneuoptError"),
-    "pneuopt.parameters": ("Parameter", "ParameterSet", "Quantity"),
-    "pneuopt.trajectories": ("Trajectory",),
+    "pneuopt.quantities.errors": ("ConvergenceError", "InputError", "PhysicsWarning", "PneuoptError"),
+    "pneuopt.quantities.parameters": ("Parameter", "ParameterSet", "Quantity"),
+    "pneuopt.quantities.trajectories": ("Trajectory",),
     "pneuopt.system": ("DiscreteSystem", "System", "define", "discretise"),
     "pneuopt.models.friction": (
         "Asymmetric",

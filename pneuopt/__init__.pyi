@@ -26,7 +26,6 @@ from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.control.take_over import take_over
 from pneuopt.derived import Derived, derived
 from pneuopt.dithering import DitherVerdict, dither_effect, judge_dither
-from pneuopt.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from pneuopt.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.files import read_drive, write_fit
 from pneuopt.fresh_plants import DesignValidation, validate_design
@@ -54,7 +53,6 @@ from pneuopt.models.sensing import coarse_delay, with_sensors
 from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.full_space import FullSpace
 from pneuopt.nlp.least_squares import LeastSquares
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.pareto import pareto_front
 from pneuopt.plotting import (
     plot_bode,
@@ -69,6 +67,9 @@ from pneuopt.plotting import (
     save_figure,
 )
 from pneuopt.profiles import Profile, profile
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.requirements import (
     IAE,
     ISE,
@@ -95,7 +96,6 @@ from pneuopt.selection import ModelSelection, select_model
 from pneuopt.simulate import contacts, simulate, simulate_stick_slip
 from pneuopt.study import grid, sweep
 from pneuopt.system import DiscreteSystem, System, define, discretise
-from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.confirmed import Confirmed

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.control.loop_start import LoggedLoop
-from pneuopt.errors import InputError, LogError, ModelError, PhysicsWarning, check_known, require
 from pneuopt.experiments import Experiment
 from pneuopt.finders import Log
 from pneuopt.logdoctor import Finding, examine
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_known, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.statistics import noise_level
 from pneuopt.system import DIRECTION, System, names
 

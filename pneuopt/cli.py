@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from pneuopt.errors import ConvergenceError, InputError, PhysicsWarning, require
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
 
 NOT_GOOD, BAD_INPUT, INTERRUPTED = 1, 2, 130
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.compiler import build
-from pneuopt.errors import ModelError, require
 from pneuopt.kernels import prepare
+from pneuopt.quantities.errors import ModelError, require
 
 Array = NDArray[np.float64]
 BATCH = 1000  # segments that the CasADi VM sums up at a time

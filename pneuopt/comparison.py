@@ -9,12 +9,12 @@ import numpy as np
 
 from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import LogError, require
 from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.nlp.least_squares import LeastSquares
-from pneuopt.parameters import ParameterSet
 from pneuopt.posing import as_logged
+from pneuopt.quantities.errors import LogError, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.system import System
 
 if TYPE_CHECKING:

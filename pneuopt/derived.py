@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.statistics import confidence_interval
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def derived(result: Estimated, function: Callable[[Values], float]) -> Derived:
     --------
     >>> from types import SimpleNamespace
     >>> import pandas as pd
-    >>> from pneuopt.parameters import Parameter
+    >>> from pneuopt.quantities.parameters import Parameter
     >>> names = ["static", "coulomb"]
     >>> fit = SimpleNamespace(
     ...     parameters=ParameterSet({n: Parameter(v, "N") for n, v in zip(names, (60.0, 40.0))}),

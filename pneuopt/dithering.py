@@ -13,9 +13,9 @@ from pneuopt.certify import evaluate
 from pneuopt.control.averaging import ripple
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError, require
 from pneuopt.finders import Rest
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, InputError, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.system import System, names
 from pneuopt.tuning.candidates import command_range
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.experiments import Experiment
-from pneuopt.parameters import ParameterSet
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 MOVING = 0.05  # of the largest speed

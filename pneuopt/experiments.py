@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import LogError, check_known, require
 from pneuopt.logfile import CHANNELS, read_columns
-from pneuopt.trajectories import Trajectory
-from pneuopt.units import read_si, read_value
+from pneuopt.quantities.errors import LogError, check_known, require
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import read_si, read_value
 
 __all__ = ["CHANNELS", "COMMANDS", "Experiment", "differentiate", "read_log", "resample", "split"]
 

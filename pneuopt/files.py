@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import tomlkit
 
-from pneuopt.errors import HardwareError, InputError, UnitError, UnknownNameError, check_known, require
 from pneuopt.experiments import CHANNELS
 from pneuopt.models.chamber import ChamberModel, Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
@@ -28,11 +27,12 @@ from pneuopt.models.load import Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.status import Code, Status
-from pneuopt.output import plain, write_text
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import HardwareError, InputError, UnitError, UnknownNameError, check_known, require
+from pneuopt.quantities.output import plain, write_text
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.units import read_value
 from pneuopt.system import System
 from pneuopt.tomlfile import Places, inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.units import read_value
 
 if TYPE_CHECKING:
     import pandas as pd

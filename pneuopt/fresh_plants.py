@@ -12,8 +12,8 @@ from pneuopt.certify import evaluate
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import AT_LEAST, KINDS, PERCENT, Requirement, most, name
 from pneuopt.scenarios import Scenarios
 from pneuopt.specification import Specification, specify

@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from pneuopt.parameters import ParameterSet, Quantity
-from pneuopt.units import write_value
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.units import write_value
 
 
 class Checker(Protocol):

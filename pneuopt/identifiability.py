@@ -15,9 +15,9 @@ from pneuopt.experiments import Experiment
 from pneuopt.finders import Start
 from pneuopt.nlp.least_squares import STIFFEST, LeastSquares
 from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for
-from pneuopt.parameters import Parameter, ParameterSet
 from pneuopt.posing import Problem, as_logged
 from pneuopt.profiles import Profile
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.system import System
 
 if TYPE_CHECKING:

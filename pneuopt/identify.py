@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 
 from pneuopt.checks import check_content, check_free, check_logs, check_smooth, doubts, measured_outputs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import ConvergenceError
 from pneuopt.experiments import Experiment
 from pneuopt.identifiability import Verdict
 from pneuopt.nlp.judge import NOISE_LEVEL
 from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status
-from pneuopt.parameters import ParameterSet
 from pneuopt.posing import Model, Problem, as_logged, conditioned, free_run
-from pneuopt.provenance import provenance
+from pneuopt.quantities.errors import ConvergenceError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.provenance import provenance
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.reweighting import Loss, Refit, fitted, white_squares
 from pneuopt.scrutiny import scrutinised
 from pneuopt.starting import attempts
 from pneuopt.statistics import agreement, confidence_interval, correlation_time, cross_correlation, ljung_box
 from pneuopt.system import System, names
-from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,7 +5,7 @@ from math import inf
 
 import numpy as np
 
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy import integrate
 
 from pneuopt.codegen import compiled
-from pneuopt.errors import ConvergenceError
 from pneuopt.guards import Contact
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import System, names
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 MOST_STEPS = 200_000

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.experiments import Experiment
-from pneuopt.trajectories import Trajectory
-from pneuopt.units import ATMOSPHERE
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import ATMOSPHERE
 
 Array = NDArray[np.float64]
 BLOCKS = 20  # of a log, whose means tell motion from noise

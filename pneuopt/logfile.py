@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import LogError, UnitError, UnknownNameError, check_known, require
-from pneuopt.units import read_value, scale_of
+from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_known, require
+from pneuopt.quantities.units import read_value, scale_of
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder, SensorLag
-from pneuopt.errors import InputError, check_known, require
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError, check_known, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.units import read_value, write_value
 from pneuopt.system import System
 from pneuopt.tomlfile import read_parameter
-from pneuopt.units import read_value, write_value
 
 Sections = Mapping[str, Any]
 T = TypeVar("T")

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from pneuopt.certificate import Found, TuningResult
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, require
 from pneuopt.nlp.status import Code, Solution, Status
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import Requirement, bound, bounded, most, name, shown
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.search import Method, Search, brief, ended_in

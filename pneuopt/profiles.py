@@ -10,14 +10,14 @@ from scipy.stats import chi2
 
 from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import check_known, require
 from pneuopt.experiments import Experiment
 from pneuopt.finders import Start
 from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
-from pneuopt.parameters import ParameterSet
 from pneuopt.posing import Problem, as_logged
+from pneuopt.quantities.errors import check_known, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import System, names
-from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd

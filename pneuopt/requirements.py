@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 
 Value = TypeVar("Value", float, NDArray[np.float64])
 PERCENT = ("Overshoot", "SteadyStateError")

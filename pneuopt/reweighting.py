@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.checks import measured_outputs
-from pneuopt.errors import require
 from pneuopt.experiments import Experiment
 from pneuopt.finders import Start
 from pneuopt.nlp.judge import NOISE_LEVEL
 from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status
 from pneuopt.posing import Problem
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.silence import WARM_STAGES, solved
 from pneuopt.statistics import noise_level
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 REFITS = 12

@@ -16,15 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder
-from pneuopt.errors import ModelError, check_known, require
 from pneuopt.experiments import CHANNELS, Experiment
 from pneuopt.instruments import Actuator, Sensor
 from pneuopt.integration import Run
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import contacts, first_state, held_inputs, new_run, warn_of
 from pneuopt.stick_slip import Event, StickSlip
 from pneuopt.system import Symbols, System, define, names, stacked, vector
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import InputError, check_known, require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError, check_known, require
+from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,7 +71,7 @@ def corners(parameters: ParameterSet, spreads: Spreads) -> Cases:
 
     Examples
     --------
-    >>> from pneuopt.parameters import Parameter
+    >>> from pneuopt.quantities.parameters import Parameter
     >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "friction.coulomb": Parameter(40.0, "N")})
     >>> corners(rig, {"load.mass": 0.2, "friction.*": (30.0, 60.0)})["load.mass low, friction.* high"]
     {'load.mass': 4.0, 'friction.coulomb': 60.0}
@@ -115,7 +115,7 @@ def tolerances(
 
     Examples
     --------
-    >>> from pneuopt.parameters import Parameter
+    >>> from pneuopt.quantities.parameters import Parameter
     >>> gains = ParameterSet({"pid.Kp": Parameter(2.0, "V*s/m", free=True), "pid.Ki": Parameter(5.0, "V/m")})
     >>> tolerances(gains, {"pid.*": 0.01})["pid.* low"]
     {'pid.Kp': Factor(share=0.99), 'pid.Ki': Factor(share=0.99)}

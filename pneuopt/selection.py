@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from pneuopt.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify, validate
 from pneuopt.nlp.least_squares import LeastSquares
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.scrutiny import AT_BOUND, NOT_TOLD
 from pneuopt.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.system import System, names

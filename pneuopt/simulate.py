@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import ModelError, PhysicsWarning, check_known, require
 from pneuopt.guards import Contact
 from pneuopt.integration import Run, Smooth, Watch
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_known, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.stick_slip import Event, StickSlip
 from pneuopt.system import DIRECTION, System, names, vector
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Update = Callable[..., tuple[Array, ...]]

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 from pneuopt.requirements import (
     AT_LEAST,
     KINDS,

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy import integrate, optimize
 
 from pneuopt.codegen import compiled
-from pneuopt.errors import ConvergenceError, ModelError, require
 from pneuopt.integration import Record
+from pneuopt.quantities.errors import ConvergenceError, ModelError, require
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import DIRECTION, System, names
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 MOST_EVENTS = 100_000

@@ -22,9 +22,9 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.errors import InputError, PneuoptError, check_known, require
-from pneuopt.parameters import ParameterSet
-from pneuopt.units import write_value
+from pneuopt.quantities.errors import InputError, PneuoptError, check_known, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,7 +64,7 @@ def grid(parameters: ParameterSet, axes: Mapping[str, Iterable[float]]) -> dict[
 
     Examples
     --------
-    >>> from pneuopt.parameters import Parameter
+    >>> from pneuopt.quantities.parameters import Parameter
     >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "stroke": Parameter(0.2, "m")})
     >>> grid(rig, {"load.mass": [2.0, 8.0], "stroke": [0.1]})["load.mass = 8 kg, stroke = 100 mm"]
     {'load.mass': 8.0, 'stroke': 0.1}
@@ -118,7 +118,7 @@ def sweep(
     Examples
     --------
     >>> from concurrent.futures import ThreadPoolExecutor
-    >>> from pneuopt.parameters import Parameter
+    >>> from pneuopt.quantities.parameters import Parameter
     >>> rig = ParameterSet({"mass": Parameter(5.0, "kg"), "force": Parameter(10.0, "N")})
     >>> table = sweep(lambda p: p.value("force") / p.value("mass"), rig, grid(rig, {"mass": [2.0, 0.0]}),
     ...               executor=ThreadPoolExecutor())

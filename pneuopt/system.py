@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.codegen import Pieces
-from pneuopt.errors import ConvergenceError, ModelError, check_known, require
 from pneuopt.finders import Doubter, Log, RestFinder, Start, StartFinder
 from pneuopt.guards import Checker, Guard
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.errors import ConvergenceError, ModelError, check_known, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.runge_kutta import rk4
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Symbols = Mapping[str, ca.SX]

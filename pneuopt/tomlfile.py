@@ -13,10 +13,10 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
-from pneuopt.errors import InputError, check_known, require
-from pneuopt.output import plain
-from pneuopt.parameters import Parameter
-from pneuopt.units import read_value, write_value
+from pneuopt.quantities.errors import InputError, check_known, require
+from pneuopt.quantities.output import plain
+from pneuopt.quantities.parameters import Parameter
+from pneuopt.quantities.units import read_value, write_value
 
 _FLAGS = ("free", "log", "per_log")
 _HEAD = re.compile(r"\s*\[+([^\[\]]+)\]")

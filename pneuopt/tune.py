@@ -15,9 +15,9 @@ from pneuopt.checks import check_smooth
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, require
 from pneuopt.nlp.status import Code
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import PeakControl, Requirement
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.search import Method, Search, relax

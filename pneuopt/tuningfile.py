@@ -10,11 +10,12 @@ import tomlkit
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import check_known, require
 from pneuopt.loopfile import SECTIONS, TUNABLE, checked, read_loop, value_of
 from pneuopt.nlp.status import Status
-from pneuopt.output import plain, write_text
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import check_known, require
+from pneuopt.quantities.output import plain, write_text
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import read_value
 from pneuopt.requirementfile import KEYS, bound_units, read_bound
 from pneuopt.requirements import AT_LEAST, Bounds, Requirement
 from pneuopt.scenariofile import read_fresh, read_scenarios
@@ -22,7 +23,6 @@ from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.specification import specify
 from pneuopt.system import System
 from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.units import read_value
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -24,7 +24,7 @@ import pneuopt as po
 from pneuopt.codegen import Pieces, Rollout, compiled
 from pneuopt.models.catalog import b32
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.parameters import Quantity
+from pneuopt.quantities.parameters import Quantity
 from pneuopt.system import Symbols, System, define, discretise, names, stacked, vector
 
 if TYPE_CHECKING:

@@ -34,7 +34,7 @@ from pneuopt.models.catalog import b32
 from pneuopt.nlp.full_space import FullSpace, solve_full_space
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.posing import Problem
-from pneuopt.trajectories import Array
+from pneuopt.quantities.trajectories import Array
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from pneuopt.parameters import ParameterSet
+    from pneuopt.quantities.parameters import ParameterSet
 
 COLUMNS = ("name", "value", "unit", "reference", "bound", "holds")
 KNOBS = {n: f"pid.{n}" for n in ("Kp", "Ki", "Kd", "Tf")}

@@ -24,9 +24,9 @@ from b32 import exact as exact_log
 from claims import Claim, arguments, finish, frame
 
 import pneuopt as po
-from pneuopt.errors import require
 from pneuopt.models.catalog import b32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
+from pneuopt.quantities.errors import require
 from pneuopt.study import INTERRUPTED
 
 if TYPE_CHECKING:

@@ -27,9 +27,9 @@ from b32 import FREE, LOGGED, NOISE, SAMPLE, SETTLING, START, VALVE, reference
 from claims import Claim, arguments, finish, frame
 
 import pneuopt as po
-from pneuopt.errors import require
 from pneuopt.models.catalog import b32
 from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
+from pneuopt.quantities.errors import require
 from pneuopt.study import INTERRUPTED
 
 if TYPE_CHECKING:

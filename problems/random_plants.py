@@ -26,10 +26,10 @@ from b32 import FREE, LOGGED, NOISE, SAMPLE, VALVE, exact, simulation_seconds
 from claims import Claim, arguments, finish, frame
 
 import pneuopt as po
-from pneuopt.errors import require
 from pneuopt.models.catalog import b32
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.trajectories import Array
 from pneuopt.study import INTERRUPTED
-from pneuopt.trajectories import Array
 
 if TYPE_CHECKING:
     import pandas as pd

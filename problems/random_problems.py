@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pneuopt as po
-from pneuopt.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.models import catalog
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.requirements import Requirement
 from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import span

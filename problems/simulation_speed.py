@@ -24,10 +24,10 @@ from scipy.integrate import solve_ivp
 
 from pneuopt.codegen import Rollout, Run, compiled
 from pneuopt.compiler import compiler
-from pneuopt.errors import require
 from pneuopt.models.catalog import b32
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.trajectories import Array
 from pneuopt.system import System, discretise, names, vector
-from pneuopt.trajectories import Array
 
 if TYPE_CHECKING:
     import pandas as pd

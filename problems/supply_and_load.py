@@ -16,7 +16,7 @@ from claims import Claim, arguments, design, finish, frame
 
 import pneuopt as po
 from pneuopt.models.catalog import s32
-from pneuopt.units import ATMOSPHERE
+from pneuopt.quantities.units import ATMOSPHERE
 
 if TYPE_CHECKING:
     import pandas as pd

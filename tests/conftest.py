@@ -11,10 +11,10 @@ from pneuopt import compiler, kernels
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import Symbols, System, define
-from pneuopt.trajectories import Trajectory
 from pneuopt.tuning.linearised import Linearised
 
 CACHES = (compiler.build, compiler.say_once, compiler._compiler_version, compiler._temporary_folder, kernels.prepared)

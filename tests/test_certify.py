@@ -11,7 +11,6 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
-from pneuopt.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
 from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.catalog import r25
 from pneuopt.models.drive import ForceDrive
@@ -20,7 +19,8 @@ from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.nlp.status import Code
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import IAE
 from pneuopt.rig import Rig
 from pneuopt.tune import tune

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from pneuopt.checks import check_content
-from pneuopt.errors import InputError, LogError, ModelError, PhysicsWarning, UnknownNameError
 from pneuopt.experiments import Experiment
 from pneuopt.finders import Log
 from pneuopt.identify import identify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.trajectories import Array, Trajectory
+from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, UnknownNameError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.trajectories import Array, Trajectory
 
 NOISE = 2e-5  # [m]
 RIG = ForceDrive(Coulomb())

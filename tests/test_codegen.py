@@ -10,11 +10,11 @@ from pneuopt.codegen import Pieces, Rollout, compiled
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.errors import ModelError
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
+from pneuopt.quantities.errors import ModelError
+from pneuopt.quantities.trajectories import Array
 from pneuopt.system import DiscreteSystem, discretise, vector
-from pneuopt.trajectories import Array
 
 Forget = Callable[[], None]
 needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="no C compiler")

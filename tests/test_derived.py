@@ -9,7 +9,7 @@ from pneuopt.experiments import Experiment
 from pneuopt.identify import identify
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.trajectories import Trajectory
 
 LEVELS = {"friction.coulomb": 30.0, "friction.static": 42.0, "friction.stribeck_velocity": 0.025}
 RIG = MotionDrive(Stribeck(), chamber=False)

@@ -10,10 +10,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dithering import DitherEffect, Usefulness, dither_effect, explained, judge_dither
-from pneuopt.errors import InputError
 from pneuopt.models.catalog import r25, t32
 from pneuopt.models.linear import SecondOrder
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 
 GAINS = {"pid.Kp": 4.5, "pid.Ki": 24.6, "pid.Kd": 0.2, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
 TABLE = {  # PHYSICS section 4, per volt: |F| [N], |v| [m/s], |y| [m]

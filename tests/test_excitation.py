@@ -4,7 +4,7 @@ from pneuopt.excitation import missing, motion, remedy
 from pneuopt.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre
-from pneuopt.trajectories import Array, Trajectory
+from pneuopt.quantities.trajectories import Array, Trajectory
 
 VALUES = ForceDrive(LuGre()).parameters  # 5 kg, 30 N, Stribeck velocity 20 mm/s
 T = np.arange(0, 4, 1e-3)

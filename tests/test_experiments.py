@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pneuopt.errors import InputError, LogError, UnitError, UnknownNameError
 from pneuopt.experiments import CHANNELS, Experiment, differentiate, read_log, resample, split
-from pneuopt.trajectories import Trajectory
-from pneuopt.units import ATMOSPHERE, scale_of
+from pneuopt.quantities.errors import InputError, LogError, UnitError, UnknownNameError
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import ATMOSPHERE, scale_of
 
 HEADER = "time [s],position [mm]\n"
 BODY = "\n".join(f"{k / 10},{k}" for k in range(12)) + "\n"

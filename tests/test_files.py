@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pneuopt.errors import InputError, UnitError, UnknownNameError
 from pneuopt.files import read_drive, read_status, write_fit
 from pneuopt.identifiability import Verdict
 from pneuopt.models.chamber import Polytropic, Thermal
@@ -24,10 +23,11 @@ from pneuopt.models.load import Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.status import Code, Status
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.tomlfile import read_toml
-from pneuopt.trajectories import Trajectory
 
 AXIS = """# my axis, 2024
 [drive]

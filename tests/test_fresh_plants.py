@@ -8,10 +8,10 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.fresh_plants import validate_design
 from pneuopt.models.linear import FirstOrder, Integrator
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PhaseMargin, SettlingTime
 from pneuopt.scenarios import applied, samples, tolerances
 

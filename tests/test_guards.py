@@ -8,7 +8,6 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning
 from pneuopt.experiments import Experiment
 from pneuopt.guards import Contact, Guard
 from pneuopt.identify import identify
@@ -18,12 +17,13 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.requirements import SettlingTime
 from pneuopt.rig import Rig, record
 from pneuopt.simulate import contacts, simulate
 from pneuopt.system import System, define, names
-from pneuopt.trajectories import Trajectory
 from pneuopt.tune import tune
 
 DRIVE = PneumaticDrive()

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pneuopt.errors import ConvergenceError, InputError
 from pneuopt.experiments import Experiment
 from pneuopt.identifiability import identifiability
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, InputError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Array, Trajectory
 from pneuopt.simulate import simulate
-from pneuopt.trajectories import Array, Trajectory
 
 TIME = np.arange(0, 1.5, 1e-3)
 SWING = 60 * np.sin(2 * np.pi * 2 * TIME) + 40 * np.sin(2 * np.pi * 5 * TIME)

@@ -6,7 +6,7 @@ import pytest
 
 from pneuopt.experiments import Experiment, read_log
 from pneuopt.logdoctor import examine
-from pneuopt.trajectories import Array, Trajectory
+from pneuopt.quantities.trajectories import Array, Trajectory
 
 DATA = Path(__file__).parents[1] / "data"
 T = np.arange(4000) * 1e-3

@@ -12,12 +12,12 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form, SeriesForm, to_parallel
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
-from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder
 from pneuopt.nlp.status import Code, Status
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuningfile import read_tuning, write_tuned
 
 PLANT = SecondOrder().system()

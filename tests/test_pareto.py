@@ -11,11 +11,11 @@ from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError
 from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.parameters import ParameterSet
 from pneuopt.pareto import pareto_front
 from pneuopt.plotting import plot_front
+from pneuopt.quantities.errors import ConvergenceError, InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import GainMargin, MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.specification import specify
 from pneuopt.tune import Method

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from pneuopt.control.margins import margins
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.experiments import Experiment, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.parameters import ParameterSet
 from pneuopt.plotting import (
     Response,
     friction_force,
@@ -33,9 +31,11 @@ from pneuopt.plotting import (
     plot_steps,
     save_figure,
 )
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import Linearisation
-from pneuopt.trajectories import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,16 +3,16 @@ import math
 import numpy as np
 import pytest
 
-from pneuopt.errors import InputError, UnknownNameError
 from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
-from pneuopt.parameters import ParameterSet
 from pneuopt.profiles import profile
+from pneuopt.quantities.errors import InputError, UnknownNameError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import System
-from pneuopt.trajectories import Trajectory
 
 LEVELS = {"friction.coulomb": 30.0, "friction.static": 42.0, "friction.stribeck_velocity": 0.025}
 CURVE = ("friction.coulomb", "friction.static", "friction.stribeck_velocity")

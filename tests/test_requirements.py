@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.errors import InputError
+from pneuopt.quantities.errors import InputError
 from pneuopt.requirements import (
     IAE,
     KINDS,

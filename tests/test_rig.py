@@ -14,7 +14,6 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
-from pneuopt.errors import InputError, ModelError, UnknownNameError
 from pneuopt.identify import identify
 from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.drive import ForceDrive
@@ -22,10 +21,11 @@ from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.rig import Recording, Rig, record
 from pneuopt.simulate import simulate
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 FRICTION = {"friction.coulomb": 30.0, "friction.static": 45.0, "friction.viscous": 40.0, "load.mass": 3.0}

@@ -7,9 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pneuopt.cli import app
-from pneuopt.errors import InputError
 from pneuopt.models.linear import SecondOrder
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.scenariofile import read_fresh, read_scenarios
 from pneuopt.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.tomlfile import read_toml

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.errors import InputError, UnknownNameError
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError, UnknownNameError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.scenarios import corners, draws, samples
 
 LOW_HIGH = ("low", "high")

@@ -3,14 +3,14 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from pneuopt.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import FrictionModel, friction_ladder
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Array, Trajectory
 from pneuopt.selection import ModelSelection, select_model
 from pneuopt.system import System
-from pneuopt.trajectories import Array, Trajectory
 
 FREE = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity", "friction.*_asymmetry")
 PAIR = ("friction.coulomb", "friction.viscous", "friction.*_asymmetry")

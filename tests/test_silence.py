@@ -12,11 +12,11 @@ from pneuopt.files import read_drive, write_fit
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import LuGre, Stribeck
-from pneuopt.parameters import ParameterSet
 from pneuopt.profiles import profile
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.tomlfile import read_toml
-from pneuopt.trajectories import Trajectory
 
 FILE = """
 [drive]

@@ -15,15 +15,15 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.paper2015 import paper_plant
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import System, define
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from pneuopt.errors import InputError
+from pneuopt.quantities.errors import InputError
 from pneuopt.requirements import (
     GainMargin,
     MaxComplementarySensitivity,

@@ -17,10 +17,10 @@ from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.nlp.status import Code
 from pneuopt.nlp.transcription import Transcription
-from pneuopt.parameters import ParameterSet
 from pneuopt.posing import Problem
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import discretise, vector
-from pneuopt.trajectories import Trajectory
 
 VELOCITY = "friction.stribeck_velocity"
 TRUTH = {"friction.coulomb": 30.0, "friction.static": 42.0, VELOCITY: 0.012, "friction.viscous": 60.0}

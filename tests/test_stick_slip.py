@@ -15,17 +15,17 @@ from pneuopt.compiler import compiler
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.errors import ConvergenceError, ModelError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ConvergenceError, ModelError
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import StickSlipResult, simulate, simulate_stick_slip
 from pneuopt.stick_slip import EventKind
 from pneuopt.system import DIRECTION, System, define
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 BREAK_AWAY, STANDSTILL, REVERSAL = EventKind

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from pneuopt.errors import InputError
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.studyfile import Axis, Pareto, read_axes, read_pareto, read_study
 
 RIG = ParameterSet(

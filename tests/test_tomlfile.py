@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from pneuopt.errors import InputError
+from pneuopt.quantities.errors import InputError
 from pneuopt.tomlfile import Places, read_toml
 
 

@@ -10,13 +10,13 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.nlp.status import Code
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
 from pneuopt.specification import specify
 from pneuopt.tune import TuningResult, tune

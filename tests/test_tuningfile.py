@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.files import read_status
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, PressureDependent
 from pneuopt.models.linear import SecondOrder
 from pneuopt.nlp.status import Code, Status
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import (
     IAE,
     ISE,

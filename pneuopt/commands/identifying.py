@@ -19,7 +19,6 @@ from pneuopt.commands.shared import (
 )
 from pneuopt.console.fits import show_estimates, show_fit, show_selection, show_verdict
 from pneuopt.console.terminal import progress, screen, show_status
-from pneuopt.errors import InputError, require
 from pneuopt.experiments import Experiment, read_log, split
 from pneuopt.files import Drive, read_drive, write_fit
 from pneuopt.identifiability import Verdict, identifiability
@@ -28,8 +27,6 @@ from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import friction_ladder
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.nlp.least_squares import LeastSquares
-from pneuopt.output import records
-from pneuopt.parameters import ParameterSet
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,
@@ -38,6 +35,9 @@ from pneuopt.plotting import (
     plot_prediction,
     plot_residuals,
 )
+from pneuopt.quantities.errors import InputError, require
+from pneuopt.quantities.output import records
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.selection import select_model
 from pneuopt.system import System
 

@@ -36,14 +36,14 @@ from pneuopt.console.terminal import progress, screen, show_status
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dithering import judge_dither
-from pneuopt.errors import ConvergenceError, InputError, require
 from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.nlp.status import Code
-from pneuopt.output import check_outputs, records
-from pneuopt.parameters import ParameterSet
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
+from pneuopt.quantities.errors import ConvergenceError, InputError, require
+from pneuopt.quantities.output import check_outputs, records
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import Linearisation
-from pneuopt.trajectories import Trajectory
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import cut
 from pneuopt.tuningfile import Tuning, write_tuned

@@ -23,18 +23,18 @@ from pneuopt.commands.shared import (
 from pneuopt.console.loops import SMALLEST_IS_WORST, metric_units, show_cases, show_front
 from pneuopt.console.terminal import progress, screen
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import InputError, check_known, require
 from pneuopt.loopfile import checked
-from pneuopt.output import records, write_text
 from pneuopt.pareto import pareto_front
 from pneuopt.plotting import plot_front, plot_map
+from pneuopt.quantities.errors import InputError, check_known, require
+from pneuopt.quantities.output import records, write_text
+from pneuopt.quantities.units import write_value
 from pneuopt.requirementfile import KEYS, bound_units
 from pneuopt.requirements import AT_LEAST, PERCENT, Requirement, SettlingTime, StepEnvelope, bound, bounded, most, name
 from pneuopt.study import INTERRUPTED as CUT_SHORT
 from pneuopt.study import grid, sweep
 from pneuopt.studyfile import Axis, Pareto, Study, read_axes, read_pareto, read_study
 from pneuopt.tuningfile import Tuning
-from pneuopt.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd

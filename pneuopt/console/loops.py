@@ -15,10 +15,10 @@ from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dithering import DitherVerdict, Usefulness
 from pneuopt.fresh_plants import DesignValidation
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import write_value
 from pneuopt.requirements import AT_LEAST, PERCENT, Requirement, name
 from pneuopt.study import INTERRUPTED
-from pneuopt.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pneuopt.control.dither import Waveform
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import ConvergenceError, check_known, require
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ConvergenceError, check_known, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import Symbols, System, define, names, stacked, symbols, vector
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ def averaged(
     A dead zone of 0.2 under a sine of 0.4 passes (2/pi) acos(0.2/0.4) = 2/3 of the slope:
 
     >>> from pneuopt.models.valve import opening
-    >>> from pneuopt.parameters import Quantity
+    >>> from pneuopt.quantities.parameters import Quantity
     >>> x, u = Quantity("level", "1"), Quantity("spool", "1")
     >>> edge = {"dead_zone": 0.2, "rounding": 0.02, "leak": 0.0}
     >>> flow = lambda t, x, u, p: ({"level": opening(u["spool"], edge) - opening(-u["spool"], edge)}, dict(x))

@@ -7,8 +7,8 @@ import casadi as ca
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, disturbing
-from pneuopt.errors import check_known
-from pneuopt.parameters import Quantity
+from pneuopt.quantities.errors import check_known
+from pneuopt.quantities.parameters import Quantity
 from pneuopt.system import System, names
 
 

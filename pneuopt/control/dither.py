@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import require
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 Symbols = Mapping[str, ca.SX]
 JOINED = 20  # periods, at most, that make a whole number of samples

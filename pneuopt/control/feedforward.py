@@ -7,8 +7,8 @@ from math import inf
 import casadi as ca
 
 from pneuopt.control.pid import ratio
-from pneuopt.errors import require
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 SHORTEST = 1e-6  # [s]

@@ -12,7 +12,7 @@ from typing import Any
 
 import casadi as ca
 
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 
 UNUSED = 0.01  # [s], the filter of a standard form's derivative that is switched off, Td = 0
 

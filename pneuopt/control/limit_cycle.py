@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.means import period_mean
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 
 Array = NDArray[np.float64]
 SETTLED = 0.4  # share of a record that is left out for the transient, unless a start is given

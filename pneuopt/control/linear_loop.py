@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.rest import find_rest
-from pneuopt.errors import require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.system import Linearisation
 
 if TYPE_CHECKING:

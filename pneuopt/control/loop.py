@@ -23,8 +23,8 @@ from pneuopt.control.pid import PID
 from pneuopt.control.rest import find_rest, sliding
 from pneuopt.control.sensor import Encoder, Feedback, SensorLag
 from pneuopt.control.wiring import check_lag, check_reach, chosen, wired
-from pneuopt.errors import ModelError, require
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.system import (
     DiscreteSystem,
     Linearisation,

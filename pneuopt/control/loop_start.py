@@ -18,11 +18,11 @@ from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.rest import drifting
 from pneuopt.control.sensor import Encoder
-from pneuopt.errors import LogError, ModelError, require
 from pneuopt.finders import Log, Start
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.errors import LogError, ModelError, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import DiscreteSystem, Symbols, define, names
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 REFERENCES = {"speed": "speed_reference", "position": "position_reference"}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.means import TAIL, end_mean, period_mean, tail
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from math import inf
 import casadi as ca
 
 from pneuopt.control.forms import NO_N, NO_TI, Form, parallel_gains
-from pneuopt.errors import UnitError, require
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import UnitError, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 

@@ -6,8 +6,8 @@ from math import inf, isfinite
 
 import numpy as np
 
-from pneuopt.errors import require
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.trajectories import Trajectory
 
 
 @dataclass(frozen=True)

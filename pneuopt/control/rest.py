@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.wiring import wired
-from pneuopt.errors import ConvergenceError, require
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.errors import ConvergenceError, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.system import DIRECTION, Symbols, System, define, names, vector
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 
 from pneuopt.control.pid import ratio
-from pneuopt.errors import ModelError, check_known, require
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 SHORTEST = 1e-6  # [s]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.errors import require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.system import names
 
 Array = NDArray[np.float64]

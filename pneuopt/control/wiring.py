@@ -5,8 +5,8 @@ from math import inf
 
 import casadi as ca
 
-from pneuopt.errors import ModelError, check_known, require
-from pneuopt.parameters import Quantity
+from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.quantities.parameters import Quantity
 from pneuopt.system import Symbols, System, names
 
 Signals = dict[str, ca.SX]

@@ -9,7 +9,7 @@ from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
 from pneuopt.models.gas import IsentropicNozzle, Smoothing, conductance_of_area
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import ProportionalValve, Spool
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 
 DriveSet = tuple[PneumaticDrive, ParameterSet]
 CATALOGUE = "sizes as in catalogues (ISO 6432, ISO 15552), friction from published ranges; no single product"

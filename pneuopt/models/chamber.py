@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import casadi as ca
 
 from pneuopt.models.gas import ISENTROPIC
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 TURNING_FLOW = 1e-5  # [kg/s] over which a flow's exponent or temperature changes from outflow's to inflow's

@@ -10,7 +10,7 @@ from math import pi
 import casadi as ca
 
 from pneuopt.models.gas import REFERENCE_PRESSURE
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 Symbols = Mapping[str, ca.SX]
 STOP_ROUNDING = 1e-4  # [m] of the end stops' onset; 10 mm away a stop of 1e6 N/m still pushes with 0.25 N

@@ -8,7 +8,7 @@ import casadi as ca
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_start import force_starts, motion_starts
 from pneuopt.models.load import Load
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import System, define
 
 Symbols = Mapping[str, ca.SX]

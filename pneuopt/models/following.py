@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.codegen import Pieces, Rollout
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import Symbols, System, define, discretise, names, stacked, vector
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 PRESSURES = ("pressure_a", "pressure_b")

@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 
 import casadi as ca
 
-from pneuopt.errors import ModelError, require
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 STICKING_SPEED = 1e-6  # [m/s] rounds |v| in LuGre; larger values creep visibly (PHYSICS section 3)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
-from pneuopt.errors import LogError, require
 from pneuopt.finders import Log, Start
 from pneuopt.models.load import GRAVITY
-from pneuopt.parameters import Parameter, ParameterSet
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.errors import LogError, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the order that succeeded most often

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import casadi as ca
 
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 Symbols = Mapping[str, ca.SX]
 GAS_CONSTANT = 287.05  # [J/(kg K)] dry air

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import HardwareError, require
 from pneuopt.guards import Guard
 from pneuopt.models.chamber import VACUUM
 from pneuopt.models.cylinder import STOP_ROUNDING
-from pneuopt.parameters import ParameterSet
-from pneuopt.units import write_value
+from pneuopt.quantities.errors import HardwareError, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import write_value
 
 EMPTY = 0.5  # of the ambient pressure: lip seals let air in long before
 STRAY = 0.01  # of the stroke, by which a piston that presses into a stop may stand outside

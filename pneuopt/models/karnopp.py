@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from pneuopt.errors import ModelError, require
 from pneuopt.models.friction import Force, FrictionModel
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 WIDTHS = ("smoothing", "asymmetry_width")

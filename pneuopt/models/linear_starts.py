@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, signal
 
-from pneuopt.errors import LogError, require
 from pneuopt.finders import Log, Start
-from pneuopt.parameters import ParameterSet
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.errors import LogError, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Polynomials = tuple[list[float], list[float]]

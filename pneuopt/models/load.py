@@ -6,7 +6,7 @@ from math import pi
 
 import casadi as ca
 
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 Symbols = Mapping[str, ca.SX]
 GRAVITY = 9.80665  # [m/s^2] standard

@@ -21,12 +21,12 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import ModelError, require
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import SecondOrder
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import Spool
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.system import System
 
 Array = NDArray[np.float64]

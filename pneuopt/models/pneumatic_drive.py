@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import require
 from pneuopt.finders import Doubter, Log, Rest
 from pneuopt.models.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.cylinder import Cylinder, areas, piston_leak, volumes
@@ -23,9 +22,10 @@ from pneuopt.models.pneumatic_rest import BALANCED, Glide, steady
 from pneuopt.models.pneumatic_start import PneumaticStarts
 from pneuopt.models.pressure_zero import PressureZeros
 from pneuopt.models.valve import Flows, Port, ProportionalValve
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import System, define, names, stacked, symbols, vector
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Symbols = Mapping[str, ca.SX]

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from pneuopt.errors import require
 from pneuopt.models.chamber import VACUUM
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
 
 Array = NDArray[np.float64]
 BALANCED = ("pressure_a", "pressure_b", "speed")

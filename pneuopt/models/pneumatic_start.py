@@ -20,7 +20,7 @@ from pneuopt.finders import Log, Start
 from pneuopt.models.following import PRESSURES, Follower
 from pneuopt.models.friction_start import Rows, candidates, filtered, load_columns, misfit, motion, named
 from pneuopt.models.gas import REFERENCE_DENSITY
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.system import System
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from pneuopt.finders import Log
 from pneuopt.models.following import PRESSURES
 from pneuopt.models.friction_start import filtered
 from pneuopt.models.pneumatic_start import SHAPES, Run
-from pneuopt.units import ATMOSPHERE
+from pneuopt.quantities.units import ATMOSPHERE
 
 Array = NDArray[np.float64]
 Runs = Callable[[Mapping[str, Log]], Mapping[str, Run]]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from pneuopt.models.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]
 

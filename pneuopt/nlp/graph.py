@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.nlp.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, phases_of
-from pneuopt.parameters import Parameter
+from pneuopt.quantities.parameters import Parameter
 from pneuopt.system import names
 
 Array = NDArray[np.float64]

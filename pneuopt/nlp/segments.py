@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.codegen import Gram, Rollout, Run
-from pneuopt.errors import ModelError, require
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import DiscreteSystem, names
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

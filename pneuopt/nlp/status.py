@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from pneuopt.parameters import ParameterSet
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 
 
 class Code(Enum):

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import ModelError, check_known, require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.system import DiscreteSystem, names
 
 Array = NDArray[np.float64]

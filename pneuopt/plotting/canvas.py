@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from pneuopt.errors import require
-from pneuopt.output import write_bytes
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.output import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

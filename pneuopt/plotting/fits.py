@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import require
 from pneuopt.experiments import CHANNELS, Experiment
-from pneuopt.parameters import ParameterSet
 from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, SCALED, axes_grid, legend_above, shown_of
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd

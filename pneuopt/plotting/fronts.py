@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from pneuopt.errors import check_known, require
 from pneuopt.plotting.canvas import BLUE, RED, axes_grid, legend_above
+from pneuopt.quantities.errors import check_known, require
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.reference import Step
-from pneuopt.errors import require
 from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, axes_grid, legend_above, shown_of
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

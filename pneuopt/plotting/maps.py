@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.errors import check_known, require
 from pneuopt.plotting.canvas import BLUE, MOST_COLUMNS, RED, axes_grid, shown_of
+from pneuopt.quantities.errors import check_known, require
 from pneuopt.study import INTERRUPTED
 
 if TYPE_CHECKING:

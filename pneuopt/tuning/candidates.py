@@ -14,10 +14,10 @@ from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.metrics import About, Envelope, step_metrics
 from pneuopt.control.reference import Step, disturbing
-from pneuopt.errors import require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.system import Linearisation
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -98,7 +98,7 @@ class Space:
 
         Examples
         --------
-        >>> from pneuopt.parameters import Parameter
+        >>> from pneuopt.quantities.parameters import Parameter
         >>> gains = ParameterSet({"pid.Kp": Parameter(0.39661, "1", 0.0, 1.0, free=True)})
         >>> space = Space(gains, ("pid.Kp",))
         >>> space.printed(space.start, 4).item(), space.neighbours(np.array([0.3966]), 4).ravel().tolist()
@@ -125,7 +125,7 @@ class Space:
 
         Examples
         --------
-        >>> from pneuopt.parameters import Parameter
+        >>> from pneuopt.quantities.parameters import Parameter
         >>> space = Space(ParameterSet({"pid.Kp": Parameter(0.4, "1", 0.0, 0.4001, free=True)}), ("pid.Kp",))
         >>> space.around(space.start, 4).ravel().tolist()
         [0.3998, 0.3999, 0.4, 0.4001]

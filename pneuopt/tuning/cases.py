@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import ConvergenceError, HardwareError, InputError, check_known, require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_known, require
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.scenarios import Factor, Scenarios, applied
 from pneuopt.tuning.candidates import Space
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.reference import Step
-from pneuopt.errors import require
 from pneuopt.nlp.sqp import SQP, Point, descend
+from pneuopt.quantities.errors import require
 from pneuopt.requirements import ROBUSTNESS, name
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.errors import require
 from pneuopt.nlp.full_space import FullSpace, prepare, solve_from
 from pneuopt.nlp.status import Solution
+from pneuopt.quantities.errors import require
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.condensed import Condensed

@@ -13,13 +13,13 @@ from pneuopt.control.means import TAIL
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.rest import find_rest, sliding
-from pneuopt.errors import ConvergenceError, InputError, ModelError, require
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import write_value
 from pneuopt.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, most, name
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, highest
 from pneuopt.tuning.cases import Case
-from pneuopt.units import write_value
 
 Array = NDArray[np.float64]
 SLOW = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read

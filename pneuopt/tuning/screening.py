@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
-from pneuopt.errors import require
+from pneuopt.quantities.errors import require
 from pneuopt.requirements import ROBUSTNESS, SettlingTime, most, name
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell

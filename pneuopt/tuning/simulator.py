@@ -11,7 +11,7 @@ from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.control.robustness import robustness
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import AT_LEAST, ROBUSTNESS, read
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.specification import Specification

@@ -18,11 +18,11 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_grid, sensitivity_terms
 from pneuopt.control.means import TAIL
 from pneuopt.control.reference import Step, disturbing
-from pneuopt.errors import require
 from pneuopt.nlp.full_space import FullSpace, Problem, follow, prepare, solve_from
 from pneuopt.nlp.status import Solution
 from pneuopt.nlp.transcription import Cost, Limit, Phase, Transcription, Where, every
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError, most, name
 from pneuopt.specification import Specification
 from pneuopt.system import DiscreteSystem, System, discretise, names

@@ -12,16 +12,16 @@ from pneuopt.control.averaging import averaged, mean_start, ripple
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.errors import InputError, ModelError, UnknownNameError
 from pneuopt.models.catalog import r25
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.valve import opening
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import System, define
-from pneuopt.trajectories import Trajectory
 
 
 def dither(amplitude: float, frequency: float, unit: str = "1") -> ParameterSet:

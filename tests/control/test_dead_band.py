@@ -10,17 +10,17 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import SecondOrder
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.requirements import Overshoot, SettlingTime
 from pneuopt.simulate import simulate_stick_slip
 from pneuopt.specification import specify
 from pneuopt.system import System
-from pneuopt.trajectories import Trajectory
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator

@@ -11,10 +11,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import margins
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.specification import specify
 from pneuopt.system import System

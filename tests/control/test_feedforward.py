@@ -12,11 +12,11 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_response
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import Overshoot, SettlingTime
 from pneuopt.specification import specify
 from pneuopt.system import System

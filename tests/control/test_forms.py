@@ -26,10 +26,10 @@ from pneuopt.control.margins import frequency_response, sensitivity_terms
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.robustness import robustness
-from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.specification import specify
 from pneuopt.system import System

@@ -11,8 +11,8 @@ from pneuopt.control.linear_loop import delayed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_response
 from pneuopt.control.pid import PID
-from pneuopt.errors import InputError, ModelError
-from pneuopt.parameters import ParameterSet, Quantity
+from pneuopt.quantities.errors import InputError, ModelError
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.system import System, define
 
 Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from pneuopt.control.pid import PID, ratio
-from pneuopt.errors import InputError, UnitError
-from pneuopt.parameters import Quantity
+from pneuopt.quantities.errors import InputError, UnitError
+from pneuopt.quantities.parameters import Quantity
 
 MEASURED, COMMAND = Quantity("speed", "m/s"), Quantity("valve_voltage", "V")
 GAINS = {"Kp": 2.0, "Ki": 9.0, "Kd": 0.05, "Tf": 0.004, "b": 0.7, "c": 0.4, "Tt": 0.06, "lower": -1.0, "upper": 1.5}

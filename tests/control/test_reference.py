@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
+from pneuopt.quantities.errors import InputError
 
 
 @given(size=st.floats(-5, 5).filter(lambda s: abs(s) > 1e-6), first=st.integers(0, 90), initial=st.floats(-5, 5))

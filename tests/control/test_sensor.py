@@ -10,12 +10,12 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.robustness import robustness
 from pneuopt.control.sensor import Encoder, SensorLag
-from pneuopt.errors import InputError, ModelError
 from pneuopt.instruments import Sensor
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.rig import Rig
 from pneuopt.scenarios import Scenarios, corners

@@ -16,10 +16,10 @@ from pneuopt.models.gas import CRITICAL_RATIO, IsentropicNozzle, Iso6358, Smooth
 from pneuopt.models.paper2015 import OperatingPoint, second_order
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import Spool
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import Linearisation, vector
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 K_S = 20.0  # [V s/m] transducer

@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.load import Load
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import System, vector
-from pneuopt.trajectories import Trajectory
 
 DRIVES: dict[str, System] = {
     "coulomb": ForceDrive(Coulomb()).system(),

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.errors import ModelError
 from pneuopt.models.friction import (
     Asymmetric,
     Coulomb,
@@ -18,7 +17,8 @@ from pneuopt.models.friction import (
     Viscous,
     stribeck_curve,
 )
-from pneuopt.trajectories import Array
+from pneuopt.quantities.errors import ModelError
+from pneuopt.quantities.trajectories import Array
 
 STATIC: dict[str, FrictionModel] = {"viscous": Viscous(), "coulomb": Coulomb(), "stribeck": Stribeck()}
 MODELS: dict[str, FrictionModel] = {

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from pneuopt.codegen import Pieces, Rollout
-from pneuopt.errors import LogError
 from pneuopt.finders import Log, Start
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.friction_start import Rows, load_columns, misfit, motion
 from pneuopt.models.load import Load
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import LogError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Array, Trajectory
 from pneuopt.system import DiscreteSystem, discretise, names, vector
-from pneuopt.trajectories import Array, Trajectory
 
 TRUTH = {
     "load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0, "friction.static": 42.0,

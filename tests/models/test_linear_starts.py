@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pneuopt.errors import LogError
 from pneuopt.finders import Log
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder
+from pneuopt.quantities.errors import LogError
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import System, names
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from pneuopt.errors import ModelError
 from pneuopt.models.catalog import r25, s32
 from pneuopt.models.paper2015 import (
     KAPPA,
@@ -23,6 +22,7 @@ from pneuopt.models.paper2015 import (
     state_space,
     third_order,
 )
+from pneuopt.quantities.errors import ModelError
 
 K_D, K_S = 2e-4, 20.0
 factor = st.floats(0.3, 3.0)

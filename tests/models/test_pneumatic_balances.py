@@ -13,10 +13,10 @@ from pneuopt.models.friction import Viscous
 from pneuopt.models.gas import GAS_CONSTANT
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import Port
-from pneuopt.parameters import Quantity
+from pneuopt.quantities.parameters import Quantity
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import Symbols, System, define, names
-from pneuopt.trajectories import Trajectory
 
 AREAS = np.pi / 4 * 0.032**2, np.pi / 4 * (0.032**2 - 0.012**2)
 

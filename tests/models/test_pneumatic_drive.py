@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.errors import InputError, PhysicsWarning
 from pneuopt.finders import Log
 from pneuopt.models.chamber import Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
@@ -19,10 +18,11 @@ from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import ProportionalValve, Spool
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import InputError, PhysicsWarning
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.simulate import simulate
 from pneuopt.system import System, names, vector
-from pneuopt.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 DRIVES = {

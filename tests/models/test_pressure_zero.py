@@ -13,7 +13,7 @@ import pytest
 import pneuopt as po
 from pneuopt.finders import Log
 from pneuopt.models.catalog import DriveSet, b32, s32, t32
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.trajectories import Trajectory
 
 DATA = Path(__file__).parents[2] / "data"
 ATMOSPHERE = 101325.0

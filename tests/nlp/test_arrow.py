@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pneuopt.nlp.arrow import STATE_FLOOR, Arrow, indistinct, scaled_inverse
-from pneuopt.trajectories import Array
+from pneuopt.quantities.trajectories import Array
 
 
 def random_problem(m: int, n: int, k: int, seed: int, spread: float = 1.0) -> tuple[Arrow, Array, Array]:

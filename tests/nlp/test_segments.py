@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pneuopt.errors import ModelError
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre
 from pneuopt.models.load import Load
 from pneuopt.nlp.equations import normal_equations
 from pneuopt.nlp.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import ModelError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.trajectories import Array
 from pneuopt.system import System, discretise
-from pneuopt.trajectories import Array
 
 FREE = ("friction.coulomb", "load.mass")
 

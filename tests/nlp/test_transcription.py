@@ -4,11 +4,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt.errors import ModelError, UnknownNameError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.nlp.transcription import Cost, Phase, Residuals, Transcription, Where, every, phases_of
-from pneuopt.parameters import Parameter, ParameterSet
+from pneuopt.quantities.errors import ModelError, UnknownNameError
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.system import discretise
 
 DRIVE = ForceDrive(Coulomb()).system()

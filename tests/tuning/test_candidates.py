@@ -8,11 +8,11 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import Ripple, SettlingTime
 from pneuopt.specification import specify
 from pneuopt.tune import tune

@@ -13,11 +13,11 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import (
     IAE,
     NoiseGain,

@@ -12,7 +12,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.nlp.status import Code
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import GainMargin, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
 from pneuopt.specification import specify
 from pneuopt.tune import Method, TuningResult, tune

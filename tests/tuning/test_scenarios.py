@@ -10,11 +10,11 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.errors import InputError, UnknownNameError
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import Integrator, SecondOrder
-from pneuopt.parameters import ParameterSet
+from pneuopt.quantities.errors import InputError, UnknownNameError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
 from pneuopt.scenarios import Factor, Scenarios, applied, corners, samples, tolerances
 from pneuopt.specification import specify

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.errors import UnitError
-from pneuopt.units import ATMOSPHERE, read_si, read_value, scale_of, write_value
+from pneuopt.quantities.errors import UnitError
+from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, scale_of, write_value
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,8 @@ def test_writes_what_reads_well() -> None:
 
 
 def test_pint_stays_out_of_import_time() -> None:
-    code = "import sys, pneuopt.units, pneuopt.experiments; assert not {'pint', 'pandas', 'casadi'} & set(sys.modules)"
+    code = "import sys, pneuopt.quantities.units, pneuopt.experiments\n"
+    code += "assert not {'pint', 'pandas', 'casadi'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.errors import InputError, UnknownNameError
-from pneuopt.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.errors import InputError, UnknownNameError
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 RIG = ParameterSet(
     {

@@ -5,8 +5,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pneuopt.errors import InputError
-from pneuopt.output import check_outputs, write_json, write_records, write_text
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.output import check_outputs, write_json, write_records, write_text
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.errors import InputError, require
+from pneuopt.quantities.errors import InputError, require
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,6 +1,6 @@
 import pytest
 
-from pneuopt.errors import (
+from pneuopt.quantities.errors import (
     ConvergenceError,
     InputError,
     LogError,

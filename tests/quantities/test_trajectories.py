@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from pneuopt.errors import InputError, UnknownNameError
-from pneuopt.trajectories import Trajectory
+from pneuopt.quantities.errors import InputError, UnknownNameError
+from pneuopt.quantities.trajectories import Trajectory
 
 RUN = Trajectory([0.0, 1.0, 3.0], {"speed": [0.0, math.nan, 2.0], "force": [1, 2, 3]})
 

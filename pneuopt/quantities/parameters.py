@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from pneuopt.errors import InputError, UnknownNameError, check_known, require
+from pneuopt.quantities.errors import InputError, UnknownNameError, check_known, require
 
 if TYPE_CHECKING:
     import pandas as pd

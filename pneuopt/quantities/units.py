@@ -11,7 +11,7 @@ from fractions import Fraction
 from functools import cache
 from typing import Any, NamedTuple
 
-from pneuopt.errors import UnitError, require
+from pneuopt.quantities.errors import UnitError, require
 
 ATMOSPHERE = 101325.0
 """Standard atmosphere [Pa], which gauge pressures count from (ISO 2533)."""

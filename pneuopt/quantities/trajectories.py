@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.errors import UnknownNameError, require
+from pneuopt.quantities.errors import UnknownNameError, require
 
 if TYPE_CHECKING:
     import pandas as pd
