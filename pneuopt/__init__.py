@@ -76,7 +76,7 @@ _HOME = {
     "pneuopt.control.metrics": ("step_metrics",),
     "pneuopt.nlp.least_squares": ("LeastSquares",),
     "pneuopt.nlp.full_space": ("FullSpace",),
-    "pneuopt.experiments": ("Experiment", "differentiate", "read_log", "resample", "split"),
+    "pneuopt.logs.experiments": ("Experiment", "differentiate", "read_log", "resample", "split"),
     "pneuopt.simulate": ("contacts", "simulate", "simulate_stick_slip"),
     "pneuopt.instruments": ("Actuator", "Sensor"),
     "pneuopt.rig": ("Rig", "record"),

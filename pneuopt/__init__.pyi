@@ -26,12 +26,12 @@ from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.control.take_over import take_over
 from pneuopt.derived import Derived, derived
 from pneuopt.dithering import DitherVerdict, dither_effect, judge_dither
-from pneuopt.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.files import read_drive, write_fit
 from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.identifiability import Verdict, identifiability
 from pneuopt.identify import IdentificationResult, identify, predict, validate
 from pneuopt.instruments import Actuator, Sensor
+from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.models.chamber import Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.control.loop_start import LoggedLoop
-from pneuopt.experiments import Experiment
 from pneuopt.finders import Log
-from pneuopt.logdoctor import Finding, examine
+from pneuopt.logs.doctor import Finding, examine
+from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_known, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.statistics import noise_level

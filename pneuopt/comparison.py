@@ -9,8 +9,8 @@ import numpy as np
 
 from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.posing import as_logged
 from pneuopt.quantities.errors import LogError, require

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import tomlkit
 
-from pneuopt.experiments import CHANNELS
+from pneuopt.logs.experiments import CHANNELS
 from pneuopt.models.chamber import ChamberModel, Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pneuopt.checks import check_content, check_free, check_logs, check_smooth, doubts, measured_outputs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.experiments import Experiment
 from pneuopt.identifiability import Verdict
+from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.judge import NOISE_LEVEL
 from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.nlp.status import Code, Status

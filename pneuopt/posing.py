@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pneuopt.checks import measured_outputs
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
-from pneuopt.experiments import Experiment
 from pneuopt.finders import Log, Start
+from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.quantities.errors import InputError

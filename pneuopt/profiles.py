@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.experiments import Experiment
 from pneuopt.finders import Start
+from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.posing import Problem, as_logged
 from pneuopt.quantities.errors import check_known, require

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder
-from pneuopt.experiments import CHANNELS, Experiment
 from pneuopt.instruments import Actuator, Sensor
 from pneuopt.integration import Run
+from pneuopt.logs.experiments import CHANNELS, Experiment
 from pneuopt.quantities.errors import ModelError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory

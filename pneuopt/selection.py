@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify, validate
+from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet

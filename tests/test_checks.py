@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pneuopt.checks import check_content
-from pneuopt.experiments import Experiment
 from pneuopt.finders import Log
 from pneuopt.identify import identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, UnknownNameError

@@ -15,8 +15,8 @@ from pneuopt.cli import app
 from pneuopt.commands import identifying, looping
 from pneuopt.console.fits import show_estimates
 from pneuopt.console.terminal import screen
-from pneuopt.experiments import read_log
 from pneuopt.files import read_drive, read_status
+from pneuopt.logs.experiments import read_log
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.nlp.least_squares import LeastSquares

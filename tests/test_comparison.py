@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pneuopt.comparison import compare_logs
-from pneuopt.experiments import Experiment
 from pneuopt.identify import identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import LogError

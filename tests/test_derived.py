@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from pneuopt.derived import Values, derived, propagated
-from pneuopt.experiments import Experiment
 from pneuopt.identify import identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.trajectories import Trajectory

@@ -1,7 +1,7 @@
 import numpy as np
 
 from pneuopt.excitation import missing, motion, remedy
-from pneuopt.experiments import Experiment
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre
 from pneuopt.quantities.trajectories import Array, Trajectory

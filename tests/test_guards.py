@@ -8,10 +8,10 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.experiments import Experiment
 from pneuopt.guards import Contact, Guard
 from pneuopt.identify import identify
 from pneuopt.instruments import Sensor
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pneuopt.experiments import Experiment
 from pneuopt.identifiability import identifiability
 from pneuopt.identify import IdentificationResult, identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck
 from pneuopt.quantities.errors import ConvergenceError, InputError

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import binom
 
 from pneuopt.codegen import Pieces, Rollout
-from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.nlp.least_squares import LeastSquares

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pneuopt.control.margins import margins
 from pneuopt.control.reference import Step
-from pneuopt.experiments import Experiment, split
+from pneuopt.logs.experiments import Experiment, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.profiles import profile

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.experiments import Experiment
 from pneuopt.identify import IdentificationResult, identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError

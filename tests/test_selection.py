@@ -3,7 +3,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from pneuopt.experiments import Experiment
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import FrictionModel, friction_ladder
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError

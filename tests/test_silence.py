@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pneuopt.experiments import Experiment
 from pneuopt.files import read_drive, write_fit
 from pneuopt.identify import IdentificationResult, identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import LuGre, Stribeck
 from pneuopt.profiles import profile

@@ -9,9 +9,9 @@ import pytest
 from pneuopt import starting
 from pneuopt.checks import check_logs
 from pneuopt.codegen import Rollout
-from pneuopt.experiments import Experiment
 from pneuopt.finders import Start
 from pneuopt.identify import identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares

@@ -19,10 +19,10 @@ from pneuopt.commands.shared import (
 )
 from pneuopt.console.fits import show_estimates, show_fit, show_selection, show_verdict
 from pneuopt.console.terminal import progress, screen, show_status
-from pneuopt.experiments import Experiment, read_log, split
 from pneuopt.files import Drive, read_drive, write_fit
 from pneuopt.identifiability import Verdict, identifiability
 from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.logs.experiments import Experiment, read_log, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import friction_ladder
 from pneuopt.models.pneumatic_drive import PneumaticDrive

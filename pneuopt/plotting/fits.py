@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.experiments import CHANNELS, Experiment
+from pneuopt.logs.experiments import CHANNELS, Experiment
 from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, SCALED, axes_grid, legend_above, shown_of
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet

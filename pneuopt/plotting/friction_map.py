@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.derived import propagated
-from pneuopt.experiments import Experiment, differentiate
+from pneuopt.logs.experiments import Experiment, differentiate
 from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
 from pneuopt.plotting.fits import MOST_POINTS, Fitted
 from pneuopt.quantities.errors import require

@@ -11,9 +11,9 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import SensorLag
-from pneuopt.experiments import Experiment
 from pneuopt.finders import Log
 from pneuopt.identify import identify, predict, validate
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import LogError, ModelError

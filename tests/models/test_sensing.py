@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.experiments import Experiment
 from pneuopt.finders import Log
 from pneuopt.identify import identify
+from pneuopt.logs.experiments import Experiment
 from pneuopt.models.catalog import b32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb

@@ -147,7 +147,7 @@ def test_writes_what_reads_well() -> None:
 
 
 def test_pint_stays_out_of_import_time() -> None:
-    code = "import sys, pneuopt.quantities.units, pneuopt.experiments\n"
+    code = "import sys, pneuopt.quantities.units, pneuopt.logs.experiments\n"
     code += "assert not {'pint', 'pandas', 'casadi'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 

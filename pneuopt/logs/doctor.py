@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.experiments import Experiment
+from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.logfile import CHANNELS, read_columns
+from pneuopt.logs.csv import CHANNELS, read_columns
 from pneuopt.quantities.errors import LogError, check_known, require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import read_si, read_value

@@ -4,11 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pneuopt.experiments import Experiment, read_log
-from pneuopt.logdoctor import examine
+from pneuopt.logs.doctor import examine
+from pneuopt.logs.experiments import Experiment, read_log
 from pneuopt.quantities.trajectories import Array, Trajectory
 
-DATA = Path(__file__).parents[1] / "data"
+DATA = Path(__file__).parents[2] / "data"
 T = np.arange(4000) * 1e-3
 
 
