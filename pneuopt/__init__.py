@@ -32,7 +32,7 @@ _HOME = {
     "pneuopt.quantities.errors": ("ConvergenceError", "InputError", "PhysicsWarning", "PneuoptError"),
     "pneuopt.quantities.parameters": ("Parameter", "ParameterSet", "Quantity"),
     "pneuopt.quantities.trajectories": ("Trajectory",),
-    "pneuopt.system": ("DiscreteSystem", "System", "define", "discretise"),
+    "pneuopt.dynamics.system": ("DiscreteSystem", "System", "define", "discretise"),
     "pneuopt.models.friction": (
         "Asymmetric",
         "Coulomb",
@@ -77,7 +77,7 @@ _HOME = {
     "pneuopt.nlp.least_squares": ("LeastSquares",),
     "pneuopt.nlp.full_space": ("FullSpace",),
     "pneuopt.logs.experiments": ("Experiment", "differentiate", "read_log", "resample", "split"),
-    "pneuopt.simulate": ("contacts", "simulate", "simulate_stick_slip"),
+    "pneuopt.dynamics.simulate": ("contacts", "simulate", "simulate_stick_slip"),
     "pneuopt.instruments": ("Actuator", "Sensor"),
     "pneuopt.rig": ("Rig", "record"),
     "pneuopt.identify": ("IdentificationResult", "identify", "predict", "validate"),

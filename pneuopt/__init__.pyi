@@ -26,6 +26,8 @@ from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.control.take_over import take_over
 from pneuopt.derived import Derived, derived
 from pneuopt.dithering import DitherVerdict, dither_effect, judge_dither
+from pneuopt.dynamics.simulate import contacts, simulate, simulate_stick_slip
+from pneuopt.dynamics.system import DiscreteSystem, System, define, discretise
 from pneuopt.files import read_drive, write_fit
 from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.identifiability import Verdict, identifiability
@@ -93,9 +95,7 @@ from pneuopt.reweighting import Huber, SoftL1
 from pneuopt.rig import Rig, record
 from pneuopt.scenarios import corners, draws, samples, tolerances
 from pneuopt.selection import ModelSelection, select_model
-from pneuopt.simulate import contacts, simulate, simulate_stick_slip
 from pneuopt.study import grid, sweep
-from pneuopt.system import DiscreteSystem, System, define, discretise
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.confirmed import Confirmed

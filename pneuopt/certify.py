@@ -16,13 +16,13 @@ from pneuopt.control.margins import margins, noise_gain
 from pneuopt.control.means import period_mean
 from pneuopt.control.metrics import Envelope
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import Array
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.rig import Rig, record
 from pneuopt.scenarios import NOMINAL, Scenarios
-from pneuopt.simulate import simulate
-from pneuopt.system import Array
 from pneuopt.tuning.candidates import cut, inputs, measure, readings, spacing
 from pneuopt.tuning.cases import Case, cases
 

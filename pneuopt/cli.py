@@ -150,8 +150,8 @@ def info() -> None:
     import platform
     from importlib.metadata import version
 
-    from pneuopt.compiler import cache_directory, compiler
     from pneuopt.console.terminal import screen, show_pairs
+    from pneuopt.dynamics.compiled.compiler import cache_directory, compiler
 
     packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
     with _guarded():

@@ -13,10 +13,10 @@ from pneuopt.certify import evaluate
 from pneuopt.control.averaging import ripple
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.finders import Rest
+from pneuopt.dynamics.hooks import Rest
+from pneuopt.dynamics.system import System, names
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.system import System, names
 from pneuopt.tuning.candidates import command_range
 
 if TYPE_CHECKING:

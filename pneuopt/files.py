@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import tomlkit
 
+from pneuopt.dynamics.system import System
 from pneuopt.logs.experiments import CHANNELS
 from pneuopt.models.chamber import ChamberModel, Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
@@ -31,7 +32,6 @@ from pneuopt.quantities.errors import HardwareError, InputError, UnitError, Unkn
 from pneuopt.quantities.output import plain, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import read_value
-from pneuopt.system import System
 from pneuopt.tomlfile import Places, inline_table, read_parameter, read_toml, toml_table, write_parameter
 
 if TYPE_CHECKING:

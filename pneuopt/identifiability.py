@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from pneuopt.checks import check_content, check_free, check_logs, check_smooth
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.system import System
 from pneuopt.excitation import missing, motion, remedy
-from pneuopt.finders import Start
 from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import STIFFEST, LeastSquares
 from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for
 from pneuopt.posing import Problem, as_logged
 from pneuopt.profiles import Profile
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.system import System
 
 if TYPE_CHECKING:
     import pandas as pd

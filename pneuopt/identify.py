@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pneuopt.checks import check_content, check_free, check_logs, check_smooth, doubts, measured_outputs
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.system import System, names
 from pneuopt.identifiability import Verdict
 from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.judge import NOISE_LEVEL
@@ -27,7 +28,6 @@ from pneuopt.reweighting import Loss, Refit, fitted, white_squares
 from pneuopt.scrutiny import scrutinised
 from pneuopt.starting import attempts
 from pneuopt.statistics import agreement, confidence_interval, correlation_time, cross_correlation, ljung_box
-from pneuopt.system import System, names
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from pneuopt.checks import measured_outputs
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
-from pneuopt.finders import Log, Start
+from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
 from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import DiscreteSystem, System, discretise, names
 
 Array = NDArray[np.float64]
 Model = System | LoggedLoop

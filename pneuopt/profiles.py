@@ -10,14 +10,14 @@ from scipy.stats import chi2
 
 from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.finders import Start
+from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.system import System, names
 from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.posing import Problem, as_logged
 from pneuopt.quantities.errors import check_known, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import System, names
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.checks import measured_outputs
-from pneuopt.finders import Start
+from pneuopt.dynamics.hooks import Start
 from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.judge import NOISE_LEVEL
 from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares

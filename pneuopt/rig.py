@@ -13,18 +13,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder
+from pneuopt.dynamics.compiled.rollout import compiled
+from pneuopt.dynamics.simulate import contacts, first_state, held_inputs, new_run, warn_of
+from pneuopt.dynamics.smooth import Run
+from pneuopt.dynamics.stick_slip import Event, StickSlip
+from pneuopt.dynamics.system import Symbols, System, define, names, stacked, vector
 from pneuopt.instruments import Actuator, Sensor
-from pneuopt.integration import Run
 from pneuopt.logs.experiments import CHANNELS, Experiment
 from pneuopt.quantities.errors import ModelError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import contacts, first_state, held_inputs, new_run, warn_of
-from pneuopt.stick_slip import Event, StickSlip
-from pneuopt.system import Symbols, System, define, names, stacked, vector
 
 Array = NDArray[np.float64]
 

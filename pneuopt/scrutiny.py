@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.checks import measured_outputs
-from pneuopt.finders import Start
+from pneuopt.dynamics.hooks import Start
 from pneuopt.identifiability import Verdict, expected, from_covariance, listed
 from pneuopt.nlp.equations import gaps_of
 from pneuopt.nlp.judge import NOISE_LEVEL

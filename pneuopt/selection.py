@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+from pneuopt.dynamics.system import System, names
 from pneuopt.identify import IdentificationResult, identify, validate
 from pneuopt.logs.experiments import Experiment
 from pneuopt.nlp.least_squares import LeastSquares
@@ -13,7 +14,6 @@ from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, requir
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.scrutiny import AT_BOUND, NOT_TOLD
 from pneuopt.statistics import bayes_information, likelihood_ratio_p
-from pneuopt.system import System, names
 
 if TYPE_CHECKING:
     import pandas as pd

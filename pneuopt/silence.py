@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from scipy.stats import chi2
 
-from pneuopt.finders import Start
+from pneuopt.dynamics.hooks import Start
 from pneuopt.nlp.least_squares import Fit, solve_least_squares
 from pneuopt.nlp.status import Code
 from pneuopt.posing import Problem

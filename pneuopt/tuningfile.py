@@ -10,6 +10,7 @@ import tomlkit
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.system import System
 from pneuopt.loopfile import SECTIONS, TUNABLE, checked, read_loop, value_of
 from pneuopt.nlp.status import Status
 from pneuopt.quantities.errors import check_known, require
@@ -21,7 +22,6 @@ from pneuopt.requirements import AT_LEAST, Bounds, Requirement
 from pneuopt.scenariofile import read_fresh, read_scenarios
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.specification import specify
-from pneuopt.system import System
 from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
 
 if TYPE_CHECKING:

@@ -21,11 +21,11 @@ from claims import Claim, arguments, finish, frame
 from scipy import integrate
 
 import pneuopt as po
-from pneuopt.codegen import Pieces, Rollout, compiled
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compiled
+from pneuopt.dynamics.system import Symbols, System, define, discretise, names, stacked, vector
 from pneuopt.models.catalog import b32
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.quantities.parameters import Quantity
-from pneuopt.system import Symbols, System, define, discretise, names, stacked, vector
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -29,7 +29,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import pneuopt as po
-from pneuopt.finders import Log, Start
+from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.models.catalog import b32
 from pneuopt.nlp.full_space import FullSpace, solve_full_space
 from pneuopt.nlp.least_squares import LeastSquares

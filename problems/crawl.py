@@ -33,12 +33,12 @@ from scipy import optimize
 
 import pneuopt as po
 from pneuopt.control.sensor import Encoder
+from pneuopt.dynamics.stick_slip import EventKind
+from pneuopt.dynamics.system import System
 from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.friction import LuGre
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 from pneuopt.rig import Recording, Rig, record
-from pneuopt.stick_slip import EventKind
-from pneuopt.system import System
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,10 +18,10 @@ from r25 import CLIP, PAPERS_PID, TRANSDUCER, Case, averaged, lagging, linearise
 
 import pneuopt as po
 from pneuopt.dithering import Usefulness
+from pneuopt.dynamics.system import Linearisation
 from pneuopt.models.catalog import r25
 from pneuopt.models.friction import Viscous
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid
-from pneuopt.system import Linearisation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

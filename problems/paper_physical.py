@@ -25,6 +25,7 @@ from claims import Claim, arguments, finish, frame
 from r25 import HALF_TRAVEL, PER_VOLT, TRANSDUCER, Array, Case, linearised, polynomials, simulated
 from scipy import optimize, signal
 
+from pneuopt.dynamics.system import names, vector
 from pneuopt.models.catalog import DriveSet, r25
 from pneuopt.models.gas import CRITICAL_RATIO, REFERENCE_DENSITY, Smoothing
 from pneuopt.models.paper2015 import (
@@ -42,7 +43,6 @@ from pneuopt.models.paper2015 import (
     third_order,
 )
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
-from pneuopt.system import names, vector
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -35,11 +35,11 @@ from pneuopt.control.margins import Margins, frequency_response, margins
 from pneuopt.control.metrics import About, step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.paper2015 import PRINTED, paper_plant
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
-from pneuopt.simulate import simulate
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 

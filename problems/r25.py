@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pneuopt as po
+from pneuopt.dynamics.system import Linearisation
 from pneuopt.models.catalog import DriveSet, r25
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.valve import Spool
-from pneuopt.system import Linearisation
 
 Array = NDArray[np.float64]
 TRANSDUCER = 20.0  # [V s/m] K_s

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy import integrate
 
 import pneuopt as po
-from pneuopt.codegen import compiled
+from pneuopt.dynamics.compiled.rollout import compiled
+from pneuopt.dynamics.system import System, names, vector
 from pneuopt.models.catalog import b32
-from pneuopt.system import System, names, vector
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,12 +22,12 @@ from b32 import FREE, VALVE, generate
 from claims import Claim, arguments, finish, frame
 from scipy.integrate import solve_ivp
 
-from pneuopt.codegen import Rollout, Run, compiled
-from pneuopt.compiler import compiler
+from pneuopt.dynamics.compiled.compiler import compiler
+from pneuopt.dynamics.compiled.rollout import Rollout, Run, compiled
+from pneuopt.dynamics.system import System, discretise, names, vector
 from pneuopt.models.catalog import b32
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Array
-from pneuopt.system import System, discretise, names, vector
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,10 +16,10 @@ import numpy as np
 from claims import Claim, arguments, finish, frame
 
 import pneuopt as po
+from pneuopt.dynamics.simulate import StickSlipResult
+from pneuopt.dynamics.stick_slip import EventKind
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
-from pneuopt.simulate import StickSlipResult
-from pneuopt.stick_slip import EventKind
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,14 +7,15 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt import compiler, kernels
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled import pieces as kernels
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import Symbols, System, define
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import Symbols, System, define
 from pneuopt.tuning.linearised import Linearised
 
 CACHES = (compiler.build, compiler.say_once, compiler._compiler_version, compiler._temporary_folder, kernels.prepared)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pneuopt.checks import check_content
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
 from pneuopt.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from pneuopt.comparison import compare_logs
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
 DRIVE = ForceDrive(Coulomb()).system()

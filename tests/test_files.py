@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.files import read_drive, read_status, write_fit
 from pneuopt.identifiability import Verdict
 from pneuopt.models.chamber import Polytropic, Thermal
@@ -26,7 +27,6 @@ from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
 from pneuopt.tomlfile import read_toml
 
 AXIS = """# my axis, 2024

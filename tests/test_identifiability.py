@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.identifiability import identifiability
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.logs.experiments import Experiment
@@ -14,7 +15,6 @@ from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, S
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Array, Trajectory
-from pneuopt.simulate import simulate
 
 TIME = np.arange(0, 1.5, 1e-3)
 SWING = 60 * np.sin(2 * np.pi * 2 * TIME) + 40 * np.sin(2 * np.pi * 5 * TIME)

@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 from scipy.stats import binom
 
-from pneuopt.codegen import Pieces, Rollout
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.dynamics.system import Symbols, System, define, discretise, names, vector
 from pneuopt.identify import IdentificationResult, identify, predict, validate
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
@@ -19,7 +20,6 @@ from pneuopt.nlp.status import Code
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Array, Trajectory
-from pneuopt.system import Symbols, System, define, discretise, names, vector
 
 TRUTH = {
     "load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0, "friction.static": 42.0,
@@ -327,7 +327,7 @@ def test_a_wrong_basin_is_not_the_answer_if_another_start_is_better() -> None:
     turn = ParameterSet({"turn": Parameter(2.0, "1", free=True)})
 
     def finder(logs: Mapping[str, object]) -> list[object]:
-        from pneuopt.finders import Log, Start
+        from pneuopt.dynamics.hooks import Log, Start
 
         (start,) = base.starts({n: Log(e.measured, truth) for n, e in logs.items()})  # type: ignore[attr-defined]
         return [Start(start.states, {"turn": value}, f"{value}") for value in (-0.9, -1.1, 2.1)]

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from pneuopt.control.margins import margins
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import Linearisation
 from pneuopt.logs.experiments import Experiment, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre
@@ -34,8 +36,6 @@ from pneuopt.plotting import (
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import Linearisation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,6 +3,8 @@ import math
 import numpy as np
 import pytest
 
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
@@ -11,8 +13,6 @@ from pneuopt.profiles import profile
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import System
 
 LEVELS = {"friction.coulomb": 30.0, "friction.static": 42.0, "friction.stribeck_velocity": 0.025}
 CURVE = ("friction.coulomb", "friction.static", "friction.stribeck_velocity")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
@@ -12,7 +13,6 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.reweighting import Huber, Loss, SoftL1
-from pneuopt.simulate import simulate
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
 NOISE = {"position": 2e-5, "speed": 1e-3}

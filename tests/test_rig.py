@@ -14,6 +14,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.identify import identify
 from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.drive import ForceDrive
@@ -25,7 +26,6 @@ from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.rig import Recording, Rig, record
-from pneuopt.simulate import simulate
 
 Array = NDArray[np.float64]
 FRICTION = {"friction.coulomb": 30.0, "friction.static": 45.0, "friction.viscous": 40.0, "load.mass": 3.0}

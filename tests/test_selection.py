@@ -3,6 +3,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
+from pneuopt.dynamics.system import System
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import FrictionModel, friction_ladder
@@ -10,7 +11,6 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameE
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Array, Trajectory
 from pneuopt.selection import ModelSelection, select_model
-from pneuopt.system import System
 
 FREE = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity", "friction.*_asymmetry")
 PAIR = ("friction.coulomb", "friction.viscous", "friction.*_asymmetry")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.files import read_drive, write_fit
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.logs.experiments import Experiment
@@ -15,7 +16,6 @@ from pneuopt.models.friction import LuGre, Stribeck
 from pneuopt.profiles import profile
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
 from pneuopt.tomlfile import read_toml
 
 FILE = """

@@ -8,8 +8,9 @@ import pytest
 
 from pneuopt import starting
 from pneuopt.checks import check_logs
-from pneuopt.codegen import Rollout
-from pneuopt.finders import Start
+from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.system import discretise, vector
 from pneuopt.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
@@ -20,7 +21,6 @@ from pneuopt.nlp.transcription import Transcription
 from pneuopt.posing import Problem
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import discretise, vector
 
 VELOCITY = "friction.stribeck_velocity"
 TRUTH = {"friction.coulomb": 30.0, "friction.static": 42.0, VELOCITY: 0.012, "friction.viscous": 60.0}

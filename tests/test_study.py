@@ -22,13 +22,13 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.system import System, discretise
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.study import INTERRUPTED, grid, sweep
-from pneuopt.system import System, discretise
 
 RIG = ParameterSet(
     {

@@ -19,6 +19,7 @@ from pneuopt.commands.shared import (
 )
 from pneuopt.console.fits import show_estimates, show_fit, show_selection, show_verdict
 from pneuopt.console.terminal import progress, screen, show_status
+from pneuopt.dynamics.system import System
 from pneuopt.files import Drive, read_drive, write_fit
 from pneuopt.identifiability import Verdict, identifiability
 from pneuopt.identify import IdentificationResult, identify, predict, validate
@@ -39,7 +40,6 @@ from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.selection import select_model
-from pneuopt.system import System
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

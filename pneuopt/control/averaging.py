@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from pneuopt.control.dither import Waveform
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.system import Symbols, System, define, names, stacked, symbols, vector
 from pneuopt.quantities.errors import ConvergenceError, check_known, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import Symbols, System, define, names, stacked, symbols, vector
 
 Array = NDArray[np.float64]
 AMPLITUDE, OFFSET, FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"

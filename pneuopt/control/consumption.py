@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.system import names
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import names
 
 Array = NDArray[np.float64]
 NORMAL_DENSITY = 1.185  # [kg/m^3] of air as normal litres count it: ISO 8778 (ANR), 100 kPa, 20 degC, 65 %

@@ -7,9 +7,9 @@ import casadi as ca
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, disturbing
+from pneuopt.dynamics.system import System, names
 from pneuopt.quantities.errors import check_known
 from pneuopt.quantities.parameters import Quantity
-from pneuopt.system import System, names
 
 
 def disturbed(loop: ClosedLoop, references: Iterable[Step]) -> ClosedLoop:

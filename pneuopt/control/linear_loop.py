@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.rest import find_rest
+from pneuopt.dynamics.system import Linearisation
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.system import Linearisation
 
 if TYPE_CHECKING:
     from pneuopt.control.loop import ClosedLoop

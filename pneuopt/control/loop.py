@@ -23,9 +23,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.rest import find_rest, sliding
 from pneuopt.control.sensor import Encoder, Feedback, SensorLag
 from pneuopt.control.wiring import check_lag, check_reach, chosen, wired
-from pneuopt.quantities.errors import ModelError, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity
-from pneuopt.system import (
+from pneuopt.dynamics.system import (
     DiscreteSystem,
     Linearisation,
     Symbols,
@@ -36,6 +34,8 @@ from pneuopt.system import (
     stacked,
     symbols,
 )
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 
 Array = NDArray[np.float64]
 Signals = dict[str, ca.SX]

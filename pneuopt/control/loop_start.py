@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.rest import drifting
 from pneuopt.control.sensor import Encoder
-from pneuopt.finders import Log, Start
+from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, names
 from pneuopt.quantities.errors import LogError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import DiscreteSystem, Symbols, define, names
 
 Array = NDArray[np.float64]
 REFERENCES = {"speed": "speed_reference", "position": "position_reference"}

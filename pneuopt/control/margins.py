@@ -20,9 +20,9 @@ from scipy.optimize import brentq, minimize_scalar
 
 from pneuopt.control.linear_loop import delayed, linear_gains
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.system import Array, Linearisation
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.system import Array, Linearisation
 
 ComplexArray = NDArray[np.complex128]
 

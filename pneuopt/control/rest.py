@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.wiring import wired
+from pneuopt.dynamics.system import DIRECTION, Symbols, System, define, names, vector
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
-from pneuopt.system import DIRECTION, Symbols, System, define, names, vector
 
 if TYPE_CHECKING:
     from pneuopt.control.loop import ClosedLoop

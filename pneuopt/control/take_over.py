@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.system import names
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.system import names
 
 Array = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from math import inf
 
 import casadi as ca
 
+from pneuopt.dynamics.system import Symbols, System, names
 from pneuopt.quantities.errors import ModelError, check_known, require
 from pneuopt.quantities.parameters import Quantity
-from pneuopt.system import Symbols, System, names
 
 Signals = dict[str, ca.SX]
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
+from pneuopt.dynamics.system import System, define
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_start import force_starts, motion_starts
 from pneuopt.models.load import Load
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import System, define
 
 Symbols = Mapping[str, ca.SX]
 ATMOSPHERE = 101325.0  # [Pa] standard atmosphere, ISO 2533

@@ -11,10 +11,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Pieces, Rollout
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.dynamics.system import Symbols, System, define, discretise, names, stacked, vector
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import Symbols, System, define, discretise, names, stacked, vector
 
 Array = NDArray[np.float64]
 PRESSURES = ("pressure_a", "pressure_b")

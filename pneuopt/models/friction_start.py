@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
-from pneuopt.finders import Log, Start
+from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.models.load import GRAVITY
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet

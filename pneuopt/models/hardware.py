@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.guards import Guard
+from pneuopt.dynamics.guards import Guard
 from pneuopt.models.chamber import VACUUM
 from pneuopt.models.cylinder import STOP_ROUNDING
 from pneuopt.quantities.errors import HardwareError, require

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
+from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, names
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.linear_starts import LinearStarts, Polynomials, Shape
 from pneuopt.quantities.errors import ModelError, check_known, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import DiscreteSystem, Symbols, System, define, names
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
 SPEED = Quantity("speed", "m/s", nominal=0.5)

@@ -21,13 +21,13 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.dynamics.system import System
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import SecondOrder
 from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import Spool
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.system import System
 
 Array = NDArray[np.float64]
 Polynomials = tuple[Array, Array]

@@ -9,7 +9,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.finders import Doubter, Log, Rest
+from pneuopt.dynamics.hooks import Doubter, Log, Rest
+from pneuopt.dynamics.system import System, define, names, stacked, symbols, vector
 from pneuopt.models.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.drive import AMBIENT, POSITION, SPEED, gauge, part, renamed
@@ -25,7 +26,6 @@ from pneuopt.models.valve import Flows, Port, ProportionalValve
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import System, define, names, stacked, symbols, vector
 
 Array = NDArray[np.float64]
 Symbols = Mapping[str, ca.SX]

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.finders import Log, Start
+from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.system import System
 from pneuopt.models.following import PRESSURES, Follower
 from pneuopt.models.friction_start import Rows, candidates, filtered, load_columns, misfit, motion, named
 from pneuopt.models.gas import REFERENCE_DENSITY
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.system import System
 
 Array = NDArray[np.float64]
 Values = Mapping[str, float]

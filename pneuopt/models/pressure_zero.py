@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
 from pneuopt.models.following import PRESSURES
 from pneuopt.models.friction_start import filtered
 from pneuopt.models.pneumatic_start import SHAPES, Run

@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.finders import Log, Rest, RestFinder, Start
+from pneuopt.dynamics.hooks import Log, Rest, RestFinder, Start
+from pneuopt.dynamics.system import Symbols, System, define, names, stacked, vector
 from pneuopt.quantities.errors import check_known, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import Symbols, System, define, names, stacked, vector
 
 Array = NDArray[np.float64]
 Channels = tuple[str, ...]

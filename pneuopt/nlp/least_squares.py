@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Run
+from pneuopt.dynamics.compiled.rollout import Run
 from pneuopt.nlp.arrow import Reduced, Step
 from pneuopt.nlp.equations import Equations, normal_equations, reconnected, weighed
 from pneuopt.nlp.judge import MOST_GAP_SHARE, NOISE_LEVEL, Judgement, judged

@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Gram, Rollout, Run
+from pneuopt.dynamics.compiled.rollout import Gram, Rollout, Run
+from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.nlp.transcription import Phase, Residuals, Transcription
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import DiscreteSystem, names
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.quantities.errors import ModelError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.system import DiscreteSystem, names
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.margins import Margins, frequency_grid, frequency_response, margins
+from pneuopt.dynamics.system import Linearisation
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
-from pneuopt.system import Linearisation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.derived import propagated
+from pneuopt.dynamics.system import System, names, vector
 from pneuopt.logs.experiments import Experiment, differentiate
 from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
 from pneuopt.plotting.fits import MOST_POINTS, Fitted
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import System, names, vector
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

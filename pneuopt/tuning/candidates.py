@@ -14,10 +14,10 @@ from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.metrics import About, Envelope, step_metrics
 from pneuopt.control.reference import Step, disturbing
+from pneuopt.dynamics.system import Linearisation
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import Linearisation
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]

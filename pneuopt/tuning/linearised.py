@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Rollout
 from pneuopt.control.means import TAIL
 from pneuopt.control.metrics import PERIODS_INSIDE
+from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.nlp.sqp import Groups, Point
 from pneuopt.requirements import ROBUSTNESS, Overshoot, SettlingTime, SteadyStateError, read
 from pneuopt.specification import Specification

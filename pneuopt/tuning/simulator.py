@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Rollout
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.control.robustness import robustness
+from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.dynamics.system import names
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import AT_LEAST, ROBUSTNESS, read
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.specification import Specification
-from pneuopt.system import names
 from pneuopt.tuning.candidates import (
     MOST_SUBSTEPS,
     POINTS_A_PERIOD,

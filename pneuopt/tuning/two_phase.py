@@ -18,6 +18,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_grid, sensitivity_terms
 from pneuopt.control.means import TAIL
 from pneuopt.control.reference import Step, disturbing
+from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
 from pneuopt.nlp.full_space import FullSpace, Problem, follow, prepare, solve_from
 from pneuopt.nlp.status import Solution
 from pneuopt.nlp.transcription import Cost, Limit, Phase, Transcription, Where, every
@@ -25,7 +26,6 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError, most, name
 from pneuopt.specification import Specification
-from pneuopt.system import DiscreteSystem, System, discretise, names
 from pneuopt.tuning.candidates import STABLE, Space, Tell, fastest, substeps
 
 Array = NDArray[np.float64]

@@ -8,13 +8,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Pieces
 from pneuopt.control.consumption import consumption, metered
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.metrics import About, Envelope, batch_metrics
 from pneuopt.control.reference import Step
-from pneuopt.runge_kutta import rk4
-from pneuopt.system import names
+from pneuopt.dynamics.compiled.rollout import Pieces
+from pneuopt.dynamics.runge_kutta import rk4
+from pneuopt.dynamics.system import names
 from pneuopt.tuning.candidates import MOST_READINGS
 from pneuopt.tuning.window import Window
 

@@ -12,6 +12,8 @@ from pneuopt.control.averaging import averaged, mean_start, ripple
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, define
 from pneuopt.models.catalog import r25
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
@@ -20,8 +22,6 @@ from pneuopt.models.valve import opening
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import System, define
 
 
 def dither(amplitude: float, frequency: float, unit: str = "1") -> ParameterSet:

@@ -9,13 +9,13 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.catalog import t32
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.requirements import AirUse, SettlingTime
-from pneuopt.simulate import simulate
 from pneuopt.specification import specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.simulator import Simulator

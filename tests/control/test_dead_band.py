@@ -10,6 +10,8 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import simulate_stick_slip
+from pneuopt.dynamics.system import System
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
@@ -18,9 +20,7 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.requirements import Overshoot, SettlingTime
-from pneuopt.simulate import simulate_stick_slip
 from pneuopt.specification import specify
-from pneuopt.system import System
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator

@@ -7,10 +7,10 @@ import pytest
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
 
 
 @pytest.mark.parametrize("frequency", [500.0, 600.0])

@@ -12,6 +12,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_response
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.system import System
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder
@@ -19,7 +20,6 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import Overshoot, SettlingTime
 from pneuopt.specification import specify
-from pneuopt.system import System
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator

@@ -9,11 +9,11 @@ from pneuopt.control.dither import Waveform
 from pneuopt.control.limit_cycle import find_limit_cycle
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
 
 Array = NDArray[np.float64]
 T = np.linspace(0.0, 4.0, 2001)

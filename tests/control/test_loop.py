@@ -11,9 +11,9 @@ from pneuopt.control.linear_loop import delayed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.margins import frequency_response
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.system import System, define
 from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.parameters import ParameterSet, Quantity
-from pneuopt.system import System, define
 
 Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 TUNED = {"pid.Kp": 0.225, "pid.Ki": 1.23, "pid.Kd": 0.01, "pid.Tf": 0.01}

@@ -11,7 +11,8 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import SensorLag
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.identify import identify, predict, validate
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
@@ -19,7 +20,6 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import LogError, ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
 GAINS = {"pid.Kp": 300.0, "pid.Ki": 2000.0, "pid.Kd": 1.0, "pid.Tf": 5e-3, "pid.lower": -60.0, "pid.upper": 60.0}

@@ -19,10 +19,10 @@ from pneuopt.control.margins import (
 )
 from pneuopt.control.pid import PID
 from pneuopt.control.robustness import _responses, robustness
+from pneuopt.dynamics.system import Linearisation, System
 from pneuopt.models.catalog import s32
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import ModelError
-from pneuopt.system import Linearisation, System
 
 
 def linearised(numerator: list[float], denominator: list[float]) -> Linearisation:

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.metrics import About, batch_metrics, step_metrics
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.system import System
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.system import System
 
 Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 T = np.linspace(0.0, 12.0, 2401)

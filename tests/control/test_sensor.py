@@ -10,6 +10,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.robustness import robustness
 from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.dynamics.system import define
 from pneuopt.instruments import Sensor
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
@@ -20,7 +21,6 @@ from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.rig import Rig
 from pneuopt.scenarios import Scenarios, corners
 from pneuopt.specification import specify
-from pneuopt.system import define
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed

@@ -10,11 +10,11 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
 from pneuopt.control.take_over import take_over
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
 
 OLD = {"pid.Kp": 200.0, "pid.Ki": 3000.0, "pid.Kd": 1.0, "pid.Tf": 0.01, "pid.b": 0.7, "pid.c": 1.0}
 NEW = {"pid.Kp": 350.0, "pid.Ki": 6000.0, "pid.Kd": 2.5, "pid.Tf": 0.02, "pid.b": 0.2, "pid.c": 0.0}

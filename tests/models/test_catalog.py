@@ -10,6 +10,8 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import Linearisation, vector
 from pneuopt.models import catalog
 from pneuopt.models.friction import Viscous
 from pneuopt.models.gas import CRITICAL_RATIO, IsentropicNozzle, Iso6358, Smoothing
@@ -18,8 +20,6 @@ from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import Spool
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import Linearisation, vector
 
 Array = NDArray[np.float64]
 K_S = 20.0  # [V s/m] transducer

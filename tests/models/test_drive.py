@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.load import Load
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import System, vector
 
 DRIVES: dict[str, System] = {
     "coulomb": ForceDrive(Coulomb()).system(),

@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.codegen import Pieces, Rollout
-from pneuopt.finders import Log, Start
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.system import DiscreteSystem, discretise, names, vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.friction_start import Rows, load_columns, misfit, motion
@@ -12,7 +13,6 @@ from pneuopt.models.load import Load
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Array, Trajectory
-from pneuopt.system import DiscreteSystem, discretise, names, vector
 
 TRUTH = {
     "load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0, "friction.static": 42.0,

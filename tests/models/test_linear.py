@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names, vector
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent
 from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder, delayed
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import DiscreteSystem, System, discretise, names, vector
 
 
 def transfer(system: System, values: dict[str, float], s: complex) -> complex:

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, names
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import System, names
 
 Array = NDArray[np.float64]
 

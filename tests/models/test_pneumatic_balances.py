@@ -6,6 +6,8 @@ import pytest
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.models.chamber import Polytropic, Thermal, blend
 from pneuopt.models.cylinder import Cylinder, areas, piston_leak
 from pneuopt.models.drive import part
@@ -15,8 +17,6 @@ from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.models.valve import Port
 from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import Symbols, System, define, names
 
 AREAS = np.pi / 4 * 0.032**2, np.pi / 4 * (0.032**2 - 0.012**2)
 

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, names, vector
 from pneuopt.models.chamber import Polytropic, Thermal
 from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
@@ -21,8 +23,6 @@ from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import System, names, vector
 
 Array = NDArray[np.float64]
 DRIVES = {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pneuopt as po
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
 from pneuopt.models.catalog import b32
 from pneuopt.models.chamber import Thermal
 from pneuopt.models.load import Load

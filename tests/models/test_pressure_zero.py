@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pneuopt as po
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
 from pneuopt.models.catalog import DriveSet, b32, s32, t32
 from pneuopt.quantities.trajectories import Trajectory
 

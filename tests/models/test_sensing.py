@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, names
 from pneuopt.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.catalog import b32
@@ -15,8 +17,6 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.models.sensing import coarse_delay, with_sensors
 from pneuopt.quantities.errors import UnknownNameError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import System, names
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
 NOISE = {"position": 2e-5, "speed": 1e-3}

@@ -7,13 +7,13 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
+from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.nlp.full_space import FullSpace, prepare, solve_from, solve_full_space
 from pneuopt.nlp.status import Code
 from pneuopt.nlp.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, every
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Array
-from pneuopt.system import DiscreteSystem, Symbols, define, discretise
 
 H = 0.02
 

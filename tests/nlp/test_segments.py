@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from pneuopt.dynamics.system import System, discretise
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre
 from pneuopt.models.load import Load
@@ -13,7 +14,6 @@ from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Array
-from pneuopt.system import System, discretise
 
 FREE = ("friction.coulomb", "load.mass")
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import integrate
 
-from pneuopt.codegen import compiled
-from pneuopt.guards import Contact
+from pneuopt.dynamics.compiled.rollout import compiled
+from pneuopt.dynamics.guards import Contact
+from pneuopt.dynamics.system import System, names
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import System, names
 
 Array = NDArray[np.float64]
 MOST_STEPS = 200_000

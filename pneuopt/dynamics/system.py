@@ -8,13 +8,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.codegen import Pieces
-from pneuopt.finders import Doubter, Log, RestFinder, Start, StartFinder
-from pneuopt.guards import Checker, Guard
+from pneuopt.dynamics.compiled.rollout import Pieces
+from pneuopt.dynamics.guards import Checker, Guard
+from pneuopt.dynamics.hooks import Doubter, Log, RestFinder, Start, StartFinder
+from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.quantities.errors import ConvergenceError, ModelError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.runge_kutta import rk4
 
 Array = NDArray[np.float64]
 Symbols = Mapping[str, ca.SX]

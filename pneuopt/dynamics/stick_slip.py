@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import integrate, optimize
 
-from pneuopt.codegen import compiled
-from pneuopt.integration import Record
+from pneuopt.dynamics.compiled.rollout import compiled
+from pneuopt.dynamics.smooth import Record
+from pneuopt.dynamics.system import DIRECTION, System, names
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.system import DIRECTION, System, names
 
 Array = NDArray[np.float64]
 MOST_EVENTS = 100_000

@@ -5,16 +5,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pneuopt import codegen, compiler
-from pneuopt.codegen import Pieces, Rollout, compiled
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled import rollout as codegen
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compiled
+from pneuopt.dynamics.system import DiscreteSystem, discretise, vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.trajectories import Array
-from pneuopt.system import DiscreteSystem, discretise, vector
 
 Forget = Callable[[], None]
 needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="no C compiler")

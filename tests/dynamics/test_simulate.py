@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from pneuopt.compiler import compiler
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.compiled.compiler import compiler
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, define
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
@@ -22,8 +24,6 @@ from pneuopt.models.paper2015 import paper_plant
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import simulate
-from pneuopt.system import System, define
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.compiler import build
-from pneuopt.kernels import prepare
+from pneuopt.dynamics.compiled.compiler import build
+from pneuopt.dynamics.compiled.pieces import prepare
 from pneuopt.quantities.errors import ModelError, require
 
 Array = NDArray[np.float64]

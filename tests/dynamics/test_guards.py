@@ -8,7 +8,9 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.guards import Contact, Guard
+from pneuopt.dynamics.guards import Contact, Guard
+from pneuopt.dynamics.simulate import contacts, simulate
+from pneuopt.dynamics.system import System, define, names
 from pneuopt.identify import identify
 from pneuopt.instruments import Sensor
 from pneuopt.logs.experiments import Experiment
@@ -22,8 +24,6 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.requirements import SettlingTime
 from pneuopt.rig import Rig, record
-from pneuopt.simulate import contacts, simulate
-from pneuopt.system import System, define, names
 from pneuopt.tune import tune
 
 DRIVE = PneumaticDrive()

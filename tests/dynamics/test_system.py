@@ -6,11 +6,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
-from pneuopt.finders import Log
+from pneuopt.dynamics.hooks import Log
+from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, discretise, vector
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Array, Trajectory
-from pneuopt.system import DiscreteSystem, Symbols, System, define, discretise, vector
 
 SPRING = ParameterSet(
     {"stiffness": Parameter(30.0, "N/m"), "damping": Parameter(2.0, "N*s/m"), "mass": Parameter(2.0, "kg")}

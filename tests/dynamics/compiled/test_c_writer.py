@@ -7,9 +7,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from pneuopt import compiler, emission
-from pneuopt.codegen import Pieces, Rollout
-from pneuopt.emission import Kernel, emit
+from pneuopt.dynamics.compiled import c_writer as emission
+from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled.c_writer import Kernel, emit
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 
 Array = NDArray[np.float64]
 needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="no C compiler")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import casadi as ca
 
-from pneuopt.compiler import say_once
-from pneuopt.emission import Kernel, emit
-from pneuopt.runge_kutta import rk4
+from pneuopt.dynamics.compiled.c_writer import Kernel, emit
+from pneuopt.dynamics.compiled.compiler import say_once
+from pneuopt.dynamics.runge_kutta import rk4
 
 HERE = Path(__file__).parent
 SAMPLED = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often the inputs of a piece change: see `emission.RATES`

@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from pneuopt.compiler import compiler
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.dynamics.compiled.compiler import compiler
+from pneuopt.dynamics.simulate import StickSlipResult, simulate, simulate_stick_slip
+from pneuopt.dynamics.stick_slip import EventKind
+from pneuopt.dynamics.system import DIRECTION, System, define
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
@@ -23,9 +26,6 @@ from pneuopt.models.pneumatic_drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.simulate import StickSlipResult, simulate, simulate_stick_slip
-from pneuopt.stick_slip import EventKind
-from pneuopt.system import DIRECTION, System, define
 
 Array = NDArray[np.float64]
 BREAK_AWAY, STANDSTILL, REVERSAL = EventKind

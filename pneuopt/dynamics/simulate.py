@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.codegen import compiled
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.guards import Contact
-from pneuopt.integration import Run, Smooth, Watch
+from pneuopt.dynamics.compiled.rollout import compiled
+from pneuopt.dynamics.guards import Contact
+from pneuopt.dynamics.smooth import Run, Smooth, Watch
+from pneuopt.dynamics.stick_slip import Event, StickSlip
+from pneuopt.dynamics.system import DIRECTION, System, names, vector
 from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_known, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.stick_slip import Event, StickSlip
-from pneuopt.system import DIRECTION, System, names, vector
 
 Array = NDArray[np.float64]
 Update = Callable[..., tuple[Array, ...]]
