@@ -34,8 +34,6 @@ from pneuopt.identifiability import Verdict, identifiability
 from pneuopt.identify import IdentificationResult, identify, predict, validate
 from pneuopt.instruments import Actuator, Sensor
 from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
-from pneuopt.models.chamber import Polytropic, Thermal
-from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import (
     Asymmetric,
@@ -46,13 +44,15 @@ from pneuopt.models.friction import (
     Viscous,
     friction_ladder,
 )
-from pneuopt.models.gas import IsentropicNozzle, Iso6358
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
+from pneuopt.models.pneumatic.cylinder import Cylinder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.gas import IsentropicNozzle, Iso6358
+from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.models.sensing import coarse_delay, with_sensors
-from pneuopt.models.valve import ProportionalValve, Spool
 from pneuopt.nlp.full_space import FullSpace
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.pareto import pareto_front

@@ -11,11 +11,14 @@ import tomlkit
 
 from pneuopt.dynamics.system import System
 from pneuopt.logs.experiments import CHANNELS
-from pneuopt.models.chamber import ChamberModel, Polytropic, Thermal
-from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.gas import (
+from pneuopt.models.linear import SPEED, VALVE_VOLTAGE, FirstOrder, Integrator, SecondOrder
+from pneuopt.models.load import Load
+from pneuopt.models.pneumatic.chamber import ChamberModel, Polytropic, Thermal
+from pneuopt.models.pneumatic.cylinder import Cylinder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.gas import (
     CRITICAL_RATIO,
     FlowLaw,
     IsentropicNozzle,
@@ -23,10 +26,7 @@ from pneuopt.models.gas import (
     Smoothing,
     conductance_of_nominal_flow,
 )
-from pneuopt.models.linear import SPEED, VALVE_VOLTAGE, FirstOrder, Integrator, SecondOrder
-from pneuopt.models.load import Load
-from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.models.valve import ProportionalValve, Spool
+from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import HardwareError, InputError, UnitError, UnknownNameError, check_known, require
 from pneuopt.quantities.output import plain, write_text

@@ -24,7 +24,7 @@ import pneuopt as po
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compiled
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, stacked, vector
 from pneuopt.models.catalog import b32
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.parameters import Quantity
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from claims import Claim, arguments, finish, frame
 import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.models.drive import ForceDrive
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.statistics import correlation
 
 if TYPE_CHECKING:

@@ -27,7 +27,6 @@ from scipy import optimize, signal
 
 from pneuopt.dynamics.system import names, vector
 from pneuopt.models.catalog import DriveSet, r25
-from pneuopt.models.gas import CRITICAL_RATIO, REFERENCE_DENSITY, Smoothing
 from pneuopt.models.paper2015 import (
     KAPPA,
     PRINTED,
@@ -42,6 +41,7 @@ from pneuopt.models.paper2015 import (
     spool_gain,
     third_order,
 )
+from pneuopt.models.pneumatic.gas import CRITICAL_RATIO, REFERENCE_DENSITY, Smoothing
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import pneuopt as po
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.models.catalog import DriveSet, r25
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.valve import Spool
+from pneuopt.models.pneumatic.valve import Spool
 
 Array = NDArray[np.float64]
 TRANSDUCER = 20.0  # [V s/m] K_s

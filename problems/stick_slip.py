@@ -18,7 +18,7 @@ from claims import Claim, arguments, finish, frame
 import pneuopt as po
 from pneuopt.dynamics.simulate import StickSlipResult
 from pneuopt.dynamics.stick_slip import EventKind
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 
 if TYPE_CHECKING:

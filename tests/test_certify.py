@@ -17,7 +17,7 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import Load
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.nlp.status import Code
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet

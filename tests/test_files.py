@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files import read_drive, read_status, write_fit
 from pneuopt.identifiability import Verdict
-from pneuopt.models.chamber import Polytropic, Thermal
-from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.gas import IsentropicNozzle, Smoothing
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
-from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.models.valve import ProportionalValve, Spool
+from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
+from pneuopt.models.pneumatic.cylinder import Cylinder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing
+from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet

@@ -18,7 +18,7 @@ from pneuopt.logs.experiments import Experiment, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.plotting import (
     Response,
     friction_force,

@@ -21,7 +21,7 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory

@@ -26,7 +26,7 @@ from pneuopt.identify import IdentificationResult, identify, predict, validate
 from pneuopt.logs.experiments import Experiment, read_log, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import friction_ladder
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.plotting import (
     has_friction_map,

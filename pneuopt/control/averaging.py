@@ -75,7 +75,7 @@ def averaged(
     --------
     A dead zone of 0.2 under a sine of 0.4 passes (2/pi) acos(0.2/0.4) = 2/3 of the slope:
 
-    >>> from pneuopt.models.valve import opening
+    >>> from pneuopt.models.pneumatic.valve import opening
     >>> from pneuopt.quantities.parameters import Quantity
     >>> x, u = Quantity("level", "1"), Quantity("spool", "1")
     >>> edge = {"dead_zone": 0.2, "rounding": 0.02, "leak": 0.0}

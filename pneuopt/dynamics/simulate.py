@@ -155,7 +155,7 @@ def contacts(trajectory: Trajectory, model: System | ClosedLoop, parameters: Par
 
     Examples
     --------
-    >>> from pneuopt.models.pneumatic_drive import PneumaticDrive
+    >>> from pneuopt.models.pneumatic.drive import PneumaticDrive
     >>> drive = PneumaticDrive().system()
     >>> run = Trajectory([0.0, 0.1], {q.name: [q.nominal, q.nominal] for q in drive.states})
     >>> run = run.with_columns({"position": [0.18, 0.22]})

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from math import pi
 
-from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
-from pneuopt.models.gas import IsentropicNozzle, Smoothing, conductance_of_area
-from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.models.valve import ProportionalValve, Spool
+from pneuopt.models.pneumatic.cylinder import Cylinder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing, conductance_of_area
+from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.parameters import ParameterSet
 
 DriveSet = tuple[PneumaticDrive, ParameterSet]

@@ -7,8 +7,8 @@ import casadi as ca
 
 from pneuopt.dynamics.system import System, define
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.friction_start import force_starts, motion_starts
 from pneuopt.models.load import Load
+from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]

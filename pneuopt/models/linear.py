@@ -14,7 +14,7 @@ import casadi as ca
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, names
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.linear_starts import LinearStarts, Polynomials, Shape
+from pneuopt.models.starts.linear import LinearStarts, Polynomials, Shape
 from pneuopt.quantities.errors import ModelError, check_known, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 

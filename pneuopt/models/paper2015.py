@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from pneuopt.dynamics.system import System
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import SecondOrder
-from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.models.valve import Spool
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.valve import Spool
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 

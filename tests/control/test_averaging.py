@@ -18,7 +18,7 @@ from pneuopt.models.catalog import r25
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.models.valve import opening
+from pneuopt.models.pneumatic.valve import opening
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory

@@ -15,7 +15,7 @@ from pneuopt.instruments import Sensor
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.rig import Rig

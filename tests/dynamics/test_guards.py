@@ -14,11 +14,11 @@ from pneuopt.dynamics.system import System, define, names
 from pneuopt.identify import identify
 from pneuopt.instruments import Sensor
 from pneuopt.logs.experiments import Experiment
-from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.cylinder import Cylinder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory

@@ -14,10 +14,10 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Linearisation, vector
 from pneuopt.models import catalog
 from pneuopt.models.friction import Viscous
-from pneuopt.models.gas import CRITICAL_RATIO, IsentropicNozzle, Iso6358, Smoothing
 from pneuopt.models.paper2015 import OperatingPoint, second_order
-from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.models.valve import Spool
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.gas import CRITICAL_RATIO, IsentropicNozzle, Iso6358, Smoothing
+from pneuopt.models.pneumatic.valve import Spool
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 

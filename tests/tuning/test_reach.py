@@ -15,7 +15,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder, Integrator
-from pneuopt.models.pneumatic_drive import PneumaticDrive
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import (

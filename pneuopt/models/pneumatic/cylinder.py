@@ -9,7 +9,7 @@ from math import pi
 
 import casadi as ca
 
-from pneuopt.models.gas import REFERENCE_PRESSURE
+from pneuopt.models.pneumatic.gas import REFERENCE_PRESSURE
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 Symbols = Mapping[str, ca.SX]

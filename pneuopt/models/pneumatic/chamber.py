@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 import casadi as ca
 
-from pneuopt.models.gas import ISENTROPIC
+from pneuopt.models.pneumatic.gas import ISENTROPIC
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from pneuopt.models.chamber import VACUUM
+from pneuopt.models.pneumatic.chamber import VACUUM
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 

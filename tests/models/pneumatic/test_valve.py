@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.models.gas import REFERENCE_DENSITY, IsentropicNozzle
-from pneuopt.models.valve import Port, ProportionalValve, Spool, opening
+from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, IsentropicNozzle
+from pneuopt.models.pneumatic.valve import Port, ProportionalValve, Spool, opening
 
 VALVE = ProportionalValve()
 NUMBERS = {n: q.value for n, q in VALVE.parameters.items()}

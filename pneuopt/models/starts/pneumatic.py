@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import System
-from pneuopt.models.following import PRESSURES, Follower
-from pneuopt.models.friction_start import Rows, candidates, filtered, load_columns, misfit, motion, named
-from pneuopt.models.gas import REFERENCE_DENSITY
+from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
+from pneuopt.models.starts.following import PRESSURES, Follower
+from pneuopt.models.starts.friction import Rows, candidates, filtered, load_columns, misfit, motion, named
 from pneuopt.quantities.parameters import ParameterSet
 
 Array = NDArray[np.float64]

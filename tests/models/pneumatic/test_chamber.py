@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.models.chamber import ChamberModel, Inflow, Polytropic, Surroundings, Thermal, blend
+from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings, Thermal, blend
 
 R, T, V = 287.05, 293.15, 2e-4
 flow = st.floats(-0.01, 0.01)

@@ -8,8 +8,8 @@ import pytest
 import pneuopt as po
 from pneuopt.dynamics.hooks import Log
 from pneuopt.models.catalog import b32
-from pneuopt.models.chamber import Thermal
 from pneuopt.models.load import Load
+from pneuopt.models.pneumatic.chamber import Thermal
 
 ALL = ("valve_voltage", "position", "pressure_a", "pressure_b")
 

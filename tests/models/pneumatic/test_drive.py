@@ -12,14 +12,14 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names, vector
-from pneuopt.models.chamber import Polytropic, Thermal
-from pneuopt.models.cylinder import Cylinder
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.gas import IsentropicNozzle
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
-from pneuopt.models.pneumatic_drive import PneumaticDrive
-from pneuopt.models.valve import ProportionalValve, Spool
+from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
+from pneuopt.models.pneumatic.cylinder import Cylinder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.pneumatic.gas import IsentropicNozzle
+from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory

@@ -7,8 +7,8 @@ import pytest
 
 import pneuopt as po
 from pneuopt.models.catalog import b32
-from pneuopt.models.chamber import Thermal
-from pneuopt.models.following import Follower
+from pneuopt.models.pneumatic.chamber import Thermal
+from pneuopt.models.starts.following import Follower
 
 Truth = tuple[po.System, po.ParameterSet, po.Trajectory]
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pneuopt.models.gas import (
+from pneuopt.models.pneumatic.gas import (
     CRITICAL_RATIO,
     GAS_CONSTANT,
     REFERENCE_DENSITY,

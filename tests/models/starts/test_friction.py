@@ -8,8 +8,8 @@ from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import DiscreteSystem, discretise, names, vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
-from pneuopt.models.friction_start import Rows, load_columns, misfit, motion
 from pneuopt.models.load import Load
+from pneuopt.models.starts.friction import Rows, load_columns, misfit, motion
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Array, Trajectory

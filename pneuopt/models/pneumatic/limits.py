@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.guards import Guard
-from pneuopt.models.chamber import VACUUM
-from pneuopt.models.cylinder import STOP_ROUNDING
+from pneuopt.models.pneumatic.chamber import VACUUM
+from pneuopt.models.pneumatic.cylinder import STOP_ROUNDING
 from pneuopt.quantities.errors import HardwareError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value

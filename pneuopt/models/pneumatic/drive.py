@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from pneuopt.dynamics.hooks import Doubter, Log, Rest
 from pneuopt.dynamics.system import System, define, names, stacked, symbols, vector
-from pneuopt.models.chamber import ChamberModel, Inflow, Polytropic, Surroundings
-from pneuopt.models.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.drive import AMBIENT, POSITION, SPEED, gauge, part, renamed
 from pneuopt.models.friction import FrictionModel, Stribeck
-from pneuopt.models.gas import GAS_CONSTANT
-from pneuopt.models.hardware import check_hardware, check_start, guards, stray
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import Load
-from pneuopt.models.pneumatic_rest import BALANCED, Glide, steady
-from pneuopt.models.pneumatic_start import PneumaticStarts
-from pneuopt.models.pressure_zero import PressureZeros
-from pneuopt.models.valve import Flows, Port, ProportionalValve
+from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings
+from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
+from pneuopt.models.pneumatic.gas import GAS_CONSTANT
+from pneuopt.models.pneumatic.limits import check_hardware, check_start, guards, stray
+from pneuopt.models.pneumatic.rest import BALANCED, Glide, steady
+from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve
+from pneuopt.models.starts.pneumatic import PneumaticStarts
+from pneuopt.models.starts.pressure_zero import PressureZeros
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory

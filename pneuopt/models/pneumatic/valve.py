@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from pneuopt.models.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
+from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 Symbols = Mapping[str, ca.SX]

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.hooks import Log
-from pneuopt.models.following import PRESSURES
-from pneuopt.models.friction_start import filtered
-from pneuopt.models.pneumatic_start import SHAPES, Run
+from pneuopt.models.starts.following import PRESSURES
+from pneuopt.models.starts.friction import filtered
+from pneuopt.models.starts.pneumatic import SHAPES, Run
 from pneuopt.quantities.units import ATMOSPHERE
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from pneuopt.dynamics.hooks import Log
 from pneuopt.models.catalog import DriveSet, b32, s32, t32
 from pneuopt.quantities.trajectories import Trajectory
 
-DATA = Path(__file__).parents[2] / "data"
+DATA = Path(__file__).parents[3] / "data"
 ATMOSPHERE = 101325.0
 BOTH = ("pressure_a", "pressure_b")
 SETS: dict[str, tuple[Callable[[], DriveSet], float, float]] = {  # opening, and its frequency [Hz]

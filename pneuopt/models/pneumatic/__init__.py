@@ -1,0 +1,1 @@
+"""The pneumatic drive and its parts."""

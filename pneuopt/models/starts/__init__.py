@@ -1,0 +1,1 @@
+"""How each plant starts from a log."""
