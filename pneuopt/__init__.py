@@ -67,7 +67,7 @@ _HOME = {
         "to_series",
         "to_standard",
     ),
-    "pneuopt.control.take_over": ("take_over",),
+    "pneuopt.control.bumpless": ("take_over",),
     "pneuopt.control.reference": ("Step",),
     "pneuopt.control.sensor": ("Encoder", "SensorLag"),
     "pneuopt.control.loop": ("ClosedLoop",),

@@ -3,6 +3,7 @@
 from pneuopt.certify import evaluate, respond
 from pneuopt.comparison import LogComparison, compare_logs
 from pneuopt.control.averaging import averaged, mean_start, ripple
+from pneuopt.control.bumpless import take_over
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import (
@@ -23,7 +24,6 @@ from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
-from pneuopt.control.take_over import take_over
 from pneuopt.derived import Derived, derived
 from pneuopt.dithering import DitherVerdict, dither_effect, judge_dither
 from pneuopt.dynamics.simulate import contacts, simulate, simulate_stick_slip

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from pneuopt.control.bumpless import take_over
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
-from pneuopt.control.take_over import take_over
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
