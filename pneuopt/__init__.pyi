@@ -53,8 +53,6 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Iso6358
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.models.sensing import coarse_delay, with_sensors
-from pneuopt.nlp.full_space import FullSpace
-from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.pareto import pareto_front
 from pneuopt.plotting import (
     plot_bode,
@@ -95,6 +93,8 @@ from pneuopt.reweighting import Huber, SoftL1
 from pneuopt.rig import Rig, record
 from pneuopt.scenarios import corners, draws, samples, tolerances
 from pneuopt.selection import ModelSelection, select_model
+from pneuopt.shooting.full_space import FullSpace
+from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.study import grid, sweep
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.condensed import Condensed

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.requirements import AT_LEAST, Requirement, bound, most, name, read, shown, told
 from pneuopt.scenarios import Scenarios
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.relaxation import sentence

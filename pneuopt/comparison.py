@@ -12,10 +12,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
 from pneuopt.identify import IdentificationResult, identify
 from pneuopt.logs.experiments import Experiment
-from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.posing import as_logged
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
     import pandas as pd

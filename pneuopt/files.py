@@ -27,11 +27,11 @@ from pneuopt.models.pneumatic.gas import (
     conductance_of_nominal_flow,
 )
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
-from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import HardwareError, InputError, UnitError, UnknownNameError, check_known, require
 from pneuopt.quantities.output import plain, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import read_value
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.tomlfile import Places, inline_table, read_parameter, read_toml, toml_table, write_parameter
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import System
 from pneuopt.excitation import missing, motion, remedy
 from pneuopt.logs.experiments import Experiment
-from pneuopt.nlp.least_squares import STIFFEST, LeastSquares
-from pneuopt.nlp.segments import Segments, segment, start_nodes, substeps_for
 from pneuopt.posing import Problem, as_logged
 from pneuopt.profiles import Profile
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.shooting.least_squares import STIFFEST, LeastSquares
+from pneuopt.shooting.segments import Segments, segment, start_nodes, substeps_for
 
 if TYPE_CHECKING:
     import pandas as pd

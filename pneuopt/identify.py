@@ -16,9 +16,6 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System, names
 from pneuopt.identifiability import Verdict
 from pneuopt.logs.experiments import Experiment
-from pneuopt.nlp.judge import NOISE_LEVEL
-from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
-from pneuopt.nlp.status import Code, Status
 from pneuopt.posing import Model, Problem, as_logged, conditioned, free_run
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
@@ -26,6 +23,9 @@ from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.reweighting import Loss, Refit, fitted, white_squares
 from pneuopt.scrutiny import scrutinised
+from pneuopt.shooting.convergence import NOISE_LEVEL
+from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.starting import attempts
 from pneuopt.statistics import agreement, confidence_interval, correlation_time, cross_correlation, ljung_box
 

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from pneuopt.certificate import Found, TuningResult
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.nlp.status import Code, Solution, Status
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import Requirement, bound, bounded, most, name, shown
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.search import Method, Search, brief, ended_in
+from pneuopt.shooting.solution import Code, Solution, Status
 from pneuopt.specification import Specification, allowing
 from pneuopt.tune import pose
 from pneuopt.tuning.candidates import Tell

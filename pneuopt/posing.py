@@ -14,11 +14,11 @@ from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
 from pneuopt.logs.experiments import Experiment
-from pneuopt.nlp.least_squares import LeastSquares
-from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, every
 
 Array = NDArray[np.float64]
 Model = System | LoggedLoop

@@ -13,11 +13,11 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import System, names
 from pneuopt.logs.experiments import Experiment
-from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 from pneuopt.posing import Problem, as_logged
 from pneuopt.quantities.errors import check_known, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pneuopt.checks import measured_outputs
 from pneuopt.dynamics.hooks import Start
 from pneuopt.logs.experiments import Experiment
-from pneuopt.nlp.judge import NOISE_LEVEL
-from pneuopt.nlp.least_squares import Fit, LeastSquares, solve_least_squares
-from pneuopt.nlp.status import Code, Status
 from pneuopt.posing import Problem
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.convergence import NOISE_LEVEL
+from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.silence import WARM_STAGES, solved
 from pneuopt.statistics import noise_level
 

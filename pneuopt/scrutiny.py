@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pneuopt.checks import measured_outputs
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identifiability import Verdict, expected, from_covariance, listed
-from pneuopt.nlp.equations import gaps_of
-from pneuopt.nlp.judge import NOISE_LEVEL
-from pneuopt.nlp.segments import segment, start_nodes
-from pneuopt.nlp.status import Code, Status
 from pneuopt.posing import Problem
 from pneuopt.profiles import Profile, traced
+from pneuopt.shooting.convergence import NOISE_LEVEL
+from pneuopt.shooting.equations import gaps_of
+from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.solution import Code, Status
 
 if TYPE_CHECKING:
     import pandas as pd

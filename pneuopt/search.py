@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.certificate import GRAZING, Found, Notary, TuningResult, missing, with_relaxations
-from pneuopt.nlp.status import Code, Status
 from pneuopt.requirements import most, name, told
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.condensed import Condensed, condense

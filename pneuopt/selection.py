@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from pneuopt.dynamics.system import System, names
 from pneuopt.identify import IdentificationResult, identify, validate
 from pneuopt.logs.experiments import Experiment
-from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.scrutiny import AT_BOUND, NOT_TOLD
+from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.statistics import bayes_information, likelihood_ratio_p
 
 if TYPE_CHECKING:

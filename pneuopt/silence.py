@@ -9,9 +9,9 @@ from dataclasses import replace
 from scipy.stats import chi2
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.nlp.least_squares import Fit, solve_least_squares
-from pneuopt.nlp.status import Code
 from pneuopt.posing import Problem
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
+from pneuopt.shooting.solution import Code
 
 WARM_STAGES = 3  # of the method's last, for a refit starts near its answer
 LEVEL = 0.95  # of confidence at which the logs may refuse a given value

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import names
-from pneuopt.nlp.least_squares import Fit, solve_least_squares
-from pneuopt.nlp.status import Code
 from pneuopt.posing import Problem
+from pneuopt.shooting.least_squares import Fit, solve_least_squares
+from pneuopt.shooting.solution import Code
 
 HELD_STAGES = 3  # of the search; tighter gaps would force a wrong guess on the log
 HELD = 1e-9  # relative width of the bounds that hold a guess: the compiled equations stay those of the search

@@ -15,12 +15,12 @@ from pneuopt.checks import check_smooth
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.nlp.status import Code
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import PeakControl, Requirement
 from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.search import Method, Search, relax
+from pneuopt.shooting.solution import Code
 from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space, Tell, span
 from pneuopt.tuning.cases import cases

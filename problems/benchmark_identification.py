@@ -31,10 +31,10 @@ from scipy.optimize import least_squares
 import pneuopt as po
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.models.catalog import b32
-from pneuopt.nlp.full_space import FullSpace, solve_full_space
-from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.posing import Problem
 from pneuopt.quantities.trajectories import Array
+from pneuopt.shooting.full_space import FullSpace, solve_full_space
+from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
     import pandas as pd

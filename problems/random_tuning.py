@@ -25,8 +25,8 @@ from claims import Claim, arguments, finish, frame
 from random_problems import problem
 
 import pneuopt as po
-from pneuopt.nlp.status import Code
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
+from pneuopt.shooting.solution import Code
 
 if TYPE_CHECKING:
     import pandas as pd

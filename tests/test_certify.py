@@ -18,11 +18,11 @@ from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.nlp.status import Code
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import IAE
 from pneuopt.rig import Rig
+from pneuopt.shooting.solution import Code
 from pneuopt.tune import tune
 from pneuopt.tuning.screening import Screening
 

@@ -19,8 +19,8 @@ from pneuopt.files import read_drive, read_status
 from pneuopt.logs.experiments import read_log
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.nlp.least_squares import LeastSquares
-from pneuopt.nlp.status import Code, Status
+from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.tomlfile import read_toml
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuningfile import read_tuning

@@ -23,10 +23,10 @@ from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
-from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.tomlfile import read_toml
 
 AXIS = """# my axis, 2024

@@ -15,11 +15,11 @@ from pneuopt.identify import IdentificationResult, identify, predict, validate
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
-from pneuopt.nlp.least_squares import LeastSquares
-from pneuopt.nlp.status import Code
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.shooting.solution import Code
 
 TRUTH = {
     "load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0, "friction.static": 42.0,

@@ -15,9 +15,9 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder
-from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.tuningfile import read_tuning, write_tuned
 
 PLANT = SecondOrder().system()

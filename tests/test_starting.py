@@ -15,12 +15,12 @@ from pneuopt.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
-from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
-from pneuopt.nlp.status import Code
-from pneuopt.nlp.transcription import Transcription
 from pneuopt.posing import Problem
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.solution import Code
+from pneuopt.shooting.transcription import Transcription
 
 VELOCITY = "friction.stribeck_velocity"
 TRUTH = {"friction.coulomb": 30.0, "friction.static": 42.0, VELOCITY: 0.012, "friction.viscous": 60.0}

@@ -16,7 +16,6 @@ from pneuopt.files import read_status
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, PressureDependent
 from pneuopt.models.linear import SecondOrder
-from pneuopt.nlp.status import Code, Status
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import (
@@ -38,6 +37,7 @@ from pneuopt.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
+from pneuopt.shooting.solution import Code, Status
 from pneuopt.tomlfile import read_toml
 from pneuopt.tuningfile import Tuning, read_tuning, write_tuned
 

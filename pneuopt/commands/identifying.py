@@ -27,7 +27,6 @@ from pneuopt.logs.experiments import Experiment, read_log, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import friction_ladder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.nlp.least_squares import LeastSquares
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,
@@ -40,6 +39,7 @@ from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.selection import select_model
+from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -38,12 +38,12 @@ from pneuopt.control.reference import Step
 from pneuopt.dithering import judge_dither
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.fresh_plants import DesignValidation, validate_design
-from pneuopt.nlp.status import Code
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.output import check_outputs, records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.solution import Code
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import cut
 from pneuopt.tuningfile import Tuning, write_tuned

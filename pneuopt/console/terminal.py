@@ -12,8 +12,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from pneuopt.nlp.least_squares import Progress as Tell
-from pneuopt.nlp.status import Status
+from pneuopt.shooting.least_squares import Progress as Tell
+from pneuopt.shooting.solution import Status
 
 
 def screen(*, error: bool = False) -> Console:

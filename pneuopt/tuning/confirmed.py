@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.nlp.full_space import FullSpace, prepare, solve_from
-from pneuopt.nlp.status import Solution
 from pneuopt.quantities.errors import require
+from pneuopt.shooting.full_space import FullSpace, prepare, solve_from
+from pneuopt.shooting.solution import Solution
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.condensed import Condensed
@@ -114,7 +114,7 @@ def told(solution: Solution, before: float, after: float) -> str:
 
     Examples
     --------
-    >>> from pneuopt.nlp.status import Code, Status
+    >>> from pneuopt.shooting.solution import Code, Status
     >>> from types import SimpleNamespace
     >>> done = SimpleNamespace(status=Status(Code.CONVERGED), stats={"cost": 0.2, "iterations": 8.0})
     >>> told(done, 0.21, 0.2)

@@ -19,12 +19,12 @@ from pneuopt.control.margins import frequency_grid, sensitivity_terms
 from pneuopt.control.means import TAIL
 from pneuopt.control.reference import Step, disturbing
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
-from pneuopt.nlp.full_space import FullSpace, Problem, follow, prepare, solve_from
-from pneuopt.nlp.status import Solution
-from pneuopt.nlp.transcription import Cost, Limit, Phase, Transcription, Where, every
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError, most, name
+from pneuopt.shooting.full_space import FullSpace, Problem, follow, prepare, solve_from
+from pneuopt.shooting.solution import Solution
+from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, every
 from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import STABLE, Space, Tell, fastest, substeps
 

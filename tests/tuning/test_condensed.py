@@ -13,7 +13,6 @@ from pneuopt.control.reference import Step
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
-from pneuopt.nlp.status import Code
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import (
@@ -36,6 +35,7 @@ from pneuopt.requirements import (
     StepEnvelope,
 )
 from pneuopt.scenarios import Scenarios, corners, tolerances
+from pneuopt.shooting.solution import Code
 from pneuopt.specification import specify
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import span

@@ -15,7 +15,6 @@ from pneuopt.control.reference import Step
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.nlp.status import Code
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import (
@@ -39,6 +38,7 @@ from pneuopt.requirements import (
     name,
     read,
 )
+from pneuopt.shooting.solution import Code
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.two_phase import TwoPhase

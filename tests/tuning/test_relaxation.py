@@ -11,9 +11,9 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.nlp.status import Code
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.requirements import GainMargin, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
+from pneuopt.shooting.solution import Code
 from pneuopt.specification import specify
 from pneuopt.tune import Method, TuningResult, tune
 from pneuopt.tuning.candidates import span

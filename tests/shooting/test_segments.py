@@ -8,12 +8,12 @@ from pneuopt.dynamics.system import System, discretise
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre
 from pneuopt.models.load import Load
-from pneuopt.nlp.equations import normal_equations
-from pneuopt.nlp.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
-from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Array
+from pneuopt.shooting.equations import normal_equations
+from pneuopt.shooting.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, every
 
 FREE = ("friction.coulomb", "load.mass")
 

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.nlp.arrow import Reduced, scaled_inverse
-from pneuopt.nlp.equations import Equations, unexplained
-from pneuopt.nlp.space import Space
-from pneuopt.nlp.status import Code, Status
+from pneuopt.shooting.arrow import Reduced, scaled_inverse
+from pneuopt.shooting.equations import Equations, unexplained
+from pneuopt.shooting.scaling import Space
+from pneuopt.shooting.solution import Code, Status
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

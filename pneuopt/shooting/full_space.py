@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import names
-from pneuopt.nlp.graph import Graph, Rows, flatten, node_guesses, scale, to_unknowns, to_values, variable_bounds
-from pneuopt.nlp.status import Code, Solution, Status
-from pneuopt.nlp.transcription import Transcription
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.graph import Graph, Rows, flatten, node_guesses, scale, to_unknowns, to_values, variable_bounds
+from pneuopt.shooting.solution import Code, Solution, Status
+from pneuopt.shooting.transcription import Transcription
 
 Array = NDArray[np.float64]
 EXPANDED = 200_000  # scalar operations up to which flattening the whole graph to scalars pays

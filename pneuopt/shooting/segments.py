@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Gram, Rollout, Run
 from pneuopt.dynamics.system import DiscreteSystem, names
-from pneuopt.nlp.transcription import Phase, Residuals, Transcription
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

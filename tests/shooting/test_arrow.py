@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from pneuopt.nlp.arrow import STATE_FLOOR, Arrow, indistinct, scaled_inverse
 from pneuopt.quantities.trajectories import Array
+from pneuopt.shooting.arrow import STATE_FLOOR, Arrow, indistinct, scaled_inverse
 
 
 def random_problem(m: int, n: int, k: int, seed: int, spread: float = 1.0) -> tuple[Arrow, Array, Array]:

@@ -7,9 +7,9 @@ import pytest
 from pneuopt.dynamics.system import discretise
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
-from pneuopt.nlp.transcription import Cost, Phase, Residuals, Transcription, Where, every, phases_of
 from pneuopt.quantities.errors import ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.shooting.transcription import Cost, Phase, Residuals, Transcription, Where, every, phases_of
 
 DRIVE = ForceDrive(Coulomb()).system()
 

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Run
-from pneuopt.nlp.arrow import Reduced, Step
-from pneuopt.nlp.equations import Equations, normal_equations, reconnected, weighed
-from pneuopt.nlp.judge import MOST_GAP_SHARE, NOISE_LEVEL, Judgement, judged
-from pneuopt.nlp.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
-from pneuopt.nlp.space import Space
-from pneuopt.nlp.status import Code, Solution, Status
-from pneuopt.nlp.transcription import Transcription
+from pneuopt.shooting.arrow import Reduced, Step
+from pneuopt.shooting.convergence import MOST_GAP_SHARE, NOISE_LEVEL, Judgement, judged
+from pneuopt.shooting.equations import Equations, normal_equations, reconnected, weighed
+from pneuopt.shooting.scaling import Space
+from pneuopt.shooting.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
+from pneuopt.shooting.solution import Code, Solution, Status
+from pneuopt.shooting.transcription import Transcription
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

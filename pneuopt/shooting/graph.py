@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import names
-from pneuopt.nlp.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, phases_of
 from pneuopt.quantities.parameters import Parameter
+from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, phases_of
 
 Array = NDArray[np.float64]
 Values = TypeVar("Values", NDArray[np.float64], ca.MX)

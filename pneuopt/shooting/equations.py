@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
-from pneuopt.nlp.arrow import ROUNDING, Arrow, Reduced, indistinct, scaled_inverse
-from pneuopt.nlp.segments import Correction, Segments
+from pneuopt.shooting.arrow import ROUNDING, Arrow, Reduced, indistinct, scaled_inverse
+from pneuopt.shooting.segments import Correction, Segments
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -8,12 +8,12 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
-from pneuopt.nlp.full_space import FullSpace, prepare, solve_from, solve_full_space
-from pneuopt.nlp.status import Code
-from pneuopt.nlp.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, every
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Array
+from pneuopt.shooting.full_space import FullSpace, prepare, solve_from, solve_full_space
+from pneuopt.shooting.solution import Code
+from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, every
 
 H = 0.02
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.nlp.arrow import Reduced
-from pneuopt.nlp.equations import Equations
-from pneuopt.nlp.transcription import Transcription
+from pneuopt.shooting.arrow import Reduced
+from pneuopt.shooting.equations import Equations
+from pneuopt.shooting.transcription import Transcription
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

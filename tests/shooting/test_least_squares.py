@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, least_squares
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
-from pneuopt.nlp.full_space import solve_full_space
-from pneuopt.nlp.least_squares import Fit, LeastSquares, Stage, solve_least_squares
-from pneuopt.nlp.status import Code
-from pneuopt.nlp.transcription import Phase, Residuals, Transcription, every
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Array
+from pneuopt.shooting.full_space import solve_full_space
+from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.solution import Code
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, every
 
 H = 0.02
 NOISE, FINE_NOISE = 1e-3, 5e-6
