@@ -1,6 +1,5 @@
 """Types of the names that `__init__.py` loads lazily."""
 
-from pneuopt.certify import evaluate, respond
 from pneuopt.comparison import LogComparison, compare_logs
 from pneuopt.control.averaging import averaged, mean_start, ripple
 from pneuopt.control.bumpless import take_over
@@ -17,22 +16,44 @@ from pneuopt.control.forms import (
     to_series,
     to_standard,
 )
-from pneuopt.control.limit_cycle import LimitCycle, find_limit_cycle
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import margins
-from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.derived import Derived, derived
-from pneuopt.dithering import DitherVerdict, dither_effect, judge_dither
 from pneuopt.dynamics.simulate import contacts, simulate, simulate_stick_slip
 from pneuopt.dynamics.system import DiscreteSystem, System, define, discretise
+from pneuopt.evaluation.dither_verdict import DitherVerdict, dither_effect, judge_dither
+from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.instruments import Actuator, Sensor
+from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
+from pneuopt.evaluation.margins import margins
+from pneuopt.evaluation.metrics import step_metrics
+from pneuopt.evaluation.requirements import (
+    IAE,
+    ISE,
+    ITAE,
+    AirUse,
+    ControlRate,
+    GainMargin,
+    MaxComplementarySensitivity,
+    MaxSensitivity,
+    NoiseGain,
+    Overshoot,
+    PeakControl,
+    PhaseMargin,
+    Ripple,
+    RiseTime,
+    SettlingTime,
+    SteadyStateError,
+    StepEnvelope,
+)
+from pneuopt.evaluation.rig import Rig, record
+from pneuopt.evaluation.scenarios import corners, draws, samples, tolerances
 from pneuopt.files import read_drive, write_fit
 from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.identifiability import Verdict, identifiability
 from pneuopt.identify import IdentificationResult, identify, predict, validate
-from pneuopt.instruments import Actuator, Sensor
 from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import (
@@ -70,28 +91,7 @@ from pneuopt.profiles import Profile, profile
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.requirements import (
-    IAE,
-    ISE,
-    ITAE,
-    AirUse,
-    ControlRate,
-    GainMargin,
-    MaxComplementarySensitivity,
-    MaxSensitivity,
-    NoiseGain,
-    Overshoot,
-    PeakControl,
-    PhaseMargin,
-    Ripple,
-    RiseTime,
-    SettlingTime,
-    SteadyStateError,
-    StepEnvelope,
-)
 from pneuopt.reweighting import Huber, SoftL1
-from pneuopt.rig import Rig, record
-from pneuopt.scenarios import corners, draws, samples, tolerances
 from pneuopt.selection import ModelSelection, select_model
 from pneuopt.shooting.full_space import FullSpace
 from pneuopt.shooting.least_squares import LeastSquares

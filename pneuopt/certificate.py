@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import AT_LEAST, Requirement, bound, most, name, read, shown, told
+from pneuopt.evaluation.scenarios import Scenarios
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
-from pneuopt.requirements import AT_LEAST, Requirement, bound, most, name, read, shown, told
-from pneuopt.scenarios import Scenarios
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.relaxation import sentence
 from pneuopt.tuning.simulator import Simulator, worst

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.certify import evaluate
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import AT_LEAST, KINDS, PERCENT, Requirement, most, name
+from pneuopt.evaluation.scenarios import Scenarios
+from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import AT_LEAST, KINDS, PERCENT, Requirement, most, name
-from pneuopt.scenarios import Scenarios
-from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.simulator import Simulator
 
@@ -88,8 +88,8 @@ def validate_design(
     --------
     >>> from pneuopt.control.pid import PID
     >>> from pneuopt.models.linear import FirstOrder
-    >>> from pneuopt.requirements import Overshoot, SettlingTime
-    >>> from pneuopt.scenarios import samples
+    >>> from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+    >>> from pneuopt.evaluation.scenarios import samples
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
     >>> design = loop.parameters.with_values({"pid.Kp": 5.0, "pid.Ki": 50.0})
     >>> fresh = samples(design, {"plant.gain": 0.2}, 50, seed=1)

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from pneuopt.certificate import Found, TuningResult
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import Requirement, bound, bounded, most, name, shown
+from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.specification import Specification, allowing
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import Requirement, bound, bounded, most, name, shown
-from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.search import Method, Search, brief, ended_in
 from pneuopt.shooting.solution import Code, Solution, Status
-from pneuopt.specification import Specification, allowing
 from pneuopt.tune import pose
 from pneuopt.tuning.candidates import Tell
 from pneuopt.tuning.relaxation import settling
@@ -92,7 +92,7 @@ def pareto_front(
     --------
     >>> from pneuopt.control.pid import PID
     >>> from pneuopt.models.linear import FirstOrder
-    >>> from pneuopt.requirements import PeakControl, SettlingTime
+    >>> from pneuopt.evaluation.requirements import PeakControl, SettlingTime
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
     >>> given = loop.parameters.with_values({"pid.Kp": 4.0, "pid.Ki": 50.0})
     >>> given = given.with_bounds({"pid.Kp": (1.0, 20.0), "pid.Ki": (10.0, 200.0)}).freed("pid.Kp", "pid.Ki")

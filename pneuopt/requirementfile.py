@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.evaluation.requirements import KINDS, Requirement
 from pneuopt.quantities.errors import UnitError, require
 from pneuopt.quantities.units import read_value
-from pneuopt.requirements import KINDS, Requirement
 
 KEYS: Mapping[str, type[Requirement]] = {
     re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in KINDS

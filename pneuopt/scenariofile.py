@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from pneuopt.evaluation.scenarios import Scenarios, Spread, corners, samples, tolerances
 from pneuopt.quantities.errors import InputError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_value
-from pneuopt.scenarios import Scenarios, Spread, corners, samples, tolerances
 
 KINDS = ("corners", "samples", "tolerances")
 FRESH = 100  # plants of each kind that a design is validated on

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.certificate import GRAZING, Found, Notary, TuningResult, missing, with_relaxations
-from pneuopt.requirements import most, name, told
+from pneuopt.evaluation.requirements import most, name, told
+from pneuopt.evaluation.specification import Specification
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.condensed import Condensed, condense
 from pneuopt.tuning.confirmed import Confirmed, reconsidered

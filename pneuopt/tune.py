@@ -15,15 +15,15 @@ from pneuopt.checks import check_smooth
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.cases import cases
+from pneuopt.evaluation.requirements import PeakControl, Requirement
+from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import PeakControl, Requirement
-from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.search import Method, Search, relax
 from pneuopt.shooting.solution import Code
-from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space, Tell, span
-from pneuopt.tuning.cases import cases
 from pneuopt.tuning.condensed import Condensed, check_differentiable, is_differentiable
 from pneuopt.tuning.confirmed import Confirmed, check_confirmable
 from pneuopt.tuning.reach import check_reach
@@ -91,7 +91,7 @@ def tune(
     --------
     >>> from pneuopt.control.pid import PID
     >>> from pneuopt.models.linear import FirstOrder
-    >>> from pneuopt.requirements import Overshoot, PeakControl, SettlingTime
+    >>> from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
     >>> given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
     >>> limits = [Overshoot(0.05), PeakControl(4.0)]

@@ -42,8 +42,8 @@ from scipy.optimize import differential_evolution
 from t32 import DIGITS, MARGIN, PEAKS, RANGES, SPEC, STEP, benchmark
 
 import pneuopt as po
+from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.tuning.candidates import Space, span
 from pneuopt.tuning.condensed import condense
 from pneuopt.tuning.screening import merit

@@ -35,10 +35,10 @@ import pneuopt as po
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.stick_slip import EventKind
 from pneuopt.dynamics.system import System
-from pneuopt.instruments import Actuator, Sensor
+from pneuopt.evaluation.instruments import Actuator, Sensor
+from pneuopt.evaluation.rig import Recording, Rig, record
 from pneuopt.models.friction import LuGre
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
-from pneuopt.rig import Recording, Rig, record
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 import pneuopt as po
 from pneuopt.control.dither import Waveform
 from pneuopt.control.sensor import Encoder
-from pneuopt.dithering import DitherVerdict, Usefulness, judge_dither
+from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness, judge_dither
+from pneuopt.evaluation.requirements import Requirement
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.requirements import Requirement
-from pneuopt.specification import specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.simulator import Simulator
 

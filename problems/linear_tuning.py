@@ -26,7 +26,7 @@ from paper_tables import PAPERS_PID, PID_1, _closed_loop
 from scipy.optimize import differential_evolution
 
 import pneuopt as po
-from pneuopt.specification import specify
+from pneuopt.evaluation.specification import specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import merit
 from pneuopt.tuning.simulator import Simulator

@@ -17,8 +17,8 @@ from claims import Claim
 from r25 import CLIP, PAPERS_PID, TRANSDUCER, Case, averaged, lagging, linearised, simulated
 
 import pneuopt as po
-from pneuopt.dithering import Usefulness
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.dither_verdict import Usefulness
 from pneuopt.models.catalog import r25
 from pneuopt.models.friction import Viscous
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid

@@ -27,19 +27,19 @@ from claims import Claim, arguments, finish, frame
 from numpy.typing import NDArray
 from scipy import optimize, signal
 
-from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
 from pneuopt.control.forms import ParallelForm
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import Margins, frequency_response, margins
-from pneuopt.control.metrics import About, step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.margins import Margins, frequency_response, margins
+from pneuopt.evaluation.metrics import About, step_metrics
+from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
 from pneuopt.models.paper2015 import PRINTED, paper_plant
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 

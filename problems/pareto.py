@@ -25,9 +25,9 @@ from claims import Claim, arguments, finish, frame
 from t32 import STEP, benchmark
 
 import pneuopt as po
+from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.plotting import plot_front
-from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import screen
 from pneuopt.tuning.simulator import Simulator

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pneuopt as po
+from pneuopt.evaluation.requirements import Requirement
+from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models import catalog
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
-from pneuopt.requirements import Requirement
-from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.simulator import Simulator
 

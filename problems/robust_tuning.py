@@ -32,11 +32,11 @@ import t32
 from claims import Claim, arguments, design, finish, frame
 
 import pneuopt as po
-from pneuopt.control.means import period_mean
+from pneuopt.evaluation.means import period_mean
+from pneuopt.evaluation.requirements import Requirement
+from pneuopt.evaluation.scenarios import Factor, Scenarios, applied
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.requirements import Requirement
-from pneuopt.scenarios import Factor, Scenarios, applied
 
 if TYPE_CHECKING:
     import pandas as pd

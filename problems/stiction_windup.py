@@ -24,9 +24,9 @@ from claims import Claim, arguments, design, finish, frame
 from r25 import CLIP, PAPERS_PID, TRANSDUCER
 
 import pneuopt as po
+from pneuopt.evaluation.requirements import Requirement
 from pneuopt.models.catalog import r25
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
-from pneuopt.requirements import Requirement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

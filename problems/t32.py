@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 import pneuopt as po
+from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.specification import Specification, specify
 from pneuopt.tuning.candidates import Space, span
 from pneuopt.tuning.screening import merit, screen
 from pneuopt.tuning.simulator import Responses, Simulator

@@ -9,9 +9,16 @@ from pneuopt.console.terminal import screen
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.dithering import DitherEffect, DitherVerdict, Usefulness
+from pneuopt.evaluation.dither_verdict import DitherEffect, DitherVerdict, Usefulness
+from pneuopt.evaluation.requirements import (
+    KINDS,
+    MaxComplementarySensitivity,
+    Overshoot,
+    PhaseMargin,
+    Requirement,
+    StepEnvelope,
+)
 from pneuopt.models.linear import FirstOrder
-from pneuopt.requirements import KINDS, MaxComplementarySensitivity, Overshoot, PhaseMargin, Requirement, StepEnvelope
 
 
 def test_metrics_stand_beside_what_is_allowed() -> None:

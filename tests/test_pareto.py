@@ -7,17 +7,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import GainMargin, MaxSensitivity, Overshoot, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.pareto import pareto_front
 from pneuopt.plotting import plot_front
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import GainMargin, MaxSensitivity, Overshoot, SettlingTime
-from pneuopt.specification import specify
 from pneuopt.tune import Method
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import Screening

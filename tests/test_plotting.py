@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from pneuopt.control.margins import margins
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.margins import margins
 from pneuopt.logs.experiments import Experiment, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre

@@ -7,11 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from pneuopt.cli import app
+from pneuopt.evaluation.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.scenariofile import read_fresh, read_scenarios
-from pneuopt.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.tomlfile import read_toml
 from pneuopt.tuningfile import read_tuning
 

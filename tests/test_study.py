@@ -17,12 +17,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System, discretise
+from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder

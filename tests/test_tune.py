@@ -5,20 +5,27 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import (
+    MaxSensitivity,
+    Overshoot,
+    PeakControl,
+    Requirement,
+    SettlingTime,
+    SteadyStateError,
+)
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
 from pneuopt.shooting.solution import Code
-from pneuopt.specification import specify
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import Judge, Screening, screen

@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.files import read_status
-from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Coulomb, PressureDependent
-from pneuopt.models.linear import SecondOrder
-from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import (
+from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
     ITAE,
@@ -37,6 +31,12 @@ from pneuopt.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
+from pneuopt.files import read_status
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Coulomb, PressureDependent
+from pneuopt.models.linear import SecondOrder
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code, Status
 from pneuopt.tomlfile import read_toml
 from pneuopt.tuningfile import Tuning, read_tuning, write_tuned

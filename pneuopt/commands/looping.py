@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.certify import evaluate, point_of_operation, respond
 from pneuopt.commands.shared import (
     INTERRUPTED,
     Columns,
@@ -35,8 +34,9 @@ from pneuopt.console.loops import (
 from pneuopt.console.terminal import progress, screen, show_status
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.dithering import judge_dither
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.dither_verdict import judge_dither
+from pneuopt.evaluation.evaluate import evaluate, point_of_operation, respond
 from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.console.terminal import screen, show_written
+from pneuopt.evaluation.requirements import Bounds, SettlingTime, StepEnvelope
 from pneuopt.files import read_drive, read_status
 from pneuopt.identify import IdentificationResult
 from pneuopt.plotting import check_figure_path, save_figure
 from pneuopt.quantities.output import check_outputs, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.requirements import Bounds, SettlingTime, StepEnvelope
 from pneuopt.shooting.solution import Code, Status
 from pneuopt.tune import TuningResult
 from pneuopt.tuningfile import Tuning, read_tuning

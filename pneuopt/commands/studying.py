@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.certify import evaluate
 from pneuopt.commands.shared import (
     GOOD,
     INTERRUPTED,
@@ -23,6 +22,18 @@ from pneuopt.commands.shared import (
 from pneuopt.console.loops import SMALLEST_IS_WORST, metric_units, show_cases, show_front
 from pneuopt.console.terminal import progress, screen
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import (
+    AT_LEAST,
+    PERCENT,
+    Requirement,
+    SettlingTime,
+    StepEnvelope,
+    bound,
+    bounded,
+    most,
+    name,
+)
 from pneuopt.loopfile import checked
 from pneuopt.pareto import pareto_front
 from pneuopt.plotting import plot_front, plot_map
@@ -30,7 +41,6 @@ from pneuopt.quantities.errors import InputError, check_known, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.units import write_value
 from pneuopt.requirementfile import KEYS, bound_units
-from pneuopt.requirements import AT_LEAST, PERCENT, Requirement, SettlingTime, StepEnvelope, bound, bounded, most, name
 from pneuopt.study import INTERRUPTED as CUT_SHORT
 from pneuopt.study import grid, sweep
 from pneuopt.studyfile import Axis, Pareto, Study, read_axes, read_pareto, read_study

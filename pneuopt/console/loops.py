@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
-from pneuopt.certify import HUNTING
 from pneuopt.console.terminal import figure, new_table
 from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dithering import DitherVerdict, Usefulness
+from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
+from pneuopt.evaluation.evaluate import HUNTING
+from pneuopt.evaluation.requirements import AT_LEAST, PERCENT, Requirement, name
 from pneuopt.fresh_plants import DesignValidation
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.requirements import AT_LEAST, PERCENT, Requirement, name
 from pneuopt.study import INTERRUPTED
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.margins import Margins, frequency_grid, frequency_response, margins
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.margins import Margins, frequency_grid, frequency_response, margins
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 
 if TYPE_CHECKING:

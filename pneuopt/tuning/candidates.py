@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.metrics import About, Envelope, step_metrics
 from pneuopt.control.reference import Step, disturbing
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.metrics import About, Envelope, step_metrics
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory

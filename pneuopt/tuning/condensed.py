@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import ROBUSTNESS, name
+from pneuopt.evaluation.specification import Specification
 from pneuopt.nlp.sqp import SQP, Point, descend
 from pneuopt.quantities.errors import require
-from pneuopt.requirements import ROBUSTNESS, name
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.linearised import SMOOTH, Linearised, differentiated
 from pneuopt.tuning.screening import Judge, Screened, first_population, generation, merit

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import require
 from pneuopt.shooting.full_space import FullSpace, prepare, solve_from
 from pneuopt.shooting.solution import Solution
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Screening

@@ -11,12 +11,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.means import TAIL
-from pneuopt.control.metrics import PERIODS_INSIDE
 from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.evaluation.means import TAIL
+from pneuopt.evaluation.metrics import PERIODS_INSIDE
+from pneuopt.evaluation.requirements import ROBUSTNESS, Overshoot, SettlingTime, SteadyStateError, read
+from pneuopt.evaluation.specification import Specification
 from pneuopt.nlp.sqp import Groups, Point
-from pneuopt.requirements import ROBUSTNESS, Overshoot, SettlingTime, SteadyStateError, read
-from pneuopt.specification import Specification
 from pneuopt.tuning.rows import READ, Lanes
 from pneuopt.tuning.rows import nodes as times
 from pneuopt.tuning.simulator import Mask, Simulator, is_sound

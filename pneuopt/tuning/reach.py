@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_response
-from pneuopt.control.means import TAIL
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.rest import find_rest, sliding
+from pneuopt.evaluation.cases import Case
+from pneuopt.evaluation.margins import frequency_response
+from pneuopt.evaluation.means import TAIL
+from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, most, name
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, most, name
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, highest
-from pneuopt.tuning.cases import Case
 
 Array = NDArray[np.float64]
 SLOW = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read

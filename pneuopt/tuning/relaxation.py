@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pneuopt.control.means import TAIL
 from pneuopt.control.reference import Step
-from pneuopt.requirements import AT_LEAST, Requirement, SettlingTime, bound, most, name
-from pneuopt.specification import Specification
+from pneuopt.evaluation.means import TAIL
+from pneuopt.evaluation.requirements import AT_LEAST, Requirement, SettlingTime, bound, most, name
+from pneuopt.evaluation.specification import Specification
 from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.simulator import Simulator
 

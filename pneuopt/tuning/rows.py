@@ -11,10 +11,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.consumption import LITRES, NORMAL_DENSITY
-from pneuopt.control.means import end_mean
-from pneuopt.control.metrics import Envelope
-from pneuopt.requirements import (
+from pneuopt.evaluation.air import LITRES, NORMAL_DENSITY
+from pneuopt.evaluation.means import end_mean
+from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
     ITAE,
@@ -25,8 +25,8 @@ from pneuopt.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
+from pneuopt.evaluation.window import Window
 from pneuopt.tuning.watching import CONTROL, FLOW, INTEGRAL, SIGNAL, Grid
-from pneuopt.tuning.window import Window
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import ROBUSTNESS, SettlingTime, most, name
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import require
-from pneuopt.requirements import ROBUSTNESS, SettlingTime, most, name
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.simulator import Index, Mask, Responses, Simulator
 from pneuopt.tuning.watching import LOST, unsettled

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.control.robustness import robustness
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
+from pneuopt.evaluation.batch_margins import robustness
+from pneuopt.evaluation.cases import cases
+from pneuopt.evaluation.requirements import AT_LEAST, ROBUSTNESS, read
+from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import AT_LEAST, ROBUSTNESS, read
-from pneuopt.scenarios import NOMINAL, Scenarios
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import (
     MOST_SUBSTEPS,
     POINTS_A_PERIOD,
@@ -27,7 +28,6 @@ from pneuopt.tuning.candidates import (
     spacing,
     substeps,
 )
-from pneuopt.tuning.cases import cases
 from pneuopt.tuning.watching import CONTROL, METERED, Grid, is_averaged, read_off, watched
 
 Array = NDArray[np.float64]

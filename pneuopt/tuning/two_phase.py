@@ -15,17 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_grid, sensitivity_terms
-from pneuopt.control.means import TAIL
 from pneuopt.control.reference import Step, disturbing
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
+from pneuopt.evaluation.margins import frequency_grid, sensitivity_terms
+from pneuopt.evaluation.means import TAIL
+from pneuopt.evaluation.requirements import (
+    MaxSensitivity,
+    Overshoot,
+    PeakControl,
+    SettlingTime,
+    SteadyStateError,
+    most,
+    name,
+)
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime, SteadyStateError, most, name
 from pneuopt.shooting.full_space import FullSpace, Problem, follow, prepare, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, every
-from pneuopt.specification import Specification
 from pneuopt.tuning.candidates import STABLE, Space, Tell, fastest, substeps
 
 Array = NDArray[np.float64]

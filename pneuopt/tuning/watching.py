@@ -8,15 +8,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.consumption import consumption, metered
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.metrics import About, Envelope, batch_metrics
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.dynamics.system import names
+from pneuopt.evaluation.air import consumption, metered
+from pneuopt.evaluation.metrics import About, Envelope, batch_metrics
+from pneuopt.evaluation.window import Window
 from pneuopt.tuning.candidates import MOST_READINGS
-from pneuopt.tuning.window import Window
 
 Array = NDArray[np.float64]
 SIGNAL, CONTROL, FLOW, SPOOL = range(4)  # outputs that are run, the last two for `METERED` only

@@ -5,13 +5,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate_stick_slip
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
@@ -19,8 +21,6 @@ from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.requirements import Overshoot, SettlingTime
-from pneuopt.specification import specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator

@@ -6,18 +6,18 @@ import control
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import margins
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.margins import margins
+from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
-from pneuopt.specification import specify
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed

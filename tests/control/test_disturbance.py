@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate, respond
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.requirements import Overshoot, PeakControl, Requirement, SettlingTime
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import Overshoot, PeakControl, Requirement, SettlingTime
 from pneuopt.tune import Method, tune
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Screening

@@ -6,20 +6,20 @@ import control
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_response
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.margins import frequency_response
+from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import Overshoot, SettlingTime
-from pneuopt.specification import specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator

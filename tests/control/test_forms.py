@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.certify import evaluate
 from pneuopt.control.forms import (
     Form,
     ParallelForm,
@@ -22,17 +21,18 @@ from pneuopt.control.forms import (
     to_standard,
 )
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_response, sensitivity_terms
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.control.robustness import robustness
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.batch_margins import robustness
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.margins import frequency_response, sensitivity_terms
+from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
-from pneuopt.specification import specify
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed

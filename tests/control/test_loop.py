@@ -9,9 +9,9 @@ from scipy.linalg import expm
 from pneuopt.control.dither import Dither
 from pneuopt.control.linear_loop import delayed
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import frequency_response
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import System, define
+from pneuopt.evaluation.margins import frequency_response
 from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 

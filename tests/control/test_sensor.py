@@ -2,25 +2,25 @@ import control
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate, respond
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.loop_start import LoggedLoop
-from pneuopt.control.margins import frequency_response, margins
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.control.robustness import robustness
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import define
-from pneuopt.instruments import Sensor
+from pneuopt.evaluation.batch_margins import robustness
+from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.instruments import Sensor
+from pneuopt.evaluation.margins import frequency_response, margins
+from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
+from pneuopt.evaluation.rig import Rig
+from pneuopt.evaluation.scenarios import Scenarios, corners
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, ModelError
-from pneuopt.requirements import MaxSensitivity, Overshoot, SettlingTime
-from pneuopt.rig import Rig
-from pneuopt.scenarios import Scenarios, corners
-from pneuopt.specification import specify
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed

@@ -11,8 +11,10 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.guards import Contact, Guard
 from pneuopt.dynamics.simulate import contacts, simulate
 from pneuopt.dynamics.system import System, define, names
+from pneuopt.evaluation.instruments import Sensor
+from pneuopt.evaluation.requirements import SettlingTime
+from pneuopt.evaluation.rig import Rig, record
 from pneuopt.identify import identify
-from pneuopt.instruments import Sensor
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
@@ -22,8 +24,6 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.requirements import SettlingTime
-from pneuopt.rig import Rig, record
 from pneuopt.tune import tune
 
 DRIVE = PneumaticDrive()

@@ -11,12 +11,12 @@ from scipy.linalg import expm
 
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.metrics import step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.compiler import compiler
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, define
+from pneuopt.evaluation.metrics import step_metrics
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder

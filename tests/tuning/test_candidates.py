@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import Ripple, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import Ripple, SettlingTime
-from pneuopt.specification import specify
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import POINTS_A_PERIOD, highest, resolving, spacing, span
 from pneuopt.tuning.screening import Screening

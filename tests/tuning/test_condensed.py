@@ -10,12 +10,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Stribeck, Viscous
-from pneuopt.models.linear import FirstOrder, Integrator
-from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import (
+from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
     ITAE,
@@ -34,9 +29,14 @@ from pneuopt.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.scenarios import Scenarios, corners, tolerances
+from pneuopt.evaluation.scenarios import Scenarios, corners, tolerances
+from pneuopt.evaluation.specification import specify
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck, Viscous
+from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code
-from pneuopt.specification import specify
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed

@@ -8,16 +8,11 @@ import pandas as pd
 import pytest
 from scipy.linalg import expm
 
-from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Stribeck
-from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import (
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
     ITAE,
@@ -38,6 +33,11 @@ from pneuopt.requirements import (
     name,
     read,
 )
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder, SecondOrder
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code
 from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.screening import Screening

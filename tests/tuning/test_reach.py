@@ -8,17 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pneuopt.certify import respond
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.models.friction import Stribeck
-from pneuopt.models.linear import FirstOrder, Integrator
-from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import (
+from pneuopt.evaluation.evaluate import respond
+from pneuopt.evaluation.requirements import (
     IAE,
     NoiseGain,
     Overshoot,
@@ -29,6 +24,11 @@ from pneuopt.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tune import tune
 from pneuopt.tuning.screening import Screening
 

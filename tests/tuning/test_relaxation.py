@@ -6,15 +6,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import (
+    GainMargin,
+    Overshoot,
+    PeakControl,
+    Requirement,
+    SettlingTime,
+    SteadyStateError,
+)
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import GainMargin, Overshoot, PeakControl, Requirement, SettlingTime, SteadyStateError
 from pneuopt.shooting.solution import Code
-from pneuopt.specification import specify
 from pneuopt.tune import Method, TuningResult, tune
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import Screening

@@ -5,22 +5,22 @@ import math
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate, respond
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.cases import cases
+from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
+from pneuopt.evaluation.scenarios import Factor, Scenarios, applied, corners, samples, tolerances
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
-from pneuopt.scenarios import Factor, Scenarios, applied, corners, samples, tolerances
-from pneuopt.specification import specify
 from pneuopt.tune import tune
 from pneuopt.tuning.candidates import span
-from pneuopt.tuning.cases import cases
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Judge, Screening, screen
 from pneuopt.tuning.simulator import Responses, Simulator

@@ -10,16 +10,16 @@ from numpy.testing import assert_allclose
 
 from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import (
+from pneuopt.control.pid import PID
+from pneuopt.dynamics.system import Linearisation, System
+from pneuopt.evaluation.batch_margins import _responses, robustness
+from pneuopt.evaluation.margins import (
     frequency_grid,
     frequency_response,
     margins,
     noise_gain,
     sensitivity_terms,
 )
-from pneuopt.control.pid import PID
-from pneuopt.control.robustness import _responses, robustness
-from pneuopt.dynamics.system import Linearisation, System
 from pneuopt.models.catalog import s32
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import ModelError

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.metrics import About, batch_metrics, step_metrics
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.metrics import About, batch_metrics, step_metrics
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 

@@ -15,8 +15,9 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate
+from pneuopt.evaluation.instruments import Actuator, Sensor
+from pneuopt.evaluation.rig import Recording, Rig, record
 from pneuopt.identify import identify
-from pneuopt.instruments import Actuator, Sensor
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.karnopp import Karnopp
@@ -25,7 +26,6 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.rig import Recording, Rig, record
 
 Array = NDArray[np.float64]
 FRICTION = {"friction.coulomb": 30.0, "friction.static": 45.0, "friction.viscous": 40.0, "load.mass": 3.0}

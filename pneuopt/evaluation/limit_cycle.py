@@ -11,7 +11,7 @@ from math import log
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.means import period_mean
+from pneuopt.evaluation.means import period_mean
 from pneuopt.quantities.errors import require
 
 Array = NDArray[np.float64]

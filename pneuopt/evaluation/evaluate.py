@@ -7,24 +7,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.control.consumption import consumed
 from pneuopt.control.disturbance import disturbed
-from pneuopt.control.limit_cycle import LEAST, SETTLED, find_limit_cycle
 from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import margins, noise_gain
-from pneuopt.control.means import period_mean
-from pneuopt.control.metrics import Envelope
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Array
+from pneuopt.evaluation.air import consumed
+from pneuopt.evaluation.cases import Case, cases
+from pneuopt.evaluation.limit_cycle import LEAST, SETTLED, find_limit_cycle
+from pneuopt.evaluation.margins import margins, noise_gain
+from pneuopt.evaluation.means import period_mean
+from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.rig import Rig, record
+from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.rig import Rig, record
-from pneuopt.scenarios import NOMINAL, Scenarios
 from pneuopt.tuning.candidates import cut, inputs, measure, readings, spacing
-from pneuopt.tuning.cases import Case, cases
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,7 +87,7 @@ def evaluate(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
-    >>> from pneuopt.instruments import Sensor
+    >>> from pneuopt.evaluation.instruments import Sensor
     >>> from pneuopt.models.drive import ForceDrive
     >>> from pneuopt.models.friction import Viscous
     >>> loop = ClosedLoop(ForceDrive(Viscous()).system(), PID(sample_time=1e-3))

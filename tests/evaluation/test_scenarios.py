@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pneuopt.evaluation.scenarios import corners, draws, samples
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.scenarios import corners, draws, samples
 
 LOW_HIGH = ("low", "high")
 RIG = ParameterSet(

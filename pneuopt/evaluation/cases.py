@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.scenarios import Factor, Scenarios, applied
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.scenarios import Factor, Scenarios, applied
 from pneuopt.tuning.candidates import Space
 
 Array = NDArray[np.float64]

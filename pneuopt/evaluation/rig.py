@@ -20,7 +20,7 @@ from pneuopt.dynamics.simulate import contacts, first_state, held_inputs, new_ru
 from pneuopt.dynamics.smooth import Run
 from pneuopt.dynamics.stick_slip import Event, StickSlip
 from pneuopt.dynamics.system import Symbols, System, define, names, stacked, vector
-from pneuopt.instruments import Actuator, Sensor
+from pneuopt.evaluation.instruments import Actuator, Sensor
 from pneuopt.logs.experiments import CHANNELS, Experiment
 from pneuopt.quantities.errors import ModelError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity

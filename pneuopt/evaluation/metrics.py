@@ -8,7 +8,7 @@ from math import nan
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.means import TAIL, end_mean, period_mean, tail
+from pneuopt.evaluation.means import TAIL, end_mean, period_mean, tail
 from pneuopt.quantities.errors import require
 
 Array = NDArray[np.float64]

@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 
-from pneuopt.quantities.errors import require
-from pneuopt.requirements import (
+from pneuopt.evaluation.requirements import (
     AT_LEAST,
     KINDS,
     Bounds,
@@ -20,6 +19,7 @@ from pneuopt.requirements import (
     most,
     name,
 )
+from pneuopt.quantities.errors import require
 
 Kind = type | tuple[type, ...]
 
@@ -109,7 +109,7 @@ def specify(
 
     Examples
     --------
-    >>> from pneuopt.requirements import Overshoot
+    >>> from pneuopt.evaluation.requirements import Overshoot
     >>> spec = specify({SettlingTime(): 1.0, Overshoot(): 2.0}, [MaxSensitivity(1.6)])
     >>> spec.objective({"SettlingTime": 0.3, "Overshoot": 0.05, "MaxSensitivity": 1.5})
     0.4

@@ -9,7 +9,7 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dithering import DitherEffect, Usefulness, dither_effect, explained, judge_dither
+from pneuopt.evaluation.dither_verdict import DitherEffect, Usefulness, dither_effect, explained, judge_dither
 from pneuopt.models.catalog import r25, t32
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError

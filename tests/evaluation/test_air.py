@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate, respond
-from pneuopt.control.consumption import NORMAL_DENSITY, consumption
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
+from pneuopt.evaluation.air import NORMAL_DENSITY, consumption
+from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.requirements import AirUse, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.requirements import AirUse, SettlingTime
-from pneuopt.specification import specify
 from pneuopt.tuning.candidates import span
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.watching import watched

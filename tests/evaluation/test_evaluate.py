@@ -5,13 +5,15 @@ from math import exp
 import numpy as np
 import pytest
 
-from pneuopt.certify import evaluate, respond
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
-from pneuopt.instruments import Actuator, Sensor
+from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.instruments import Actuator, Sensor
+from pneuopt.evaluation.requirements import IAE
+from pneuopt.evaluation.rig import Rig
 from pneuopt.models.catalog import r25
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous
@@ -20,8 +22,6 @@ from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.requirements import IAE
-from pneuopt.rig import Rig
 from pneuopt.shooting.solution import Code
 from pneuopt.tune import tune
 from pneuopt.tuning.screening import Screening

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.quantities.errors import InputError
-from pneuopt.requirements import (
+from pneuopt.evaluation.requirements import (
     IAE,
     KINDS,
     ControlRate,
@@ -26,6 +25,7 @@ from pneuopt.requirements import (
     read,
     told,
 )
+from pneuopt.quantities.errors import InputError
 
 
 def test_metrics_in_percent_become_fractions() -> None:

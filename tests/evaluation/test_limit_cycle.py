@@ -6,10 +6,10 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from pneuopt.control.dither import Waveform
-from pneuopt.control.limit_cycle import find_limit_cycle
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
+from pneuopt.evaluation.limit_cycle import find_limit_cycle
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre
 from pneuopt.quantities.errors import InputError

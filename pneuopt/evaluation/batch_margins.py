@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.linear_loop import delayed, linear_gains
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.margins import ComplexArray, controller_parts, solved
 from pneuopt.dynamics.compiled.rollout import compiled
 from pneuopt.dynamics.system import Array, names
+from pneuopt.evaluation.margins import ComplexArray, controller_parts, solved
 
 ZOOMS, ZOOMED = 3, 9  # grids about a coarse peak, each within two steps of the last, and their frequencies
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import casadi as ca
 import numpy as np
 
-from pneuopt.certify import evaluate
 from pneuopt.control.averaging import ripple
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.hooks import Rest
 from pneuopt.dynamics.system import System, names
+from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.candidates import command_range

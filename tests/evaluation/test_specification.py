@@ -2,8 +2,7 @@ import math
 
 import pytest
 
-from pneuopt.quantities.errors import InputError
-from pneuopt.requirements import (
+from pneuopt.evaluation.requirements import (
     GainMargin,
     MaxComplementarySensitivity,
     MaxSensitivity,
@@ -14,7 +13,8 @@ from pneuopt.requirements import (
     SettlingTime,
     StepEnvelope,
 )
-from pneuopt.specification import specify
+from pneuopt.evaluation.specification import specify
+from pneuopt.quantities.errors import InputError
 
 TUBE, OTHER = ((0.0, -0.1, 1.1), (0.5, 0.9, 1.1)), ((0.0, -0.2, 1.2),)
 

@@ -1,0 +1,1 @@
+"""What a loop is worth, without any optimiser."""
