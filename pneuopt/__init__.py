@@ -80,10 +80,10 @@ _HOME = {
     "pneuopt.dynamics.simulate": ("contacts", "simulate", "simulate_stick_slip"),
     "pneuopt.evaluation.instruments": ("Actuator", "Sensor"),
     "pneuopt.evaluation.rig": ("Rig", "record"),
-    "pneuopt.identify": ("IdentificationResult", "identify", "predict", "validate"),
-    "pneuopt.identifiability": ("Verdict", "identifiability"),
-    "pneuopt.profiles": ("Profile", "profile"),
-    "pneuopt.derived": ("Derived", "derived"),
+    "pneuopt.identification.identify": ("IdentificationResult", "identify", "predict", "validate"),
+    "pneuopt.identification.identifiability": ("Verdict", "identifiability"),
+    "pneuopt.identification.profiles": ("Profile", "profile"),
+    "pneuopt.identification.propagation": ("Derived", "derived"),
     "pneuopt.evaluation.requirements": (
         "IAE",
         "ISE",
@@ -110,10 +110,10 @@ _HOME = {
     "pneuopt.evaluation.evaluate": ("evaluate", "respond"),
     "pneuopt.tune": ("TuningResult", "tune"),
     "pneuopt.evaluation.scenarios": ("corners", "draws", "samples", "tolerances"),
-    "pneuopt.comparison": ("LogComparison", "compare_logs"),
-    "pneuopt.reweighting": ("Huber", "SoftL1"),
+    "pneuopt.identification.compare_logs": ("LogComparison", "compare_logs"),
+    "pneuopt.identification.losses": ("Huber", "SoftL1"),
     "pneuopt.models.sensing": ("coarse_delay", "with_sensors"),
-    "pneuopt.selection": ("ModelSelection", "select_model"),
+    "pneuopt.identification.select_model": ("ModelSelection", "select_model"),
     "pneuopt.pareto": ("pareto_front",),
     "pneuopt.study": ("grid", "sweep"),
     "pneuopt.fresh_plants": ("DesignValidation", "validate_design"),
@@ -151,7 +151,7 @@ def __dir__() -> list[str]:
 
 class _Package(ModuleType):
     def __setattr__(self, name: str, value: Any) -> None:
-        # the import of a submodule, `pneuopt.identify` say, must not hide the verb of that name
+        # the import of a submodule, `pneuopt.identification.identify` say, must not hide the verb of that name
         if not (name in _MODULE and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 

@@ -1,6 +1,5 @@
 """Types of the names that `__init__.py` loads lazily."""
 
-from pneuopt.comparison import LogComparison, compare_logs
 from pneuopt.control.averaging import averaged, mean_start, ripple
 from pneuopt.control.bumpless import take_over
 from pneuopt.control.dither import Dither, Waveform
@@ -20,7 +19,6 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
-from pneuopt.derived import Derived, derived
 from pneuopt.dynamics.simulate import contacts, simulate, simulate_stick_slip
 from pneuopt.dynamics.system import DiscreteSystem, System, define, discretise
 from pneuopt.evaluation.dither_verdict import DitherVerdict, dither_effect, judge_dither
@@ -52,8 +50,13 @@ from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import corners, draws, samples, tolerances
 from pneuopt.files import read_drive, write_fit
 from pneuopt.fresh_plants import DesignValidation, validate_design
-from pneuopt.identifiability import Verdict, identifiability
-from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.compare_logs import LogComparison, compare_logs
+from pneuopt.identification.identifiability import Verdict, identifiability
+from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.losses import Huber, SoftL1
+from pneuopt.identification.profiles import Profile, profile
+from pneuopt.identification.propagation import Derived, derived
+from pneuopt.identification.select_model import ModelSelection, select_model
 from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import (
@@ -87,12 +90,9 @@ from pneuopt.plotting import (
     plot_steps,
     save_figure,
 )
-from pneuopt.profiles import Profile, profile
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.reweighting import Huber, SoftL1
-from pneuopt.selection import ModelSelection, select_model
 from pneuopt.shooting.full_space import FullSpace
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.study import grid, sweep

@@ -37,7 +37,7 @@ from pneuopt.tomlfile import Places, inline_table, read_parameter, read_toml, to
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pneuopt.identifiability import Verdict
+    from pneuopt.identification.identifiability import Verdict
 
 Sections = Mapping[str, Mapping[str, Any]]
 

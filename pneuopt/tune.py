@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.certificate import Notary, TuningResult
-from pneuopt.checks import check_smooth
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
@@ -19,6 +18,7 @@ from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.requirements import PeakControl, Requirement
 from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.evaluation.specification import Specification, specify
+from pneuopt.identification.checks import check_smooth
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.search import Method, Search, relax

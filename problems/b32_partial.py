@@ -19,10 +19,10 @@ from b32 import FREE, LOGGED, VALVE, generate
 from claims import Claim, arguments, finish, frame
 
 import pneuopt as po
+from pneuopt.identification.statistics import correlation
 from pneuopt.models.catalog import b32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.statistics import correlation
 
 if TYPE_CHECKING:
     import pandas as pd

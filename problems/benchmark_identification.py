@@ -30,8 +30,8 @@ from scipy.optimize import least_squares
 
 import pneuopt as po
 from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.identification.problem import Problem
 from pneuopt.models.catalog import b32
-from pneuopt.posing import Problem
 from pneuopt.quantities.trajectories import Array
 from pneuopt.shooting.full_space import FullSpace, solve_full_space
 from pneuopt.shooting.least_squares import LeastSquares

@@ -22,8 +22,8 @@ from claims import Claim, arguments, design, finish, frame
 from numpy.typing import NDArray
 
 import pneuopt as po
+from pneuopt.identification.statistics import agreement
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.statistics import agreement
 from pneuopt.tuning.candidates import measure
 
 Array = NDArray[np.float64]

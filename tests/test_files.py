@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files import read_drive, read_status, write_fit
-from pneuopt.identifiability import Verdict
+from pneuopt.identification.identifiability import Verdict
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder

@@ -21,8 +21,9 @@ from pneuopt.console.fits import show_estimates, show_fit, show_selection, show_
 from pneuopt.console.terminal import progress, screen, show_status
 from pneuopt.dynamics.system import System
 from pneuopt.files import Drive, read_drive, write_fit
-from pneuopt.identifiability import Verdict, identifiability
-from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.identifiability import Verdict, identifiability
+from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiments import Experiment, read_log, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import friction_ladder
@@ -38,7 +39,6 @@ from pneuopt.plotting import (
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.selection import select_model
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import numpy as np
 from pneuopt.console.terminal import screen, show_written
 from pneuopt.evaluation.requirements import Bounds, SettlingTime, StepEnvelope
 from pneuopt.files import read_drive, read_status
-from pneuopt.identify import IdentificationResult
+from pneuopt.identification.identify import IdentificationResult
 from pneuopt.plotting import check_figure_path, save_figure
 from pneuopt.quantities.output import check_outputs, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet

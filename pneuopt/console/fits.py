@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.text import Text
 
 from pneuopt.console.terminal import figure, new_table
-from pneuopt.identifiability import Verdict
-from pneuopt.scrutiny import NOT_TOLD
-from pneuopt.selection import ModelSelection
+from pneuopt.identification.identifiability import Verdict
+from pneuopt.identification.review import NOT_TOLD
+from pneuopt.identification.select_model import ModelSelection
 
 if TYPE_CHECKING:
     import pandas as pd

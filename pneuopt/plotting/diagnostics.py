@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.identification.statistics import correlation, ljung_box
 from pneuopt.logs.experiments import CHANNELS, Experiment
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, SCALED, axes_grid, shown_of
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.statistics import correlation, ljung_box
 
 if TYPE_CHECKING:
     import pandas as pd

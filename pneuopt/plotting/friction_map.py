@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.derived import propagated
 from pneuopt.dynamics.system import System, names, vector
+from pneuopt.identification.propagation import propagated
 from pneuopt.logs.experiments import Experiment, differentiate
 from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
 from pneuopt.plotting.fits import MOST_POINTS, Fitted

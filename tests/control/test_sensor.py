@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
@@ -16,6 +15,7 @@ from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingT
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import Scenarios, corners
 from pneuopt.evaluation.specification import specify
+from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder

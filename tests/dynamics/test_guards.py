@@ -14,7 +14,7 @@ from pneuopt.dynamics.system import System, define, names
 from pneuopt.evaluation.instruments import Sensor
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.rig import Rig, record
-from pneuopt.identify import identify
+from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck

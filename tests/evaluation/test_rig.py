@@ -17,7 +17,7 @@ from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.instruments import Actuator, Sensor
 from pneuopt.evaluation.rig import Recording, Rig, record
-from pneuopt.identify import identify
+from pneuopt.identification.identify import identify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.karnopp import Karnopp

@@ -9,7 +9,7 @@ import pytest
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names
-from pneuopt.identify import identify
+from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.catalog import b32
 from pneuopt.models.drive import ForceDrive

@@ -11,23 +11,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.checks import check_content, check_free, check_logs, check_smooth, doubts, measured_outputs
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System, names
-from pneuopt.identifiability import Verdict
+from pneuopt.identification.checks import check_content, check_free, check_logs, check_smooth, doubts, measured_outputs
+from pneuopt.identification.identifiability import Verdict
+from pneuopt.identification.losses import Loss, Refit, fitted, white_squares
+from pneuopt.identification.multistart import attempts
+from pneuopt.identification.problem import Model, Problem, as_logged, conditioned, free_run
+from pneuopt.identification.review import scrutinised
+from pneuopt.identification.statistics import (
+    agreement,
+    confidence_interval,
+    correlation_time,
+    cross_correlation,
+    ljung_box,
+)
 from pneuopt.logs.experiments import Experiment
-from pneuopt.posing import Model, Problem, as_logged, conditioned, free_run
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.reweighting import Loss, Refit, fitted, white_squares
-from pneuopt.scrutiny import scrutinised
 from pneuopt.shooting.convergence import NOISE_LEVEL
 from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.starting import attempts
-from pneuopt.statistics import agreement, confidence_interval, correlation_time, cross_correlation, ljung_box
 
 if TYPE_CHECKING:
     import pandas as pd

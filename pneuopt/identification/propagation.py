@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.identification.statistics import confidence_interval
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.statistics import confidence_interval
 
 if TYPE_CHECKING:
     import pandas as pd

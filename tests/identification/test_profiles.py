@@ -5,11 +5,11 @@ import pytest
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System
-from pneuopt.identify import IdentificationResult, identify
+from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.profiles import profile
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
-from pneuopt.profiles import profile
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory

@@ -1,6 +1,6 @@
 import numpy as np
 
-from pneuopt.excitation import missing, motion, remedy
+from pneuopt.identification.excitation import missing, motion, remedy
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pneuopt.comparison import compare_logs
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identify import identify
+from pneuopt.identification.compare_logs import compare_logs
+from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pneuopt.derived import Values, derived, propagated
-from pneuopt.identify import identify
+from pneuopt.identification.identify import identify
+from pneuopt.identification.propagation import Values, derived, propagated
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import Stribeck

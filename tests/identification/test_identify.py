@@ -11,7 +11,7 @@ from scipy.stats import binom
 
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, vector
-from pneuopt.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.system import DIRECTION, System, names
+from pneuopt.identification.logged_loop import LoggedLoop
+from pneuopt.identification.statistics import noise_level
 from pneuopt.logs.doctor import Finding, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_known, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.statistics import noise_level
 
 REFERENCES = ("speed_reference", "position_reference")  # a loop's set-points may stay in a log; no plant reads them
 Model = System | LoggedLoop

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pneuopt.checks import check_content
 from pneuopt.dynamics.hooks import Log
-from pneuopt.identify import identify
+from pneuopt.identification.checks import check_content
+from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb

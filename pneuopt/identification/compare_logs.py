@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
-from pneuopt.identify import IdentificationResult, identify
+from pneuopt.identification.checks import check_logs
+from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.problem import as_logged
 from pneuopt.logs.experiments import Experiment
-from pneuopt.posing import as_logged
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import LeastSquares

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identify import IdentificationResult, identify
+from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.losses import Huber, Loss, SoftL1
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.reweighting import Huber, Loss, SoftL1
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
 NOISE = {"position": 2e-5, "speed": 1e-3}

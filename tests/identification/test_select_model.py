@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.system import System
+from pneuopt.identification.select_model import ModelSelection, select_model
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import FrictionModel, friction_ladder
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Array, Trajectory
-from pneuopt.selection import ModelSelection, select_model
 
 FREE = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity", "friction.*_asymmetry")
 PAIR = ("friction.coulomb", "friction.viscous", "friction.*_asymmetry")

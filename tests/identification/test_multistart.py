@@ -6,16 +6,16 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from pneuopt import starting
-from pneuopt.checks import check_logs
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import discretise, vector
-from pneuopt.identify import identify
+from pneuopt.identification import multistart as starting
+from pneuopt.identification.checks import check_logs
+from pneuopt.identification.identify import identify
+from pneuopt.identification.problem import Problem
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
-from pneuopt.posing import Problem
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
@@ -81,7 +81,7 @@ def test_an_interruption_keeps_the_best_so_far(monkeypatch: pytest.MonkeyPatch) 
         yield Start(wrong.states, {**wrong.parameters, "friction.coulomb": 3.0})
         raise KeyboardInterrupt
 
-    module = sys.modules["pneuopt.identify"]  # the package shows the verb of that name
+    module = sys.modules["pneuopt.identification.identify"]  # the package shows the verb of that name
     monkeypatch.setattr(module, "attempts", interrupted)
     problem = posed(Stribeck())
     hasty = LeastSquares(stages=(Stage(1e-2, 1),))
@@ -106,7 +106,7 @@ def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.M
         armed.append(True)
         yield Start(good.states, {**good.parameters, "friction.coulomb": 3.0}, "far off")
 
-    module = sys.modules["pneuopt.identify"]
+    module = sys.modules["pneuopt.identification.identify"]
     monkeypatch.setattr(module, "attempts", two)
     monkeypatch.setattr(module, "_is_at_noise", lambda _: False)
     problem, method = posed(Coulomb()), LeastSquares(progress=progress)

@@ -8,12 +8,12 @@ import pytest
 
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import SensorLag
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identify import identify, predict, validate
+from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb

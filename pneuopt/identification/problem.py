@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.checks import measured_outputs
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.loop_start import LoggedLoop
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
+from pneuopt.identification.checks import measured_outputs
+from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.checks import measured_outputs
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identifiability import Verdict, expected, from_covariance, listed
-from pneuopt.posing import Problem
-from pneuopt.profiles import Profile, traced
+from pneuopt.identification.checks import measured_outputs
+from pneuopt.identification.identifiability import Verdict, expected, from_covariance, listed
+from pneuopt.identification.problem import Problem
+from pneuopt.identification.profiles import Profile, traced
 from pneuopt.shooting.convergence import NOISE_LEVEL
 from pneuopt.shooting.equations import gaps_of
 from pneuopt.shooting.segments import segment, start_nodes
@@ -21,7 +21,7 @@ from pneuopt.shooting.solution import Code, Status
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pneuopt.identify import IdentificationResult
+    from pneuopt.identification.identify import IdentificationResult
 
 Array = NDArray[np.float64]
 DOUBTFUL = 0.15  # relative standard deviation beyond which the likelihood of a log parameter is no parabola

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from scipy.stats import chi2
 
-from pneuopt.checks import check_logs
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import System, names
+from pneuopt.identification.checks import check_logs
+from pneuopt.identification.problem import Problem, as_logged
 from pneuopt.logs.experiments import Experiment
-from pneuopt.posing import Problem, as_logged
 from pneuopt.quantities.errors import check_known, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory

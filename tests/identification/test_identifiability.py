@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identifiability import identifiability
-from pneuopt.identify import IdentificationResult, identify
+from pneuopt.identification.identifiability import identifiability
+from pneuopt.identification.identify import IdentificationResult, identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import names
-from pneuopt.posing import Problem
+from pneuopt.identification.problem import Problem
 from pneuopt.shooting.least_squares import Fit, solve_least_squares
 from pneuopt.shooting.solution import Code
 

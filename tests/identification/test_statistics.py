@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from pneuopt.statistics import agreement, confidence_interval, correlation, correlation_time, noise_level
+from pneuopt.identification.statistics import agreement, confidence_interval, correlation, correlation_time, noise_level
 
 
 def test_agreement_of_a_known_error() -> None:

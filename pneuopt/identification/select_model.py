@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.system import System, names
-from pneuopt.identify import IdentificationResult, identify, validate
+from pneuopt.identification.identify import IdentificationResult, identify, validate
+from pneuopt.identification.review import AT_BOUND, NOT_TOLD
+from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.scrutiny import AT_BOUND, NOT_TOLD
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.statistics import bayes_information, likelihood_ratio_p
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files import read_drive, write_fit
-from pneuopt.identify import IdentificationResult, identify
+from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.profiles import profile
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import LuGre, Stribeck
-from pneuopt.profiles import profile
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tomlfile import read_toml

@@ -12,17 +12,17 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.checks import measured_outputs
 from pneuopt.dynamics.hooks import Start
+from pneuopt.identification.checks import measured_outputs
+from pneuopt.identification.problem import Problem
+from pneuopt.identification.silence import WARM_STAGES, solved
+from pneuopt.identification.statistics import noise_level
 from pneuopt.logs.experiments import Experiment
-from pneuopt.posing import Problem
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.convergence import NOISE_LEVEL
 from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.silence import WARM_STAGES, solved
-from pneuopt.statistics import noise_level
 
 Array = NDArray[np.float64]
 REFITS = 12

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.checks import check_content, check_free, check_logs, check_smooth
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import System
-from pneuopt.excitation import missing, motion, remedy
+from pneuopt.identification.checks import check_content, check_free, check_logs, check_smooth
+from pneuopt.identification.excitation import missing, motion, remedy
+from pneuopt.identification.problem import Problem, as_logged
+from pneuopt.identification.profiles import Profile
 from pneuopt.logs.experiments import Experiment
-from pneuopt.posing import Problem, as_logged
-from pneuopt.profiles import Profile
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.shooting.least_squares import STIFFEST, LeastSquares
 from pneuopt.shooting.segments import Segments, segment, start_nodes, substeps_for
