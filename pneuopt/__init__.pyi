@@ -49,7 +49,6 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import corners, draws, samples, tolerances
 from pneuopt.files import read_drive, write_fit
-from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.identification.compare_logs import LogComparison, compare_logs
 from pneuopt.identification.identifiability import Verdict, identifiability
 from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
@@ -77,7 +76,6 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Iso6358
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.models.sensing import coarse_delay, with_sensors
-from pneuopt.pareto import pareto_front
 from pneuopt.plotting import (
     plot_bode,
     plot_correlation,
@@ -96,11 +94,13 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.full_space import FullSpace
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.study import grid, sweep
-from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.confirmed import Confirmed
+from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
+from pneuopt.tuning.validation import DesignValidation, validate_design
 from pneuopt.tuningfile import read_tuning, write_tuned
 
 __version__: str

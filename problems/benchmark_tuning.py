@@ -44,10 +44,10 @@ from t32 import DIGITS, MARGIN, PEAKS, RANGES, SPEC, STEP, benchmark
 import pneuopt as po
 from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.tuning.candidates import Space, span
 from pneuopt.tuning.condensed import condense
 from pneuopt.tuning.screening import merit
 from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.space import Space, span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -32,8 +32,8 @@ from pneuopt.evaluation.requirements import Requirement
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

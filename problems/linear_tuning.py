@@ -27,9 +27,9 @@ from scipy.optimize import differential_evolution
 
 import pneuopt as po
 from pneuopt.evaluation.specification import specify
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import merit
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
 from pneuopt.tuning.two_phase import TwoPhase, solve_two_phase
 
 if TYPE_CHECKING:

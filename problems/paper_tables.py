@@ -40,7 +40,7 @@ from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PeakContr
 from pneuopt.models.paper2015 import PRINTED, paper_plant
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tune import TuningResult, tune
+from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 if TYPE_CHECKING:

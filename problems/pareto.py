@@ -28,9 +28,9 @@ import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.plotting import plot_front
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import screen
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
 from pneuopt.tuning.two_phase import two_phase_path
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from pneuopt.evaluation.requirements import Requirement
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models import catalog
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
 
 Array = NDArray[np.float64]
 Ranges = dict[str, tuple[float, float]]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 import pneuopt as po
 from pneuopt.identification.statistics import agreement
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.tuning.candidates import measure
+from pneuopt.tuning.space import measure
 
 Array = NDArray[np.float64]
 

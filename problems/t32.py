@@ -27,9 +27,9 @@ import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.tuning.candidates import Space, span
 from pneuopt.tuning.screening import merit, screen
 from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.space import Space, span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -22,7 +22,7 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.solution import Code, Status
 from pneuopt.tomlfile import read_toml
-from pneuopt.tune import TuningResult, tune
+from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuningfile import read_tuning
 
 

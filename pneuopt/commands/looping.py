@@ -37,15 +37,15 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate, point_of_operation, respond
-from pneuopt.fresh_plants import DesignValidation, validate_design
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.output import check_outputs, records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.solution import Code
-from pneuopt.tune import TuningResult, tune
-from pneuopt.tuning.candidates import cut
+from pneuopt.tuning.space import cut
+from pneuopt.tuning.tune import TuningResult, tune
+from pneuopt.tuning.validation import DesignValidation, validate_design
 from pneuopt.tuningfile import Tuning, write_tuned
 
 if TYPE_CHECKING:

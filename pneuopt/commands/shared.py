@@ -19,7 +19,7 @@ from pneuopt.quantities.output import check_outputs, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tune import TuningResult
+from pneuopt.tuning.tune import TuningResult
 from pneuopt.tuningfile import Tuning, read_tuning
 
 if TYPE_CHECKING:

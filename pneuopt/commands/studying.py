@@ -35,7 +35,6 @@ from pneuopt.evaluation.requirements import (
     name,
 )
 from pneuopt.loopfile import checked
-from pneuopt.pareto import pareto_front
 from pneuopt.plotting import plot_front, plot_map
 from pneuopt.quantities.errors import InputError, check_known, require
 from pneuopt.quantities.output import records, write_text
@@ -44,6 +43,7 @@ from pneuopt.requirementfile import KEYS, bound_units
 from pneuopt.study import INTERRUPTED as CUT_SHORT
 from pneuopt.study import grid, sweep
 from pneuopt.studyfile import Axis, Pareto, Study, read_axes, read_pareto, read_study
+from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuningfile import Tuning
 
 if TYPE_CHECKING:

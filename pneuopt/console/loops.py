@@ -15,10 +15,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
 from pneuopt.evaluation.evaluate import HUNTING
 from pneuopt.evaluation.requirements import AT_LEAST, PERCENT, Requirement, name
-from pneuopt.fresh_plants import DesignValidation
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 from pneuopt.study import INTERRUPTED
+from pneuopt.tuning.validation import DesignValidation
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,7 +11,7 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.scenarios import Factor, Scenarios, applied
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.candidates import Space
+from pneuopt.tuning.space import Space
 
 Array = NDArray[np.float64]
 

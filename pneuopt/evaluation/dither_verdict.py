@@ -17,7 +17,7 @@ from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.candidates import command_range
+from pneuopt.tuning.space import command_range
 
 if TYPE_CHECKING:
     import pandas as pd

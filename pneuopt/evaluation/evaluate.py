@@ -24,7 +24,7 @@ from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.candidates import cut, inputs, measure, readings, spacing
+from pneuopt.tuning.space import cut, inputs, measure, readings, spacing
 
 if TYPE_CHECKING:
     import pandas as pd

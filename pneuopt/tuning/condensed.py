@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import ROBUSTNESS, name
 from pneuopt.evaluation.specification import Specification
-from pneuopt.nlp.sqp import SQP, Point, descend
 from pneuopt.quantities.errors import require
-from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.linearised import SMOOTH, Linearised, differentiated
 from pneuopt.tuning.screening import Judge, Screened, first_population, generation, merit
 from pneuopt.tuning.simulator import Simulator, each
+from pneuopt.tuning.space import Space, Tell
+from pneuopt.tuning.sqp import SQP, Point, descend
 
 Array = NDArray[np.float64]
 UNFELT = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # gradients are wrong or useless there

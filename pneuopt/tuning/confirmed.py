@@ -17,10 +17,10 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import require
 from pneuopt.shooting.full_space import FullSpace, prepare, solve_from
 from pneuopt.shooting.solution import Solution
-from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator, each
+from pneuopt.tuning.space import Space
 from pneuopt.tuning.two_phase import TwoPhase, check_exact, transcribe
 
 Array = NDArray[np.float64]

@@ -16,11 +16,11 @@ from pneuopt.evaluation.means import TAIL
 from pneuopt.evaluation.metrics import PERIODS_INSIDE
 from pneuopt.evaluation.requirements import ROBUSTNESS, Overshoot, SettlingTime, SteadyStateError, read
 from pneuopt.evaluation.specification import Specification
-from pneuopt.nlp.sqp import Groups, Point
+from pneuopt.tuning.readings import CONTROL, METERED, watched
 from pneuopt.tuning.rows import READ, Lanes
 from pneuopt.tuning.rows import nodes as times
 from pneuopt.tuning.simulator import Mask, Simulator, is_sound
-from pneuopt.tuning.watching import CONTROL, METERED, watched
+from pneuopt.tuning.sqp import Groups, Point
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -18,8 +18,8 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.means import TAIL
 from pneuopt.evaluation.requirements import AT_LEAST, Requirement, SettlingTime, bound, most, name
 from pneuopt.evaluation.specification import Specification
-from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import Space
 
 Array = NDArray[np.float64]
 DIGITS = 3  # of a relaxed limit, rounded so that the design that was found keeps it

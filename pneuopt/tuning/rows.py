@@ -26,7 +26,7 @@ from pneuopt.evaluation.requirements import (
     StepEnvelope,
 )
 from pneuopt.evaluation.window import Window
-from pneuopt.tuning.watching import CONTROL, FLOW, INTEGRAL, SIGNAL, Grid
+from pneuopt.tuning.readings import CONTROL, FLOW, INTEGRAL, SIGNAL, Grid
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array]

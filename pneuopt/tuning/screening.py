@@ -16,9 +16,9 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import ROBUSTNESS, SettlingTime, most, name
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import require
-from pneuopt.tuning.candidates import Space, Tell
+from pneuopt.tuning.readings import LOST, unsettled
 from pneuopt.tuning.simulator import Index, Mask, Responses, Simulator
-from pneuopt.tuning.watching import LOST, unsettled
+from pneuopt.tuning.space import Space, Tell
 
 Array = NDArray[np.float64]
 PENALTY = 20.0  # weight of a limit's relative violation beside that of never settling

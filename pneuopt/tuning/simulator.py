@@ -17,7 +17,8 @@ from pneuopt.evaluation.requirements import AT_LEAST, ROBUSTNESS, read
 from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.candidates import (
+from pneuopt.tuning.readings import CONTROL, METERED, Grid, is_averaged, read_off, watched
+from pneuopt.tuning.space import (
     MOST_SUBSTEPS,
     POINTS_A_PERIOD,
     Space,
@@ -28,7 +29,6 @@ from pneuopt.tuning.candidates import (
     spacing,
     substeps,
 )
-from pneuopt.tuning.watching import CONTROL, METERED, Grid, is_averaged, read_off, watched
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -34,7 +34,7 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.shooting.full_space import FullSpace, Problem, follow, prepare, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, every
-from pneuopt.tuning.candidates import STABLE, Space, Tell, fastest, substeps
+from pneuopt.tuning.space import STABLE, Space, Tell, fastest, substeps
 
 Array = NDArray[np.float64]
 KINDS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)

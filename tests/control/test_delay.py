@@ -18,11 +18,11 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tune import tune
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import tune
 
 GAINS = {"pid.Kp": 0.18, "pid.Ki": 0.9, "pid.Kd": 0.008, "pid.Tf": 0.01}
 STEP = Step(0.1, horizon=0.3)

@@ -33,11 +33,11 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tune import tune
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import tune
 
 Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 SAME = {

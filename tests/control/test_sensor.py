@@ -21,11 +21,11 @@ from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, ModelError
-from pneuopt.tune import tune
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 LAG = 5e-3

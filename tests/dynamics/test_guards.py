@@ -24,7 +24,7 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tune import tune
+from pneuopt.tuning.tune import tune
 
 DRIVE = PneumaticDrive()
 CLOSED = {"valve.dead_zone": 0.1, "valve.rounding": 1e-5, "load.mass": 50.0}

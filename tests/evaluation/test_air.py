@@ -17,9 +17,9 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.candidates import span
+from pneuopt.tuning.readings import watched
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.watching import watched
+from pneuopt.tuning.space import span
 
 STEP = Step(0.1, horizon=0.4, start={"position": 0.2, "pressure_b": 3.5e5})
 

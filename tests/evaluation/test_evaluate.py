@@ -23,8 +23,8 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code
-from pneuopt.tune import tune
 from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.tune import tune
 
 GAINS = {"pid.Kp": 150.0, "pid.Ki": 8000.0, "pid.lower": -60.0, "pid.upper": 60.0}
 VALVE = {"pid.Kp": 1.0, "pid.Ki": 20.0, "pid.Kd": 0.03, "pid.Tf": 3e-3, "pid.lower": -5.0, "pid.upper": 5.0}

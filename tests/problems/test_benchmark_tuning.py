@@ -10,7 +10,7 @@ import pytest
 from benchmark_tuning import Clock, Run, Study
 from numpy.typing import NDArray
 
-from pneuopt.tuning.candidates import span
+from pneuopt.tuning.space import span
 
 
 def test_a_run_that_never_settles_is_the_worst() -> None:

@@ -37,13 +37,13 @@ from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code
-from pneuopt.tune import TuningResult, tune
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.confirmed import Confirmed
 from pneuopt.tuning.linearised import Linearised, differentiated
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import TuningResult, tune
 
 STEP = Step(1.0, horizon=2.0)
 QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
@@ -269,7 +269,7 @@ def test_a_working_set_takes_in_the_case_that_it_missed() -> None:
 
 @pytest.mark.parametrize(("friction", "kind"), [(Viscous(), "TwoPhase"), (Stribeck(), "Screening")])
 def test_one_plant_and_few_gains_are_left_to_the_other_methods(friction: Viscous | Stribeck, kind: str) -> None:
-    from pneuopt.tune import _checked
+    from pneuopt.tuning.tune import _checked
 
     loop = ClosedLoop(ForceDrive(friction).system(), PID())
     given = loop.parameters.with_bounds({"pid.Kp": (1.0, 10.0)}).freed("pid.Kp")

@@ -39,8 +39,8 @@ from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code
-from pneuopt.tune import TuningResult, tune
 from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 FAST = Screening(members=10, generations=4, bands=(0.1,), refinements=50)

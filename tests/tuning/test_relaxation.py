@@ -22,10 +22,10 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code
-from pneuopt.tune import Method, TuningResult, tune
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import Method, TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 FAST = Screening(members=20, generations=6, bands=(), refinements=80)

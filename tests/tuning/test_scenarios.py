@@ -19,11 +19,11 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tune import tune
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Judge, Screening, screen
 from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 STEP = Step(1.0, horizon=2.0)

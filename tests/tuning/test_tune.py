@@ -26,10 +26,10 @@ from pneuopt.models.paper2015 import paper_plant
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code
-from pneuopt.tune import TuningResult, tune
-from pneuopt.tuning.candidates import span
 from pneuopt.tuning.screening import Judge, Screening, screen
 from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
 
 STEP = Step(1.0)

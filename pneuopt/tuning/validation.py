@@ -17,8 +17,8 @@ from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import Space
 
 if TYPE_CHECKING:
     import pandas as pd

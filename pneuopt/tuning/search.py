@@ -7,16 +7,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.certificate import GRAZING, Found, Notary, TuningResult, missing, with_relaxations
 from pneuopt.evaluation.requirements import most, name, told
 from pneuopt.evaluation.specification import Specification
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tuning.candidates import Space, Tell
 from pneuopt.tuning.condensed import Condensed, condense
 from pneuopt.tuning.confirmed import Confirmed, reconsidered
 from pneuopt.tuning.relaxation import alone, row, together
+from pneuopt.tuning.result import GRAZING, Found, Notary, TuningResult, missing, with_relaxations
 from pneuopt.tuning.screening import Screening, merit, screen
 from pneuopt.tuning.simulator import Simulator, each
+from pneuopt.tuning.space import Space, Tell
 from pneuopt.tuning.two_phase import TwoPhase, solve_two_phase
 
 Array = NDArray[np.float64]

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.certificate import Found, TuningResult
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import Requirement, bound, bounded, most, name, shown
@@ -25,13 +24,14 @@ from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.evaluation.specification import Specification, allowing
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.search import Method, Search, brief, ended_in
 from pneuopt.shooting.solution import Code, Solution, Status
-from pneuopt.tune import pose
-from pneuopt.tuning.candidates import Tell
 from pneuopt.tuning.relaxation import settling
+from pneuopt.tuning.result import Found, TuningResult
 from pneuopt.tuning.screening import first_population
+from pneuopt.tuning.search import Method, Search, brief, ended_in
 from pneuopt.tuning.simulator import each
+from pneuopt.tuning.space import Tell
+from pneuopt.tuning.tune import pose
 from pneuopt.tuning.two_phase import TwoPhase, TwoPhasePath, two_phase_path
 
 if TYPE_CHECKING:

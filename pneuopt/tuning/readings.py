@@ -16,7 +16,7 @@ from pneuopt.dynamics.system import names
 from pneuopt.evaluation.air import consumption, metered
 from pneuopt.evaluation.metrics import About, Envelope, batch_metrics
 from pneuopt.evaluation.window import Window
-from pneuopt.tuning.candidates import MOST_READINGS
+from pneuopt.tuning.space import MOST_READINGS
 
 Array = NDArray[np.float64]
 SIGNAL, CONTROL, FLOW, SPOOL = range(4)  # outputs that are run, the last two for `METERED` only

@@ -10,10 +10,10 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PhaseMargin, SettlingTime
 from pneuopt.evaluation.scenarios import applied, samples, tolerances
-from pneuopt.fresh_plants import validate_design
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.validation import validate_design
 
 STEPS = [Step(1.0, horizon=2.0), Step(-0.5, horizon=1.5)]
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from pneuopt.nlp.sqp import SQP, Groups, Point, descend, program
+from pneuopt.tuning.sqp import SQP, Groups, Point, descend, program
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pneuopt.certificate import Notary, TuningResult
 from pneuopt.control.disturbance import disturbed
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
@@ -21,13 +20,14 @@ from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.identification.checks import check_smooth
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.search import Method, Search, relax
 from pneuopt.shooting.solution import Code
-from pneuopt.tuning.candidates import Space, Tell, span
 from pneuopt.tuning.condensed import Condensed, check_differentiable, is_differentiable
 from pneuopt.tuning.confirmed import Confirmed, check_confirmable
-from pneuopt.tuning.reach import check_reach
+from pneuopt.tuning.feasibility import check_reach
+from pneuopt.tuning.result import Notary, TuningResult
 from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.search import Method, Search, relax
+from pneuopt.tuning.space import Space, Tell, span
 from pneuopt.tuning.two_phase import TwoPhase, check_exact, is_exact, is_light, is_linear
 
 __all__ = ["Method", "TuningResult", "pose", "tune"]

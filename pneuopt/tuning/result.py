@@ -19,9 +19,9 @@ from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tuning.candidates import Space
 from pneuopt.tuning.relaxation import sentence
 from pneuopt.tuning.simulator import Simulator, worst
+from pneuopt.tuning.space import Space
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,10 +15,10 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tune import tune
-from pneuopt.tuning.candidates import POINTS_A_PERIOD, highest, resolving, spacing, span
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import POINTS_A_PERIOD, highest, resolving, spacing, span
+from pneuopt.tuning.tune import tune
 
 STEP = Step(0.1, horizon=0.4)
 WIDE = {"dither.amplitude": (0.0, 60.0), "dither.frequency": (20.0, 200.0)}

@@ -19,7 +19,7 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.tuning.candidates import Space, highest
+from pneuopt.tuning.space import Space, highest
 
 Array = NDArray[np.float64]
 SLOW = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read

@@ -14,14 +14,14 @@ from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import GainMargin, MaxSensitivity, Overshoot, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.pareto import pareto_front
 from pneuopt.plotting import plot_front
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tune import Method
-from pneuopt.tuning.candidates import span
+from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import span
+from pneuopt.tuning.tune import Method
 from pneuopt.tuning.two_phase import TwoPhase
 
 STEP = Step(1.0, horizon=1.5)

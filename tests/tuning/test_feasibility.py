@@ -29,8 +29,8 @@ from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tune import tune
 from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.tune import tune
 
 FREE = {"pid.Kp": (1.0, 40.0), "pid.Ki": (5.0, 200.0)}
 CLIP = {"pid.lower": -5.0, "pid.upper": 5.0}

@@ -1,1 +1,0 @@
-"""Multiple shooting: what a problem is (`transcription`), and the methods that solve it."""
