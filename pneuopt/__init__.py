@@ -115,7 +115,7 @@ _HOME = {
     "pneuopt.models.sensing": ("coarse_delay", "with_sensors"),
     "pneuopt.identification.select_model": ("ModelSelection", "select_model"),
     "pneuopt.tuning.pareto": ("pareto_front",),
-    "pneuopt.study": ("grid", "sweep"),
+    "pneuopt.studies.sweep": ("grid", "sweep"),
     "pneuopt.tuning.validation": ("DesignValidation", "validate_design"),
     "pneuopt.files": ("read_drive", "write_fit"),
     "pneuopt.tuningfile": ("read_tuning", "write_tuned"),

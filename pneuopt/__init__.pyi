@@ -93,7 +93,7 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.full_space import FullSpace
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.study import grid, sweep
+from pneuopt.studies.sweep import grid, sweep
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.confirmed import Confirmed
 from pneuopt.tuning.pareto import pareto_front

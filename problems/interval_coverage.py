@@ -27,7 +27,7 @@ import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.quantities.errors import require
-from pneuopt.study import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED
 
 if TYPE_CHECKING:
     import pandas as pd

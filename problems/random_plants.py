@@ -29,7 +29,7 @@ import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Array
-from pneuopt.study import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 
 from pneuopt.cli import app
 from pneuopt.commands import studying
-from pneuopt.study import sweep
+from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
 

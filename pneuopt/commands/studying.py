@@ -40,8 +40,8 @@ from pneuopt.quantities.errors import InputError, check_known, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.units import write_value
 from pneuopt.requirementfile import KEYS, bound_units
-from pneuopt.study import INTERRUPTED as CUT_SHORT
-from pneuopt.study import grid, sweep
+from pneuopt.studies.sweep import INTERRUPTED as CUT_SHORT
+from pneuopt.studies.sweep import grid, sweep
 from pneuopt.studyfile import Axis, Pareto, Study, read_axes, read_pareto, read_study
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuningfile import Tuning

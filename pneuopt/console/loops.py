@@ -17,7 +17,7 @@ from pneuopt.evaluation.evaluate import HUNTING
 from pneuopt.evaluation.requirements import AT_LEAST, PERCENT, Requirement, name
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.study import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED
 from pneuopt.tuning.validation import DesignValidation
 
 if TYPE_CHECKING:

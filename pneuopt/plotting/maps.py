@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pneuopt.plotting.canvas import BLUE, MOST_COLUMNS, RED, axes_grid, shown_of
 from pneuopt.quantities.errors import check_known, require
-from pneuopt.study import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED
 
 if TYPE_CHECKING:
     import pandas as pd

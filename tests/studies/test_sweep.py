@@ -28,7 +28,7 @@ from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.study import INTERRUPTED, grid, sweep
+from pneuopt.studies.sweep import INTERRUPTED, grid, sweep
 
 RIG = ParameterSet(
     {
