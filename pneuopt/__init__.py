@@ -117,8 +117,8 @@ _HOME = {
     "pneuopt.tuning.pareto": ("pareto_front",),
     "pneuopt.studies.sweep": ("grid", "sweep"),
     "pneuopt.tuning.validation": ("DesignValidation", "validate_design"),
-    "pneuopt.files": ("read_drive", "write_fit"),
-    "pneuopt.tuningfile": ("read_tuning", "write_tuned"),
+    "pneuopt.files.drive": ("read_drive", "write_fit"),
+    "pneuopt.files.tuning": ("read_tuning", "write_tuned"),
     "pneuopt.plotting": (
         "plot_bode",
         "plot_correlation",

@@ -48,7 +48,8 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import corners, draws, samples, tolerances
-from pneuopt.files import read_drive, write_fit
+from pneuopt.files.drive import read_drive, write_fit
+from pneuopt.files.tuning import read_tuning, write_tuned
 from pneuopt.identification.compare_logs import LogComparison, compare_logs
 from pneuopt.identification.identifiability import Verdict, identifiability
 from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
@@ -101,7 +102,6 @@ from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 from pneuopt.tuning.validation import DesignValidation, validate_design
-from pneuopt.tuningfile import read_tuning, write_tuned
 
 __version__: str
 __all__ = [

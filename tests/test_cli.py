@@ -15,15 +15,15 @@ from pneuopt.cli import app
 from pneuopt.commands import identifying, looping
 from pneuopt.console.fits import show_estimates
 from pneuopt.console.terminal import screen
-from pneuopt.files import read_drive, read_status
+from pneuopt.files.drive import read_drive, read_status
+from pneuopt.files.toml import read_toml
+from pneuopt.files.tuning import read_tuning
 from pneuopt.logs.experiments import read_log
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tomlfile import read_toml
 from pneuopt.tuning.tune import TuningResult, tune
-from pneuopt.tuningfile import read_tuning
 
 
 def run(line: str) -> Result:

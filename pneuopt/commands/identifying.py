@@ -20,7 +20,7 @@ from pneuopt.commands.shared import (
 from pneuopt.console.fits import show_estimates, show_fit, show_selection, show_verdict
 from pneuopt.console.terminal import progress, screen, show_status
 from pneuopt.dynamics.system import System
-from pneuopt.files import Drive, read_drive, write_fit
+from pneuopt.files.drive import Drive, read_drive, write_fit
 from pneuopt.identification.identifiability import Verdict, identifiability
 from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
 from pneuopt.identification.select_model import select_model

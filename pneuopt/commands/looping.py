@@ -37,6 +37,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate, point_of_operation, respond
+from pneuopt.files.tuning import Tuning, write_tuned
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.output import check_outputs, records
@@ -46,7 +47,6 @@ from pneuopt.shooting.solution import Code
 from pneuopt.tuning.space import cut
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.validation import DesignValidation, validate_design
-from pneuopt.tuningfile import Tuning, write_tuned
 
 if TYPE_CHECKING:
     import pandas as pd

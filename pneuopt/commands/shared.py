@@ -12,7 +12,8 @@ import numpy as np
 
 from pneuopt.console.terminal import screen, show_written
 from pneuopt.evaluation.requirements import Bounds, SettlingTime, StepEnvelope
-from pneuopt.files import read_drive, read_status
+from pneuopt.files.drive import read_drive, read_status
+from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.identify import IdentificationResult
 from pneuopt.plotting import check_figure_path, save_figure
 from pneuopt.quantities.output import check_outputs, write_json, write_text
@@ -20,7 +21,6 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.solution import Code, Status
 from pneuopt.tuning.tune import TuningResult
-from pneuopt.tuningfile import Tuning, read_tuning
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

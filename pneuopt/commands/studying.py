@@ -34,17 +34,17 @@ from pneuopt.evaluation.requirements import (
     most,
     name,
 )
-from pneuopt.loopfile import checked
+from pneuopt.files.loop import checked
+from pneuopt.files.requirements import KEYS, bound_units
+from pneuopt.files.study import Axis, Pareto, Study, read_axes, read_pareto, read_study
+from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import plot_front, plot_map
 from pneuopt.quantities.errors import InputError, check_known, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.units import write_value
-from pneuopt.requirementfile import KEYS, bound_units
 from pneuopt.studies.sweep import INTERRUPTED as CUT_SHORT
 from pneuopt.studies.sweep import grid, sweep
-from pneuopt.studyfile import Axis, Pareto, Study, read_axes, read_pareto, read_study
 from pneuopt.tuning.pareto import pareto_front
-from pneuopt.tuningfile import Tuning
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.files import read_drive, write_fit
+from pneuopt.files.drive import read_drive, write_fit
+from pneuopt.files.toml import read_toml
 from pneuopt.identification.identify import IdentificationResult, identify
 from pneuopt.identification.profiles import profile
 from pneuopt.logs.experiments import Experiment
@@ -16,7 +17,6 @@ from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import LuGre, Stribeck
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tomlfile import read_toml
 
 FILE = """
 [drive]

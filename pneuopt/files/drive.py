@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import tomlkit
 
 from pneuopt.dynamics.system import System
+from pneuopt.files.toml import Places, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.logs.experiments import CHANNELS
 from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
@@ -32,7 +33,6 @@ from pneuopt.quantities.output import plain, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import read_value
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tomlfile import Places, inline_table, read_parameter, read_toml, toml_table, write_parameter
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,12 +8,12 @@ from typer.testing import CliRunner
 
 from pneuopt.cli import app
 from pneuopt.evaluation.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
+from pneuopt.files.scenarios import read_fresh, read_scenarios
+from pneuopt.files.toml import read_toml
+from pneuopt.files.tuning import read_tuning
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.scenariofile import read_fresh, read_scenarios
-from pneuopt.tomlfile import read_toml
-from pneuopt.tuningfile import read_tuning
 
 RIG = ParameterSet({"load.mass": Parameter(5.0, "kg", 1.0, 20.0), "friction.coulomb": Parameter(40.0, "N")})
 RIG = RIG | ParameterSet({"pid.Kp": Parameter(2.0, "V*s/m", free=True)})

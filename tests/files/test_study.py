@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
+from pneuopt.files.study import Axis, Pareto, read_axes, read_pareto, read_study
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studyfile import Axis, Pareto, read_axes, read_pareto, read_study
 
 RIG = ParameterSet(
     {

@@ -14,15 +14,15 @@ from pneuopt.dynamics.system import System
 from pneuopt.evaluation.requirements import AT_LEAST, Bounds, Requirement
 from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
 from pneuopt.evaluation.specification import specify
-from pneuopt.loopfile import SECTIONS, TUNABLE, checked, read_loop, value_of
+from pneuopt.files.loop import SECTIONS, TUNABLE, checked, read_loop, value_of
+from pneuopt.files.requirements import KEYS, bound_units, read_bound
+from pneuopt.files.scenarios import read_fresh, read_scenarios
+from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.quantities.errors import check_known, require
 from pneuopt.quantities.output import plain, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_value
-from pneuopt.requirementfile import KEYS, bound_units, read_bound
-from pneuopt.scenariofile import read_fresh, read_scenarios
 from pneuopt.shooting.solution import Status
-from pneuopt.tomlfile import inline_table, read_parameter, read_toml, toml_table, write_parameter
 
 if TYPE_CHECKING:
     import pandas as pd

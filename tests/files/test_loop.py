@@ -12,13 +12,13 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form, SeriesForm, to_parallel
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
+from pneuopt.files.tuning import read_tuning, write_tuned
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tuningfile import read_tuning, write_tuned
 
 PLANT = SecondOrder().system()
 STANDARD = """[pid]

@@ -31,15 +31,15 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.files import read_status
+from pneuopt.files.drive import read_status
+from pneuopt.files.toml import read_toml
+from pneuopt.files.tuning import Tuning, read_tuning, write_tuned
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, PressureDependent
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tomlfile import read_toml
-from pneuopt.tuningfile import Tuning, read_tuning, write_tuned
 
 PLANT = SecondOrder().system()
 TUNING = """# my loop, 2024

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
+from pneuopt.files.toml import Places, read_toml
 from pneuopt.quantities.errors import InputError
-from pneuopt.tomlfile import Places, read_toml
 
 
 def written(folder: Path, text: str, name: str = "drive.toml") -> Path:

@@ -13,10 +13,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import System
+from pneuopt.files.toml import read_parameter
 from pneuopt.quantities.errors import InputError, check_known, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.units import read_value, write_value
-from pneuopt.tomlfile import read_parameter
 
 Sections = Mapping[str, Any]
 T = TypeVar("T")

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.files import read_drive, read_status, write_fit
+from pneuopt.files.drive import read_drive, read_status, write_fit
+from pneuopt.files.toml import read_toml
 from pneuopt.identification.identifiability import Verdict
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
@@ -27,7 +28,6 @@ from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.solution import Code, Status
-from pneuopt.tomlfile import read_toml
 
 AXIS = """# my axis, 2024
 [drive]

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.files.requirements import read_bound
+from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_known, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_value, scale_of, unit_of
-from pneuopt.requirementfile import read_bound
-from pneuopt.tomlfile import read_toml
 
 _KEYS = {
     "study": ("drive", "tuning"),
