@@ -1,6 +1,6 @@
 """`python -m pneuopt`."""
 
-from pneuopt.cli import main
+from pneuopt.cli.app import main
 
 if __name__ == "__main__":
     main()

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pneuopt.cli import app
+from pneuopt.cli.app import app
 from pneuopt.evaluation.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.files.scenarios import read_fresh, read_scenarios
 from pneuopt.files.toml import read_toml

@@ -11,10 +11,11 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
-from pneuopt.cli import app
-from pneuopt.commands import identifying, looping
-from pneuopt.console.fits import show_estimates
-from pneuopt.console.terminal import screen
+from pneuopt.cli.app import app
+from pneuopt.cli.app import identify as identifying
+from pneuopt.cli.app import tune as looping
+from pneuopt.cli.show_fits import show_estimates
+from pneuopt.cli.terminal import screen
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
@@ -239,7 +240,7 @@ def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys\n"
         "sys.argv = ['pneuopt', '--help']\n"
-        "from pneuopt.cli import main\n"
+        "from pneuopt.cli.app import main\n"
         "try: main()\n"
         "except SystemExit as stop: assert stop.code == 0, stop.code\n"
         "heavy = {'pandas', 'matplotlib', 'scipy', 'casadi', 'numpy', 'pint'} & set(sys.modules)\n"
@@ -257,7 +258,7 @@ def test_ctrl_c_ends_a_real_process_with_130(folder: Path) -> None:
         "import os, signal\n"
         "from pneuopt.commands import looping\n"
         "looping.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
-        "from pneuopt.cli import main\n"
+        "from pneuopt.cli.app import main\n"
         "main()\n"
     )
     arguments = [sys.executable, "-c", code, "tune", "drive.toml", "tuning.toml", "-o", "tuned.toml"]

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.commands.shared import (
+from pneuopt.cli.shared import (
     GOOD,
     INTERRUPTED,
     NOT_GOOD,
@@ -19,8 +19,8 @@ from pneuopt.commands.shared import (
     read_loop,
     warn_of,
 )
-from pneuopt.console.loops import SMALLEST_IS_WORST, metric_units, show_cases, show_front
-from pneuopt.console.terminal import progress, screen
+from pneuopt.cli.show_loops import SMALLEST_IS_WORST, metric_units, show_cases, show_front
+from pneuopt.cli.terminal import progress, screen
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import (

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
-from pneuopt.console.terminal import figure, new_table
+from pneuopt.cli.terminal import figure, new_table
 from pneuopt.identification.identifiability import Verdict
 from pneuopt.identification.review import NOT_TOLD
 from pneuopt.identification.select_model import ModelSelection

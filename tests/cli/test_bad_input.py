@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from pneuopt.cli import app
+from pneuopt.cli.app import app
 
 
 def run(line: str) -> Result:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.console.terminal import screen, show_written
+from pneuopt.cli.terminal import screen, show_written
 from pneuopt.evaluation.requirements import Bounds, SettlingTime, StepEnvelope
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.tuning import Tuning, read_tuning

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.commands.shared import (
+from pneuopt.cli.shared import (
     INTERRUPTED,
     Columns,
     Outputs,
@@ -22,7 +22,7 @@ from pneuopt.commands.shared import (
     read_loop,
     write_csv,
 )
-from pneuopt.console.loops import (
+from pneuopt.cli.show_loops import (
     show_dither,
     show_gains,
     show_metrics,
@@ -31,7 +31,7 @@ from pneuopt.console.loops import (
     show_requirements,
     show_validation,
 )
-from pneuopt.console.terminal import progress, screen, show_status
+from pneuopt.cli.terminal import progress, screen, show_status
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.commands.shared import (
+from pneuopt.cli.shared import (
     Outputs,
     Writers,
     background,
@@ -17,8 +17,8 @@ from pneuopt.commands.shared import (
     warn_of,
     write_csv,
 )
-from pneuopt.console.fits import show_estimates, show_fit, show_selection, show_verdict
-from pneuopt.console.terminal import progress, screen, show_status
+from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show_verdict
+from pneuopt.cli.terminal import progress, screen, show_status
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import Drive, read_drive, write_fit
 from pneuopt.identification.identifiability import Verdict, identifiability

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
-from pneuopt.console.terminal import figure, new_table
+from pneuopt.cli.terminal import figure, new_table
 from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness

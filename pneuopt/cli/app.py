@@ -72,8 +72,8 @@ def identify(
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
     with _guarded():
-        from pneuopt.commands.identifying import run_identify, run_select
-        from pneuopt.commands.shared import Outputs
+        from pneuopt.cli.identify import run_identify, run_select
+        from pneuopt.cli.shared import Outputs
 
         run = run_select if select else run_identify
         raise typer.Exit(run(drive, _expanded(logs), Outputs(output, json, plot), window, quiet))
@@ -94,8 +94,8 @@ def tune(
 ) -> None:
     """Tune PID and dither together, and certify them."""
     with _guarded():
-        from pneuopt.commands.looping import run_tune
-        from pneuopt.commands.shared import Outputs
+        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.tune import run_tune
 
         raise typer.Exit(run_tune(fit, tuning, Outputs(output, json, plot), quiet))
 
@@ -114,9 +114,9 @@ def simulate(
     """Simulate a closed loop, or predict a log."""
     with _guarded():
         require((tuning is None) != (log is None), "give either a tuning file or --log, to say what to simulate")
-        from pneuopt.commands.identifying import run_predict
-        from pneuopt.commands.looping import run_simulate
-        from pneuopt.commands.shared import Outputs
+        from pneuopt.cli.identify import run_predict
+        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.tune import run_simulate
 
         outputs = Outputs(output, json, plot)
         if tuning is not None:
@@ -137,8 +137,8 @@ def study(
 ) -> None:
     """Certify a loop over a grid of any parameters, or tune it along a Pareto front; status 1 if a case fails."""
     with _guarded():
-        from pneuopt.commands.shared import Outputs
-        from pneuopt.commands.studying import run_study
+        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.study import run_study
 
         raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet))
 
@@ -150,7 +150,7 @@ def info() -> None:
     import platform
     from importlib.metadata import version
 
-    from pneuopt.console.terminal import screen, show_pairs
+    from pneuopt.cli.terminal import screen, show_pairs
     from pneuopt.dynamics.compiled.compiler import cache_directory, compiler
 
     packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")

@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from pneuopt.console.loops import metric_units, show_dither, show_gains, show_metrics
-from pneuopt.console.terminal import screen
+from pneuopt.cli.show_loops import metric_units, show_dither, show_gains, show_metrics
+from pneuopt.cli.terminal import screen
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID

@@ -1,1 +1,0 @@
-"""What each command does: read, compute, show, and only then write."""
