@@ -7,7 +7,7 @@ The concept map, in the order in which data flow:
     identify(system, logs, freed)     -> IdentificationResult: estimates with confidence intervals
     select_model(systems, logs, ...)  -> which of several models the logs support, and why
     identifiability(system, logs, freed) -> Verdict: what the logs can tell, in words, before a fit
-    profile, derived(result, ...)     -> an interval where a linear one lies; one of a figure made of estimates
+    profile, propagate_error(...)     -> an interval where a linear one lies; one of a figure made of estimates
     validate(system, logs, fitted)    -> how well a held-out log is predicted, and what is left in the residuals
     ClosedLoop(system, PID, Dither)   -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
@@ -15,7 +15,7 @@ The concept map, in the order in which data flow:
     judge_dither(loop, steps, tuned)  -> whether the dither is useful, useless or harmful, and why, in numbers
     find_limit_cycle(t, speed)        -> hunting or crawl in a response or a log: amplitude, frequency, stick share
     evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser
-    take_over(loop, x, old, new)      -> the state from which a running loop goes on with new gains, without a bump
+    bumpless_transfer(loop, x, ...)   -> the state from which a running loop goes on with new gains, without a bump
     record(Rig(loop, sensors), ...)   -> the log of a rig with stick-slip, hysteresis, sensors; and the truth
     pareto_front(loop, steps, ...)    -> what one requirement costs in terms of another: a row a certified design
     grid, sweep(fn, parameters, cases)-> a study: any function over named cases, in processes, as a table
@@ -67,11 +67,11 @@ _HOME = {
         "to_series",
         "to_standard",
     ),
-    "pneuopt.control.bumpless": ("take_over",),
+    "pneuopt.control.bumpless": ("bumpless_transfer",),
     "pneuopt.control.reference": ("Step",),
     "pneuopt.control.sensor": ("Encoder", "SensorLag"),
     "pneuopt.control.loop": ("ClosedLoop",),
-    "pneuopt.control.averaging": ("averaged", "mean_start", "ripple"),
+    "pneuopt.control.averaging": ("average_dither", "mean_start", "ripple"),
     "pneuopt.evaluation.margins": ("margins",),
     "pneuopt.evaluation.metrics": ("step_metrics",),
     "pneuopt.shooting.least_squares": ("LeastSquares",),
@@ -83,7 +83,7 @@ _HOME = {
     "pneuopt.identification.identify": ("IdentificationResult", "identify", "predict", "validate"),
     "pneuopt.identification.identifiability": ("Verdict", "identifiability"),
     "pneuopt.identification.profiles": ("Profile", "profile"),
-    "pneuopt.identification.propagation": ("Derived", "derived"),
+    "pneuopt.identification.propagation": ("PropagatedValue", "propagate_error"),
     "pneuopt.evaluation.requirements": (
         "IAE",
         "ISE",

@@ -1,7 +1,7 @@
 """Types of the names that `__init__.py` loads lazily."""
 
-from pneuopt.control.averaging import averaged, mean_start, ripple
-from pneuopt.control.bumpless import take_over
+from pneuopt.control.averaging import average_dither, mean_start, ripple
+from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import (
@@ -55,7 +55,7 @@ from pneuopt.identification.identifiability import Verdict, identifiability
 from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
 from pneuopt.identification.losses import Huber, SoftL1
 from pneuopt.identification.profiles import Profile, profile
-from pneuopt.identification.propagation import Derived, derived
+from pneuopt.identification.propagation import PropagatedValue, propagate_error
 from pneuopt.identification.select_model import ModelSelection, select_model
 from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
@@ -119,7 +119,6 @@ __all__ = [
     "ConvergenceError",
     "Coulomb",
     "Cylinder",
-    "Derived",
     "DesignValidation",
     "DiscreteSystem",
     "Dither",
@@ -161,6 +160,7 @@ __all__ = [
     "Polytropic",
     "PressureDependent",
     "Profile",
+    "PropagatedValue",
     "ProportionalValve",
     "Quantity",
     "Rig",
@@ -187,13 +187,13 @@ __all__ = [
     "Verdict",
     "Viscous",
     "Waveform",
-    "averaged",
+    "average_dither",
+    "bumpless_transfer",
     "coarse_delay",
     "compare_logs",
     "contacts",
     "corners",
     "define",
-    "derived",
     "differentiate",
     "discretise",
     "dither_effect",
@@ -219,6 +219,7 @@ __all__ = [
     "plot_steps",
     "predict",
     "profile",
+    "propagate_error",
     "proportional_band",
     "proportional_gain",
     "read_drive",
@@ -236,7 +237,6 @@ __all__ = [
     "split",
     "step_metrics",
     "sweep",
-    "take_over",
     "to_parallel",
     "to_series",
     "to_standard",

@@ -21,17 +21,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from claims import Claim, arguments, finish, frame
-from numpy.typing import NDArray
 
 import pneuopt as po
-from pneuopt.control.averaging import averaged, mean_start, ripple
+from pneuopt.control.averaging import average_dither, mean_start, ripple
 from pneuopt.models.catalog import s32, t32
+from pneuopt.quantities.arrays import Array
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 DRIVES = {"T32": t32, "S32": s32}
 SWEEP = (1000.0, 628.0, 400.0, 200.0, 126.0)  # [rad/s]
 CASES = [("T32", rate, 2.0) for rate in SWEEP] + [("S32", 1000.0, 2.0), ("S32", 200.0, 1.0)]
@@ -77,7 +76,10 @@ def _case(drive_name: str, rate: float, volts: float, shape: po.Waveform = po.Wa
     half_way = GAINS["cylinder.start"] + STEP * HORIZON / 2 / p.value("cylinder.stroke")
     point = p.with_values({"cylinder.start": half_way})
     begun = time.perf_counter()
-    model, swing = averaged(loop, point, reference=STEP, nodes=NODES), ripple(loop, point, reference=STEP, nodes=NODES)
+    model, swing = (
+        average_dither(loop, point, reference=STEP, nodes=NODES),
+        ripple(loop, point, reference=STEP, nodes=NODES),
+    )
     built = time.perf_counter() - begun
     resolved, resolving = _timed(loop, inputs, p, start)
     mean, averaging = _timed(model, inputs, p, mean_start(swing, start))

@@ -21,8 +21,8 @@ from claims import Claim, arguments, finish, frame
 from scipy import integrate
 
 import pneuopt as po
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compiled
-from pneuopt.dynamics.system import Symbols, System, define, discretise, names, stacked, vector
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compile_function
+from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector, stack
 from pneuopt.models.catalog import b32
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.parameters import Quantity
@@ -67,8 +67,8 @@ def _identified(name: str, drive: PneumaticDrive, truth: po.ParameterSet, free: 
 def generate(drive: PneumaticDrive, truth: po.ParameterSet, seed: int = SEED, seconds: float = 10.0) -> po.Experiment:
     """The log, at 1 kHz after 0.3 s of settling, with u = clip(4 e - 0.15 v, +-0.6) held over each sample."""
     system, h, samples = drive.system(), 1e-3, round(1000 * seconds)
-    p, state = vector(system.parameters, truth), names(system.states)
-    ode = compiled(system.ode)
+    p, state = parameter_vector(system.parameters, truth), names(system.states)
+    ode = compile_function(system.ode)
     u = np.zeros(1)
     solver = integrate.ode(lambda t, x: ode(t, x, u, p)[0])
     scale = np.array([q.nominal for q in system.states])
@@ -105,7 +105,7 @@ def exact(truth: po.ParameterSet, lugre: bool = False, *, seconds: float = 10.0,
     given = np.array([reference(t % PERIOD if t > 0 else 0.0) for t in instants.tolist()])[None, :, None]
     start = np.array([[START.get(n, 0.0) for n in names(loop.states)]])
     h = np.full((1, len(instants)), SAMPLE)
-    run = rollout.run(start, given, vector(loop.parameters, truth), instants[None], h, substeps=substeps)
+    run = rollout.run(start, given, parameter_vector(loop.parameters, truth), instants[None], h, substeps=substeps)
     columns = dict(zip(names(loop.outputs), run.y[0, SETTLING:].T.copy(), strict=True))
     return po.Trajectory(np.arange(samples) * SAMPLE, columns)
 
@@ -118,7 +118,7 @@ def sampled_loop(lugre: bool = False) -> tuple[System, Rollout]:
 
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - a right-hand side's
         inside = ca.vertcat(*(x[n] for n in names(drive.states)))
-        rates, y = drive.ode(t, inside, x["valve_voltage"], stacked(p))
+        rates, y = drive.ode(t, inside, x["valve_voltage"], stack(p))
         found = dict(zip(names(drive.states), ca.vertsplit(rates), strict=True))
         shown = dict(zip(names(drive.outputs), ca.vertsplit(y), strict=True))
         return {**found, "valve_voltage": ca.SX(0)}, {**shown, "valve_voltage": x["valve_voltage"]}
@@ -142,7 +142,7 @@ def simulation_seconds(log: po.Experiment, lugre: bool = False) -> float:
     best = math.inf
     for _ in range(5):
         began = time.process_time()
-        rollout.run(start, u, vector(system.parameters, truth), t, np.full_like(t, SAMPLE), substeps=COARSE)
+        rollout.run(start, u, parameter_vector(system.parameters, truth), t, np.full_like(t, SAMPLE), substeps=COARSE)
         best = min(best, time.process_time() - began)
     return best
 

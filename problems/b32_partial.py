@@ -84,7 +84,7 @@ def shaped(drive: PneumaticDrive, truth: po.ParameterSet) -> list[Claim]:
 
 def two_steps(drive: PneumaticDrive, truth: po.ParameterSet, log: po.Experiment) -> list[Claim]:
     """Friction of a `ForceDrive` under the force of the logged pressures, their noise taken for force; then jointly."""
-    pushed = log.trajectory.with_columns({"force": drive.push(log.trajectory, truth)})
+    pushed = log.trajectory.with_columns({"force": drive.air_force(log.trajectory, truth)})
     first = replace(log, trajectory=pushed).select(["force", "position"])
     load = ForceDrive(drive.friction, drive.load)
     claims = _case("force", load, [first], truth.select(load.parameters), FREE, None)

@@ -30,9 +30,9 @@ from scipy.optimize import least_squares
 
 import pneuopt as po
 from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.identification.problem import Problem
+from pneuopt.identification.problem import EstimationProblem
 from pneuopt.models.catalog import b32
-from pneuopt.quantities.trajectories import Array
+from pneuopt.quantities.arrays import Array
 from pneuopt.shooting.full_space import FullSpace, solve_full_space
 from pneuopt.shooting.least_squares import LeastSquares
 
@@ -207,7 +207,7 @@ def full_space(limit: float) -> dict[str, float]:
     system, truth, blind = _blind()
     whole = generate(*b32()).select(LOGGED)
     log = po.Experiment(whole.trajectory.rows(0, SHORT), whole.noise, name="b32")
-    problem = Problem(system, (log,), system.parameters | blind, LeastSquares())
+    problem = EstimationProblem(system, (log,), system.parameters | blind, LeastSquares())
     posed = problem.transcription(_start(log, blind))
     transcription = type(posed)(posed.system.with_substeps(COARSE), posed.parameters, posed.phases, posed.residuals)
     began = time.process_time()

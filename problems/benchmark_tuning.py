@@ -37,23 +37,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from claims import Claim, arguments, finish, frame
-from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 from t32 import DIGITS, MARGIN, PEAKS, RANGES, SPEC, STEP, benchmark
 
 import pneuopt as po
-from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.tuning.condensed import condense
+from pneuopt.quantities.arrays import Array
+from pneuopt.tuning.condensed import run_gradient_search
 from pneuopt.tuning.screening import merit
 from pneuopt.tuning.simulator import Responses, Simulator
-from pneuopt.tuning.space import Space, span
+from pneuopt.tuning.space import Space, search_space
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-Array = NDArray[np.float64]
 FRICTION = ("friction.coulomb", "friction.static", "friction.viscous")
 SPREADS: dict[str | tuple[str, ...], float] = {"load.mass": 0.3, FRICTION: 0.3, "supply.pressure": 0.1}
 MORE = {"pid.Tf": (5e-4, 0.05), "pid.b": (0.0, 1.5), "pid.c": (0.0, 1.5)}
@@ -61,8 +60,8 @@ MORE |= {"feedforward.gain": (-20.0, 40.0), "feedforward.time": (2e-3, 0.2)}
 FRESH, DRAWN = 100, 32
 TIMES = (1, 3)  # the CPU time at which SciPy's best is kept, over that of condensed
 OWN: dict[str, Any] = {"popsize": 4, "strategy": "randtobest1bin", "mutation": (0.3, 0.9), "recombination": 0.9}
-TIGHT = SPEC.tightened(MARGIN, PEAKS)
-WARM = po.Condensed(members=5, generations=1, iterations=1, renewals=0, polish=1)
+TIGHT = SPEC.tighten(MARGIN, PEAKS)
+WARM = po.Condensed(members=5, generations=1, iterations=1, restarts=0, polish=1)
 BOUNDS = {
     "5_corners.condensed.median": "<= 0.157",
     "10_corners.condensed.median": "<= 0.075",
@@ -83,7 +82,7 @@ class Job:
 
 
 JOBS = {
-    "5_nominal": Job(5, lambda _: NOMINAL),
+    "5_nominal": Job(5, lambda _: NO_SCENARIOS),
     "5_corners": Job(5, lambda given: po.corners(given, SPREADS)),
     "10_corners": Job(10, lambda given: po.corners(given, SPREADS)),
     "10_plants": Job(10, lambda given: po.samples(given, SPREADS, DRAWN)),
@@ -154,11 +153,11 @@ def run(names: list[str], seeds: int, cap: float = 10.0) -> Study:
 def compete(study: Study, name: str, seeds: int, cap: float) -> None:
     """One row of the study: every method, every seed."""
     loop, given = posed(JOBS[name].gains)
-    space, scenarios = span(loop, given), JOBS[name].scenarios(given)
+    space, scenarios = search_space(loop, given), JOBS[name].scenarios(given)
     simulator = Simulator(loop, [STEP], space, scenarios)
     fresh = Simulator(loop, [STEP], space, po.samples(given, SPREADS, FRESH, seed=999))
-    simulator.values(space.draw(np.full((8, len(space.names)), 0.5)), TIGHT)  # compiled and warm
-    condense(simulator, [STEP], space, TIGHT, WARM, space.start, lambda _: None)
+    simulator.values(space.from_unit(np.full((8, len(space.names)), 0.5)), TIGHT)  # compiled and warm
+    run_gradient_search(simulator, [STEP], space, TIGHT, WARM, space.start, lambda _: None)
     runs, reach = study.runs.setdefault(name, {}), study.reach.setdefault(name, {})
 
     def note(method: str, seed: int, point: Array, seconds: float) -> None:
@@ -185,14 +184,14 @@ def posed(gains: int) -> tuple[po.ClosedLoop, po.ParameterSet]:
     if gains == len(RANGES):
         return loop, given
     loop = replace(loop, feedforward=po.Feedforward())
-    own = loop.parameters.select(loop.parameters.matching("feedforward.*"))
+    own = loop.parameters.select(loop.parameters.match_names("feedforward.*"))
     return loop, (given | own).with_bounds(MORE).freed(*MORE)
 
 
 def timed(simulator: Simulator, space: Space, seed: int) -> tuple[Array, float]:
     """What condensed finds, and the CPU time that it takes [s]."""
     begun = time.process_time()
-    found = condense(simulator, [STEP], space, TIGHT, po.Condensed(seed=seed), space.start, lambda _: None)
+    found = run_gradient_search(simulator, [STEP], space, TIGHT, po.Condensed(seed=seed), space.start, lambda _: None)
     return found.point, time.process_time() - begun
 
 
@@ -205,11 +204,11 @@ def evolve(clock: Clock, space: Space, seed: int, options: dict[str, Any]) -> No
     """SciPy's differential evolution, a generation a batch, stopped by the clock, or once all its members are alike."""
 
     def cost(unit: Array) -> Array:
-        return clock.merits(space.draw(np.clip(np.atleast_2d(unit.T), 0.0, 1.0)))
+        return clock.merits(space.from_unit(np.clip(np.atleast_2d(unit.T), 0.0, 1.0)))
 
     settings: dict[str, Any] = {"bounds": [(0.0, 1.0)] * len(space.names), "vectorized": True, "updating": "deferred"}
     settings |= {"maxiter": 10**9, "tol": 0, "atol": 0, "polish": False, "seed": seed}
-    settings |= {"x0": space.unit(space.start), **options}
+    settings |= {"x0": space.to_unit(space.start), **options}
     solve: Any = differential_evolution  # its stub knows scalar costs only
     try:
         solve(cost, **settings)
@@ -221,8 +220,8 @@ def judged(
     loop: po.ClosedLoop, space: Space, scenarios: Scenarios, fresh: Simulator, point: Array
 ) -> tuple[float, float, float, float]:
     """Certified settling time and overshoot, the worst; shares of fresh plants that settle, and that keep 5 %."""
-    printed = space.printed(point, DIGITS)
-    found = po.evaluate(loop, STEP, space.filled(printed), scenarios=scenarios, band=SPEC.band)
+    printed = space.round_point(point, DIGITS)
+    found = po.evaluate(loop, STEP, space.parameters_at(printed), scenarios=scenarios, band=SPEC.band)
     responses = fresh.respond(printed[None], SPEC.band)
     settled = np.isfinite(responses.table("SettlingTime")[0, 1:]).sum()
     kept = (responses.table("Overshoot")[0, 1:] <= 5.0).sum()

@@ -120,7 +120,7 @@ def tuned(ranges: Mapping[str, tuple[float, float]], start: Mapping[str, float])
     """
     drive, p = lagging(po.Stribeck())
     loop = controlled(drive.system(), dither=bool(start))
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "sensor.*", *(["dither.*"] if start else [])))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "sensor.*", *(["dither.*"] if start else [])))
     given = (p | own).with_values({**HAND, **DAMPER, **start}).with_bounds(ranges).freed(*ranges)
     limits = [] if start else [po.MaxSensitivity(SENSITIVITY)]
     return po.tune(loop, STEPS, given, minimise=po.SettlingTime(BAND), subject_to=limits, method=SEARCH)
@@ -134,7 +134,7 @@ def controlled(plant: System, *, dither: bool) -> po.ClosedLoop:
 
 def knobs(found: po.TuningResult) -> dict[str, float]:
     """The controller's numbers, as the rig gets them."""
-    names = found.parameters.matching("pid.*")
+    names = found.parameters.match_names("pid.*")
     names += tuple(n for n in found.parameters if n.startswith("dither."))
     return {n: found.parameters.value(n) for n in names}
 
@@ -201,7 +201,7 @@ def measured(name: str, recording: Recording, v: float, since: float) -> list[Cl
 def cycle(name: str, run_: po.Trajectory, v: float, since: float, dithered: bool) -> list[Claim]:
     """The limit cycle in the speed, as `find_limit_cycle` sees it without knowing of sticking: amplitude 0 is none."""
     period = 1 / FREQUENCY if dithered else None
-    found = po.find_limit_cycle(run_.t, run_["speed"], start=since, dither_period=period, least=LEAST * v)
+    found = po.find_limit_cycle(run_.t, run_["speed"], start=since, dither_period=period, min_amplitude=LEAST * v)
     if found is None:
         return [Claim(f"{name}.cycle", 0.0, "mm/s")]
     return [

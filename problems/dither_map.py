@@ -32,14 +32,14 @@ from pneuopt.evaluation.requirements import Requirement
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
+from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-Array = NDArray[np.float64]
 SPEED, HORIZON, BAND = 0.05, 0.8, 0.05  # [m/s], [s], of the step
 UP = po.Step(SPEED, horizon=HORIZON, start={"position": 0.25, "pressure_b": 3.5e5})
 BACK = po.Step(-2 * SPEED, initial=SPEED, horizon=HORIZON, start={"position": 0.25})
@@ -100,7 +100,7 @@ def controlled(shape: Waveform = Waveform.SINE) -> po.ClosedLoop:
 
 
 def filled(loop: po.ClosedLoop) -> po.ParameterSet:
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*", "sensor.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*", "sensor.*"))
     return (t32()[1].with_values(HARDWARE).fixed("*") | own).with_values(GIVEN)
 
 
@@ -137,7 +137,7 @@ def mapped(loop: po.ClosedLoop, gains: po.ParameterSet) -> tuple[Array, Array]:
     }
     given = gains.fixed("*").with_bounds(bounds).freed(*bounds)
     spec = specify({po.SettlingTime(BAND): 1.0, po.AirUse(): 1.0})
-    space = span(loop, given)
+    space = search_space(loop, given)
     grid = np.stack(np.meshgrid(AMPLITUDES, FREQUENCIES), axis=-1).reshape(-1, 2)
     responses = Simulator(loop, STEPS, space, spec=spec).respond(grid, BAND)
     size = len(FREQUENCIES), len(AMPLITUDES)
@@ -163,7 +163,7 @@ def main(job: Job) -> "DataFrame":
             before, after = (float(verdict.table[c][row]) for c in ("without", "with"))
             claims.append(Claim(f"verdict.{name}.{row}", after, unit, before))
     effect = job.verdicts["retuned"].effect
-    claims += [Claim("moved.spool", effect.spool), Claim("moved.passed", effect.passed)]
+    claims += [Claim("moved.spool", effect.spool), Claim("moved.passed", effect.valve_gain)]
     for name, settled in job.maps.items():
         reference = settled[:, 0].min()  # amplitude 0: the same at every frequency
         claims.append(Claim(f"map.{name}.useful", float(np.mean(useful(settled, job)))))

@@ -88,8 +88,8 @@ def _inseparable(drive: po.ForceDrive, windows: tuple[po.Experiment, ...]) -> li
     print(verdict)
     pair = ("load.force", "friction.coulomb_asymmetry")
     return [
-        Claim("inseparable.offset_and_asymmetry", float(pair in verdict.together), bound=">= 1"),
-        Claim("inseparable.others", float(len(verdict.together) - 1), bound="<= 0"),
+        Claim("inseparable.offset_and_asymmetry", float(pair in verdict.indistinguishable), bound=">= 1"),
+        Claim("inseparable.others", float(len(verdict.indistinguishable) - 1), bound="<= 0"),
         *(Claim(f"inseparable.inflation.{name}", verdict.table["inflation"][name]) for name in pair),
     ]
 
@@ -118,7 +118,7 @@ def _selected(windows: tuple[po.Experiment, ...]) -> list[Claim]:
 def _tuned(drive: po.ForceDrive, fitted: po.ParameterSet) -> list[Claim]:
     """A sampled speed loop on the fitted axis (ideal speed sensing), a plain PI beside it."""
     loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3), po.Dither(frequency=100.0))
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     given = (fitted.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
     limits = (po.Overshoot(0.02), po.MaxSensitivity(1.4))
     best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=limits)

@@ -27,7 +27,7 @@ import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.quantities.errors import require
-from pneuopt.studies.sweep import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED_CASE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,7 +61,7 @@ def study(case: str, seeds: range) -> "pd.DataFrame":
     fn = functools.partial(identified, case)
     rows = po.sweep(fn, truth, draws, progress=lambda line: print(f"{case}: {line}", end="\r", file=sys.stderr))
     require("converged" in rows, f"no draw was identified: {rows['error'].iloc[0]}")
-    return rows[rows["error"] != INTERRUPTED]  # Ctrl-C keeps the draws that are done
+    return rows[rows["error"] != INTERRUPTED_CASE]  # Ctrl-C keeps the draws that are done
 
 
 def identified(case: str, truth: po.ParameterSet) -> dict[str, Any]:

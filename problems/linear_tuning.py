@@ -21,28 +21,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from claims import Claim, arguments, finish, frame
-from numpy.typing import NDArray
 from paper_tables import PAPERS_PID, PID_1, _closed_loop
 from scipy.optimize import differential_evolution
 
 import pneuopt as po
 from pneuopt.evaluation.specification import specify
+from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.screening import merit
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.two_phase import TwoPhase, solve_two_phase
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Array = NDArray[np.float64]
 BOUNDS = {"Kp": (0.0, 2.0), "Ki": (PAPERS_PID.Ki, 10.0), "Kd": (0.0, 0.1), "Tf": (0.005, 0.1)}
 SPEC = specify(po.SettlingTime(0.001), [po.Overshoot(2e-4), po.PeakControl(1.225), po.MaxSensitivity(1.2)])
 STEP = po.Step(1.0, horizon=1.0)
 METHOD = TwoPhase(starts=1)
 STARTS, CAP, SAME, NEAR = 20, 10.0, 1e-3, 0.01
 SEEDS = (0, 1, 2)
-TIGHT = SPEC.tightened(METHOD.margin, METHOD.margin / 300)
+TIGHT = SPEC.tighten(METHOD.margin, METHOD.margin / 300)
 
 
 def main() -> "DataFrame":
@@ -51,7 +50,7 @@ def main() -> "DataFrame":
     given = (
         given.fixed("*").with_bounds({f"pid.{n}": b for n, b in BOUNDS.items()}).freed(*(f"pid.{n}" for n in BOUNDS))
     )
-    space = span(loop, given)
+    space = search_space(loop, given)
     many = solve_two_phase(loop, [STEP], space, TIGHT, replace(METHOD, starts=STARTS), lambda _: None)
     begun = time.process_time()
     best = solve_two_phase(loop, [STEP], space, TIGHT, METHOD, lambda _: None).best
@@ -79,11 +78,11 @@ def reached(trace: list[tuple[float, float]], goal: float) -> float:
 def evolved(simulator: Simulator, goal: float, limit: float, seed: int) -> list[tuple[float, float]]:
     """Differential evolution's best merits [s] over CPU time [s], up to the goal or the limit."""
     space, trace = simulator.space, list[tuple[float, float]]()
-    simulator.values(space.draw(np.full((8, len(space.names)), 0.5)), TIGHT)  # compiled and warm
+    simulator.values(space.from_unit(np.full((8, len(space.names)), 0.5)), TIGHT)  # compiled and warm
     begun = time.process_time()
 
     def cost(unit: Array) -> Array:
-        points = space.draw(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
+        points = space.from_unit(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
         merits = merit(simulator.values(points, TIGHT), TIGHT, STEP.horizon)
         best = min(trace[-1][1] if trace else inf, float(merits.min()))
         trace.append((time.process_time() - begun, best))
@@ -95,7 +94,7 @@ def evolved(simulator: Simulator, goal: float, limit: float, seed: int) -> list[
     settings |= {"tol": 0, "atol": 0}
     solve: Any = differential_evolution  # its stub knows scalar costs only
     with suppress(StopIteration):
-        solve(cost, [(0.0, 1.0)] * len(space.names), seed=seed, x0=space.unit(space.start), **settings)
+        solve(cost, [(0.0, 1.0)] * len(space.names), seed=seed, x0=space.to_unit(space.start), **settings)
     return trace
 
 

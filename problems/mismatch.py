@@ -30,7 +30,7 @@ import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
 from pneuopt.quantities.errors import require
-from pneuopt.studies.sweep import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED_CASE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -83,7 +83,7 @@ def run(count: int = COUNT, cases: tuple[str, ...] = tuple(CASES)) -> "pd.DataFr
     rows = po.sweep(drawn, none, draws, progress=lambda line: print(line, end="\r", file=sys.stderr))
     require("converged" in rows, f"no draw was identified: {rows['error'].iloc[0]}")
     kinds = [list(CASES)[round(k)] for k in rows["hardware"]]
-    return rows.assign(kind=kinds)[rows["error"] != INTERRUPTED]
+    return rows.assign(kind=kinds)[rows["error"] != INTERRUPTED_CASE]
 
 
 def drawn(given: po.ParameterSet) -> dict[str, Any]:

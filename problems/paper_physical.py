@@ -22,14 +22,14 @@ import casadi as ca
 import numpy as np
 import paper_dither
 from claims import Claim, arguments, finish, frame
-from r25 import HALF_TRAVEL, PER_VOLT, TRANSDUCER, Array, Case, linearised, polynomials, simulated
+from r25 import HALF_TRAVEL, PER_VOLT, TRANSDUCER, Case, linearised, polynomials, simulated
 from scipy import optimize, signal
 
-from pneuopt.dynamics.system import names, vector
+from pneuopt.dynamics.system import names, parameter_vector
 from pneuopt.models.catalog import DriveSet, r25
 from pneuopt.models.paper2015 import (
     KAPPA,
-    PRINTED,
+    PRINTED_COEFFICIENTS,
     OperatingPoint,
     R,
     constant_term,
@@ -43,6 +43,7 @@ from pneuopt.models.paper2015 import (
 )
 from pneuopt.models.pneumatic.gas import CRITICAL_RATIO, REFERENCE_DENSITY, Smoothing
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
+from pneuopt.quantities.arrays import Array
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -129,7 +130,7 @@ def _balances() -> list[Claim]:
     drive, p = r25()
     state, voltage = {"position": 0.3, "speed": 0.4, "pressure_a": 4.4e5, "pressure_b": 4.0e5}, 1.7
     x, travel = [state[n] for n in names(drive.states)], voltage * PER_VOLT
-    rates = np.array(drive.system().ode(0, x, [voltage], vector(p, p))[0]).ravel()
+    rates = np.array(drive.system().ode(0, x, [voltage], parameter_vector(p, p))[0]).ravel()
     rows, worst = [], 0.0
     for side, sign, number in (("a", 1, 7), ("b", -1, 8)):
         pressure, pressure_rate = state[f"pressure_{side}"], rates[names(drive.states).index(f"pressure_{side}")]
@@ -203,7 +204,7 @@ def _equation_16() -> list[Claim]:
     top, bottom = second_order(operating_point(*r25(), half_travel=HALF_TRAVEL))
     formulas = (bottom[1], bottom[2], top[0] * PER_VOLT * TRANSDUCER)
     *by_ad, pole, zero = polynomials(r25())
-    rows, printed = [], (PRINTED[1], PRINTED[2], PRINTED[0])
+    rows, printed = [], (PRINTED_COEFFICIENTS[1], PRINTED_COEFFICIENTS[2], PRINTED_COEFFICIENTS[0])
     for label, values in (("formulas", formulas), ("ad", by_ad)):
         for name, value, reference in zip(("s", "constant", "gain"), values, printed, strict=True):
             rows.append(near(f"eq16.{label}.{name}", value, reference, 1e-9))
@@ -211,7 +212,7 @@ def _equation_16() -> list[Claim]:
         *rows,
         near("eq16.ad.third_pole", pole, -0.83333, 1e-5, "1/s"),
         near("eq16.ad.zero", zero, -0.83333, 1e-5, "1/s"),
-        Claim("eq16.gain", PRINTED[0] / PRINTED[2], "1", 14.711, "14.711 +- 0.0005"),
+        Claim("eq16.gain", PRINTED_COEFFICIENTS[0] / PRINTED_COEFFICIENTS[2], "1", 14.711, "14.711 +- 0.0005"),
     ]
 
 
@@ -223,7 +224,7 @@ def _alternatives() -> list[Claim]:
     w = 1j * np.geomspace(1, 100, 50)
     found = linearised(tight)
     ad = [TRANSDUCER * (found.C @ np.linalg.solve(s * np.eye(3) - found.A, found.B)).item() for s in w]
-    line = PRINTED[0] / np.polyval([1.0, *PRINTED[1:]], w)
+    line = PRINTED_COEFFICIENTS[0] / np.polyval([1.0, *PRINTED_COEFFICIENTS[1:]], w)
     return [
         near("printed_set.eq15.s", bottom[1], 17.5, 1e-7),
         near("printed_set.eq15.constant", bottom[2], 86.34, 1e-7),
@@ -242,7 +243,7 @@ def _other(values: Mapping[str, float]) -> DriveSet:
 
 def _line(case: Case) -> Array:
     """Eq. (16) under the same gains, from polynomials [V]."""
-    gain, rate, constant = PRINTED
+    gain, rate, constant = PRINTED_COEFFICIENTS
     q = {"Kp": 0.0, "Ki": 0.0, "Kd": 0.0, **case.gains}
     lag, s = [q["Tf"], 1.0], [1.0, 0.0]
     top = np.polyadd(np.polymul([q["Kp"], q["Ki"]], lag), [q["Kd"], 0.0, 0.0])

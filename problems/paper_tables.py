@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from claims import Claim, arguments, finish, frame
-from numpy.typing import NDArray
 from scipy import optimize, signal
 
 from pneuopt.control.dither import Dither
@@ -35,9 +34,10 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.margins import Margins, frequency_response, margins
-from pneuopt.evaluation.metrics import About, step_metrics
+from pneuopt.evaluation.metrics import BandCentre, step_metrics
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
-from pneuopt.models.paper2015 import PRINTED, paper_plant
+from pneuopt.models.paper2015 import PRINTED_COEFFICIENTS, paper_plant
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import TuningResult, tune
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 GRID, HORIZON = 5e-4, 2.0
 CHATTER = 1000.0  # [rad/s]
 READING = 0.1  # [%] how well the paper's figures agree with the loop that it prints: its first row is 0.08 off
@@ -177,7 +176,7 @@ def _checks() -> list[Claim]:
     """The same from polynomials and scipy.signal, which share nothing with pneuopt."""
     cases = (PLAIN, CHATTER_1, CHATTER_2, PID_1, PID_2)
     worst = max(float(np.abs(_run(case)["speed"] - _by_scipy(case)).max()) for case in cases)
-    gain, rate, constant = PRINTED
+    gain, rate, constant = PRINTED_COEFFICIENTS
     w = np.sqrt(max(np.roots([1.0, rate**2 - 2 * constant, constant**2 - gain**2])))
     phase = 180 - float(np.degrees(np.angle(constant - w**2 + 1j * rate * w)))
     return [
@@ -231,7 +230,7 @@ def _as_case(parameters: ParameterSet) -> Case:
 
 
 def _settled(case: Case) -> float:
-    m = step_metrics(_run(case).t, _by_scipy(case), 1.0, 0.0, band=0.001, about=About.REFERENCE)
+    m = step_metrics(_run(case).t, _by_scipy(case), 1.0, 0.0, band=0.001, band_centre=BandCentre.REFERENCE)
     return m["SettlingTime"]
 
 
@@ -248,7 +247,7 @@ def _spread(parameters: ParameterSet) -> tuple[float, float]:
 
 
 def _by_scipy(case: Case) -> Array:
-    gain, rate, constant = PRINTED
+    gain, rate, constant = PRINTED_COEFFICIENTS
     q, s, lag = case.pid, np.array([1.0, 0.0]), np.array([case.pid.Tf, 1.0])
     top = np.polyadd(np.polymul(np.polyadd(q.Kp * s, [q.Ki]), lag), q.Kd * np.array([1.0, 0.0, 0.0]))
     bottom, plant = np.polymul(s, lag), case.gain * gain

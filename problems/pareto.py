@@ -28,9 +28,9 @@ import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.plotting import plot_front
-from pneuopt.tuning.screening import screen
+from pneuopt.tuning.screening import run_screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.two_phase import two_phase_path
 
 if TYPE_CHECKING:
@@ -103,9 +103,9 @@ def paper_loop() -> tuple[po.ClosedLoop, po.ParameterSet]:
 
 def continuation(loop: po.ClosedLoop, given: po.ParameterSet, front: "pd.DataFrame") -> float:
     """CPU seconds of the solver along the front's limits, each solved from its neighbours; inf if one fails."""
-    space, method, limits = span(loop, given), po.TwoPhase(), front["limit"].to_numpy(dtype=float).tolist()
+    space, method, limits = search_space(loop, given), po.TwoPhase(), front["limit"].to_numpy(dtype=float).tolist()
     limits[-1] *= 1 + 1e-3  # the least that can be, which leaves no room for the search's margin
-    specs = [asked(limit).tightened(method.margin, method.margin / 300) for limit in limits]
+    specs = [asked(limit).tighten(method.margin, method.margin / 300) for limit in limits]
     path = two_phase_path(loop, [LINEAR], space, specs[0], method)
     start = front[list(space.names)].to_numpy(dtype=float)[0]
     path.follow(start, specs[:1])  # warm
@@ -121,12 +121,12 @@ def asked(limit: float) -> Specification:
 
 def beaten(loop: po.ClosedLoop, given: po.ParameterSet, front: "pd.DataFrame", k: int) -> float:
     """By how much differential evolution settles faster than a design within its limit, as a fraction."""
-    space, spec = span(loop, given), asked(front["limit"].to_numpy(dtype=float)[k])
+    space, spec = search_space(loop, given), asked(front["limit"].to_numpy(dtype=float)[k])
     simulator = Simulator(loop, [LINEAR], space, spec=spec)
-    found = screen(simulator, [LINEAR], space, spec, EVOLUTION, space.start, lambda _: None)
+    found = run_screening(simulator, [LINEAR], space, spec, EVOLUTION, space.start, lambda _: None)
     values = {n: float(v[0]) for n, v in simulator.values(found.point[None], spec).items()}
     ours = front["SettlingTime"].to_numpy(dtype=float)[k]
-    return 1 - values["SettlingTime"] / ours if not spec.violated(values, 1e-4) else -np.inf
+    return 1 - values["SettlingTime"] / ours if not spec.violations(values, 1e-4) else -np.inf
 
 
 def main(job: Job) -> "pd.DataFrame":

@@ -8,15 +8,14 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 import pneuopt as po
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.models.catalog import DriveSet, r25
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.pneumatic.valve import Spool
+from pneuopt.quantities.arrays import Array
 
-Array = NDArray[np.float64]
 TRANSDUCER = 20.0  # [V s/m] K_s
 HALF_TRAVEL, PER_VOLT = 1e-3, 2e-4  # [m] of the spool, [m/V] K_d
 CLIP = 5.0  # [V]

@@ -27,9 +27,9 @@ from claims import Claim, arguments, finish, frame
 
 import pneuopt as po
 from pneuopt.models.catalog import b32
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.trajectories import Array
-from pneuopt.studies.sweep import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED_CASE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,7 +76,7 @@ def study(kind: str, seeds: range, encoder: float = 0.0, outliers: float = 0.0) 
     fn = functools.partial(identified, kind, encoder, outliers)
     rows = po.sweep(fn, truth, cases, progress=lambda line: print(f"{kind}: {line}", end="\r", file=sys.stderr))
     require("converged" in rows, f"no plant was identified: {rows['error'].iloc[0]}")
-    return rows[rows["error"] != INTERRUPTED]  # Ctrl-C keeps the plants that are done
+    return rows[rows["error"] != INTERRUPTED_CASE]  # Ctrl-C keeps the plants that are done
 
 
 def drawn(kind: str, seed: int) -> dict[str, float]:

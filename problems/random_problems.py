@@ -14,17 +14,16 @@ from math import inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import pneuopt as po
 from pneuopt.evaluation.requirements import Requirement
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models import catalog
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 
-Array = NDArray[np.float64]
 Ranges = dict[str, tuple[float, float]]
 MARGIN = 0.1  # of the design's figures: what the limits leave
 FLOORS = {"Overshoot": 0.005, "SteadyStateError": 0.002, "MaxSensitivity": 0.01}  # where there is next to nothing
@@ -236,7 +235,7 @@ def _limit(name: str, value: float) -> Requirement:
 
 def _brute_force(plant: Plant, steps: list[po.Step], kinds: list[str], rng: np.random.Generator) -> dict[str, float]:
     """The best design's certified figures; empty where nothing is good enough."""
-    space = span(plant.loop, plant.parameters)
+    space = search_space(plant.loop, plant.parameters)
     asked = [getattr(po, n)(max=1e9 if n not in ("Overshoot", "SteadyStateError") else 0.9) for n in kinds]
     spec = specify(po.SettlingTime(), [*asked, *([] if "MaxSensitivity" in kinds else [po.MaxSensitivity(1e9)])])
     simulator = Simulator(plant.loop, steps, space, spec=spec)
@@ -249,12 +248,14 @@ def _brute_force(plant: Plant, steps: list[po.Step], kinds: list[str], rng: np.r
         best, times = _best(simulator, spec, np.vstack([best, np.clip(near, 0.0, 1.0)]), robust)
     if not np.isfinite(times[0]):
         return {}
-    return _certified(plant, steps, space.filled(space.printed(space.draw(best[0]), DIGITS)), ["SettlingTime", *kinds])
+    return _certified(
+        plant, steps, space.parameters_at(space.round_point(space.from_unit(best[0]), DIGITS)), ["SettlingTime", *kinds]
+    )
 
 
 def _best(simulator: Simulator, spec: Specification, unit: Array, robust: float) -> tuple[Array, Array]:
     """The ten best by settling time, those that are nervous last."""
-    points = simulator.space.draw(unit)
+    points = simulator.space.from_unit(unit)
     quick = simulator.respond(points, spec.band).values
     order = np.argsort(np.where(quick["Overshoot"] <= OVERSHOOT, _finite(quick["SettlingTime"]), inf))[: 3 * TOP]
     values = simulator.values(points[order], spec)

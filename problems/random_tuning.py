@@ -26,7 +26,7 @@ from random_problems import problem
 
 import pneuopt as po
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.shooting.solution import Code
+from pneuopt.quantities.status import Code
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy import integrate
 
 import pneuopt as po
-from pneuopt.dynamics.compiled.rollout import compiled
-from pneuopt.dynamics.system import System, names, vector
+from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.models.catalog import b32
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ def two_drives() -> list[Claim]:
 
 def _driven(system: System, t: Times, truth: po.ParameterSet, late: float = 0.0) -> po.Trajectory:
     """Outputs under u = clip(4 e - 0.15 v, +-0.6), held from sample to sample; the position read `late` [s]."""
-    p, state, ode = vector(system.parameters, truth), names(system.states), compiled(system.ode)
+    p, state, ode = parameter_vector(system.parameters, truth), names(system.states), compile_function(system.ode)
     u, scale = np.zeros(1), np.array([q.nominal for q in system.states])
     solver = integrate.ode(lambda s, x: ode(s, x, u, p)[0])
     exact: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-11 * scale, "nsteps": 100_000}

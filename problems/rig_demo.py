@@ -19,14 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from claims import Claim, arguments, design, finish, frame
-from numpy.typing import NDArray
 
 import pneuopt as po
 from pneuopt.identification.statistics import agreement
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
+from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.space import measure
-
-Array = NDArray[np.float64]
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,7 +96,7 @@ def run() -> Demo:
     fit = po.identify(drive.system(), [log], given)
     seconds = {"identify": perf_counter() - began}
     loop = speed_loop(drive.system())
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*", "sensor.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*", "sensor.*"))
     free = (fit.parameters.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
     designs = {"hand": on_rig(free, po.evaluate(loop, STEPS, free))}
     for name, start in {"pid_only": free.fixed("dither.*"), "tuned": free}.items():

@@ -34,7 +34,7 @@ from claims import Claim, arguments, design, finish, frame
 import pneuopt as po
 from pneuopt.evaluation.means import period_mean
 from pneuopt.evaluation.requirements import Requirement
-from pneuopt.evaluation.scenarios import Factor, Scenarios, applied
+from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
 
@@ -117,7 +117,7 @@ def fit(seeds: int) -> Part:
     short = replace(log, trajectory=log.trajectory.rows(0, LOGGED))
     fitted = po.identify(model.system(), [short], given)
     loop = rig_demo.speed_loop(model.system())
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*", "sensor.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*", "sensor.*"))
     free = (fitted.parameters.fixed("*") | own).with_values(rig_demo.HAND).with_bounds(rig_demo.RANGES)
     free = free.freed(*rig_demo.RANGES)
     scenarios, fresh = (
@@ -129,7 +129,7 @@ def fit(seeds: int) -> Part:
 
 
 def _on_truth(task: Task, parameters: po.ParameterSet, truth: Mapping[str, float]) -> dict[str, float]:
-    found = po.evaluate(task.loop, task.steps, applied(parameters, truth))
+    found = po.evaluate(task.loop, task.steps, apply_scenario(parameters, truth))
     return {
         f"true.{n}": float(np.max(found.loc[metric].to_numpy(dtype=float)))
         for n, metric in (("settling_time", "SettlingTime"), ("overshoot", "Overshoot"))
@@ -236,7 +236,7 @@ def _draw_fan(axes: "Axes", task: Task, parameters: po.ParameterSet, band: float
     """The first step on every third fresh plant, averaged over the dither; the band is where it shall settle."""
     step = task.steps[0]
     for values in itertools.islice(task.fresh.values(), 0, None, 3):
-        own = applied(parameters, values)
+        own = apply_scenario(parameters, values)
         run = po.respond(task.loop, step, own)
         t, signal = run.t, run[task.loop.feedback.name]
         if period := task.loop.dither_period(own):

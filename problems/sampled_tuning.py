@@ -73,7 +73,7 @@ def benchmark(sample_time: float | None) -> tuple[po.ClosedLoop, po.ParameterSet
     drive, hardware = t32()
     pid = po.PID() if sample_time is None else po.PID(sample_time=sample_time, delay=DELAY)
     loop = po.ClosedLoop(drive.system(), pid, po.Dither(frequency=20.0))  # of which the offset alone is used
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     given = (hardware.fixed("*") | own).with_values(VALUES | {"dither.amplitude": 0.0})
     return loop, given.with_bounds(FREE).freed(*FREE)
 

@@ -80,7 +80,7 @@ def _refused(logs: list[po.Experiment]) -> list[Claim]:
     for verdict in verdicts.values():
         print(verdict)
     return [
-        Claim(f"refused.{name}", float(name in verdict.untold), bound=">= 1")
+        Claim(f"refused.{name}", float(name in verdict.unidentifiable), bound=">= 1")
         for names, verdict in verdicts.items()
         for name in names
     ]

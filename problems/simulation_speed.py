@@ -22,12 +22,12 @@ from b32 import FREE, VALVE, generate
 from claims import Claim, arguments, finish, frame
 from scipy.integrate import solve_ivp
 
-from pneuopt.dynamics.compiled.compiler import compiler
-from pneuopt.dynamics.compiled.rollout import Rollout, Run, compiled
-from pneuopt.dynamics.system import System, discretise, names, vector
+from pneuopt.dynamics.compiled.compiler import find_compiler
+from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult, compile_function
+from pneuopt.dynamics.system import System, discretise, names, parameter_vector
 from pneuopt.models.catalog import b32
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.trajectories import Array
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,7 +53,7 @@ class Record:
 
 
 def main() -> "pd.DataFrame":
-    require(compiler() is not None, "no C compiler found, so there is nothing to compare; install gcc or clang")
+    require(find_compiler() is not None, "no C compiler found, so there is nothing to compare; install gcc or clang")
     record = _record()
     lanes = Rollout(discretise(record.system).pieces).lanes
     claims = [Claim("lanes", lanes)]
@@ -72,7 +72,7 @@ def main() -> "pd.DataFrame":
 
 def _record() -> Record:
     drive, truth = b32()
-    system, numbers = drive.system(), vector(drive.system().parameters, truth)
+    system, numbers = drive.system(), parameter_vector(drive.system().parameters, truth)
     log = generate(drive, truth).trajectory
     start = np.array([log[n][0] if n in log else 0.0 for n in names(system.states)])
     commands = np.asarray(log["valve_voltage"])
@@ -101,7 +101,7 @@ def _rollouts(record: Record, sensitivities: bool) -> tuple[dict[str, float], fl
     ns, found = {}, {}
     for way, lanes in WAYS.items():
         rollout = Rollout(discretise(record.system).pieces, wrt, start=sensitivities, threads=1, lanes=lanes)
-        run: Callable[[], Run] = partial(rollout.run, *given, substeps=SUBSTEPS)
+        run: Callable[[], RolloutResult] = partial(rollout.run, *given, substeps=SUBSTEPS)
         result = run()
         found[way] = result.dx_end if result.dx_end is not None else result.x_end
         ns[way] = 1e9 * _fastest(run, 2 if way == "vm" else 7) / (samples * SUBSTEPS)
@@ -127,7 +127,7 @@ def _others(record: Record, ns: dict[str, float]) -> list[Claim]:
 
 
 def _scipy(record: Record, method: Any) -> Array:
-    ode, u, numbers = compiled(record.system.ode), record.commands[:SHORT], record.numbers
+    ode, u, numbers = compile_function(record.system.ode), record.commands[:SHORT], record.numbers
 
     def rate(t: float, x: Array) -> Array:
         return ode(t, x, u[min(int(t / SAMPLE + 1e-9), SHORT - 1)], numbers)[0]

@@ -56,7 +56,7 @@ def main(paths: list[Path]) -> "pd.DataFrame":
 def tuned(plant: po.System, fitted: po.ParameterSet) -> "tuple[tuple[po.ParameterSet, pd.DataFrame], po.TuningResult]":
     """A plain hand setting (a PI of moderate gain), and gains with dither tuned for the fitted plant."""
     loop = po.ClosedLoop(plant, po.PID(sample_time=0.002), po.Dither(frequency=100.0))
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     given = (fitted.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
     limits = (po.Overshoot(0.02), po.MaxSensitivity(1.6))
     best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=limits)

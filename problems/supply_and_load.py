@@ -51,7 +51,7 @@ class Job:
 def run() -> Job:
     drive, rig = s32()
     loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3), po.Dither(frequency=100.0), measured="speed")
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     nominal = {"supply.pressure": 6e5 + ATMOSPHERE, "load.mass": 5.0, "cylinder.start": 0.1}
     given = (rig.fixed("*") | own).with_values(nominal | HAND).with_bounds(RANGES).freed(*RANGES)
     best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)

@@ -20,22 +20,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from claims import Claim, arguments, finish, frame
-from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.models.catalog import t32
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, axes_grid, legend_above
-from pneuopt.tuning.screening import merit, screen
+from pneuopt.quantities.arrays import Array
+from pneuopt.tuning.screening import merit, run_screening
 from pneuopt.tuning.simulator import Responses, Simulator
-from pneuopt.tuning.space import Space, span
+from pneuopt.tuning.space import Space, search_space
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-Array = NDArray[np.float64]
 STEP = po.Step(0.2, horizon=1.0, start={"position": 0.05, "pressure_b": 3.5e5})
 VALUES = {"pid.Kp": 10.0, "pid.Ki": 40.0, "pid.Tf": 0.01, "pid.Tt": 0.1, "pid.lower": -5.0, "pid.upper": 5.0}
 RANGES = {
@@ -119,14 +118,14 @@ class Job:
 
 def run() -> Job:
     loop, given = benchmark()
-    space = span(loop, given)
-    simulator, spec = Simulator(loop, [STEP], space), SPEC.tightened(MARGIN, PEAKS)
-    simulator.values(space.draw(np.full((8, len(space.names)), 0.5)), spec)  # compiled and warm
+    space = search_space(loop, given)
+    simulator, spec = Simulator(loop, [STEP], space), SPEC.tighten(MARGIN, PEAKS)
+    simulator.values(space.from_unit(np.full((8, len(space.names)), 0.5)), spec)  # compiled and warm
     runs, traces = dict[str, list[Run]](), dict[str, list[list[tuple[int, float]]]]()
     for seed in SEEDS:
         ours = Counter(simulator, space, spec)
         method = po.Screening(seed=seed)
-        screen(ours, [STEP], space, spec, method, space.start, lambda _: None)  # type: ignore[arg-type]  # counts
+        run_screening(ours, [STEP], space, spec, method, space.start, lambda _: None)  # type: ignore[arg-type]  # counts
         ours.keep()
         budget = ours.kept[-1][2]
         rivals: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
@@ -152,7 +151,7 @@ def run() -> Job:
 def benchmark() -> tuple[po.ClosedLoop, po.ParameterSet]:
     drive, hardware = t32()
     loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(frequency=1000 / (2 * pi)))
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     return loop, (hardware.fixed("*") | own).with_values(VALUES).with_bounds(RANGES).freed(*RANGES)
 
 
@@ -161,18 +160,18 @@ def evolve(counter: Counter, budget: int, seed: int, options: dict[str, Any]) ->
     space = counter.space
 
     def cost(unit: Array) -> Array:
-        points = space.draw(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
+        points = space.from_unit(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
         return merit(counter.respond(points, counter.spec.band).values, counter.spec, STEP.horizon)
 
     members = options.get("popsize", 15) * len(space.names)
     settings: dict[str, Any] = {"bounds": [(0.0, 1.0)] * len(space.names), "vectorized": True, "updating": "deferred"}
-    settings |= {"maxiter": max(1, budget // members - 1), "x0": space.unit(space.start), "seed": seed, **options}
+    settings |= {"maxiter": max(1, budget // members - 1), "x0": space.to_unit(space.start), "seed": seed, **options}
     solve: Any = differential_evolution  # its stub knows scalar costs only
     solve(cost, **settings)
 
 
 def certified(loop: po.ClosedLoop, space: Space, point: Array) -> tuple[float, float, float, float]:
-    parameters = space.filled(space.printed(point, DIGITS))
+    parameters = space.parameters_at(space.round_point(point, DIGITS))
     found = po.evaluate(loop, STEP, parameters, band=SPEC.band)[STEP.label]
     response = po.respond(loop, STEP, parameters)
     raw = settled(response.t, response["speed"])

@@ -87,7 +87,7 @@ def loops() -> tuple[po.ClosedLoop, po.Rig, po.ParameterSet]:
         po.Actuator(hysteresis=HYSTERESIS),
         po.Encoder(filter=FILTER),
     )
-    own = loop.parameters.select(loop.parameters.matching("pid.*", "dither.*", "sensor.*"))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*", "sensor.*"))
     return loop, rig, (hardware.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
 
 

@@ -16,9 +16,15 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.linearised import Linearised
+from pneuopt.tuning.linearised import LinearisedProblem
 
-CACHES = (compiler.build, compiler.say_once, compiler._compiler_version, compiler._temporary_folder, kernels.prepared)
+CACHES = (
+    compiler.compile_library,
+    compiler.warn_once,
+    compiler._compiler_version,
+    compiler._temporary_folder,
+    kernels.prepare_by_content,
+)
 DRIVE = """# my axis
 [drive]
 kind = "force"
@@ -137,9 +143,13 @@ def run() -> Run:
         loop: ClosedLoop, parameters: ParameterSet, reference: float, h: float, duration: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         model = loop.discrete(4)
-        x, u, p = ca.MX.sym("x", len(model.states)), ca.MX.sym("u", len(model.inputs)), loop.numbers(parameters)
+        x, u, p = (
+            ca.MX.sym("x", len(model.states)),
+            ca.MX.sym("u", len(model.inputs)),
+            loop.parameter_vector(parameters),
+        )
         t = ca.MX.sym("t")
-        after, y = model.sample(t, ca.MX(h), x, u, ca.MX(ca.DM(p)))
+        after, y = model.advance_sample(t, ca.MX(h), x, u, ca.MX(ca.DM(p)))
         n = round(duration / h)
         grid = h * np.arange(n)
         inputs = np.zeros((len(model.inputs), n))
@@ -152,10 +162,10 @@ def run() -> Run:
 
 
 @pytest.fixture(scope="session")
-def check_slopes() -> Callable[[Linearised, np.ndarray], None]:
+def check_slopes() -> Callable[[LinearisedProblem, np.ndarray], None]:
     """The rows' derivatives at z are those of central differences; nodes that move past a kink may be off."""
 
-    def check(posed: Linearised, z: np.ndarray) -> None:
+    def check(posed: LinearisedProblem, z: np.ndarray) -> None:
         (point,) = posed.evaluate(z[None])
         for k in range(len(z)):
             nudge = 1e-6 * (np.arange(len(z)) == k)

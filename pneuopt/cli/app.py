@@ -15,7 +15,7 @@ import typer
 
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
 
-NOT_GOOD, BAD_INPUT, INTERRUPTED = 1, 2, 130
+EXIT_FAILURE, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 app = typer.Typer(
     name="pneuopt",
@@ -52,7 +52,7 @@ def options(
 
 
 @app.command()
-def identify(
+def identify_command(
     drive: Annotated[
         Path, typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is identified.")
     ],
@@ -71,16 +71,16 @@ def identify(
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
-    with _guarded():
+    with _report_errors():
         from pneuopt.cli.identify import run_identify, run_select
         from pneuopt.cli.shared import Outputs
 
         run = run_select if select else run_identify
-        raise typer.Exit(run(drive, _expanded(logs), Outputs(output, json, plot), window, quiet))
+        raise typer.Exit(run(drive, _expand_patterns(logs), Outputs(output, json, plot), window, quiet))
 
 
 @app.command()
-def tune(
+def tune_command(
     fit: Annotated[
         Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant; nothing of it is tuned.")
     ],
@@ -93,7 +93,7 @@ def tune(
     quiet: Quiet = False,
 ) -> None:
     """Tune PID and dither together, and certify them."""
-    with _guarded():
+    with _report_errors():
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.tune import run_tune
 
@@ -101,7 +101,7 @@ def tune(
 
 
 @app.command()
-def simulate(
+def simulate_command(
     fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml.")],
     tuning: Annotated[
         Path | None, typer.Argument(metavar="[TUNING]", help="tuning.toml or tuned.toml: simulate its closed loop.")
@@ -112,7 +112,7 @@ def simulate(
     plot: Plot = None,
 ) -> None:
     """Simulate a closed loop, or predict a log."""
-    with _guarded():
+    with _report_errors():
         require((tuning is None) != (log is None), "give either a tuning file or --log, to say what to simulate")
         from pneuopt.cli.identify import run_predict
         from pneuopt.cli.shared import Outputs
@@ -126,7 +126,7 @@ def simulate(
 
 
 @app.command()
-def study(
+def study_command(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning, and a grid's axes or a front.")
     ],
@@ -136,7 +136,7 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Certify a loop over a grid of any parameters, or tune it along a Pareto front; status 1 if a case fails."""
-    with _guarded():
+    with _report_errors():
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.study import run_study
 
@@ -144,59 +144,59 @@ def study(
 
 
 @app.command()
-def info() -> None:
+def info_command() -> None:
     """Show versions, compiler and cache: say them when asking for help."""
     import os
     import platform
     from importlib.metadata import version
 
-    from pneuopt.cli.terminal import screen, show_pairs
-    from pneuopt.dynamics.compiled.compiler import cache_directory, compiler
+    from pneuopt.cli.terminal import make_console, show_pairs
+    from pneuopt.dynamics.compiled.compiler import cache_directory, find_compiler
 
     packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
-    with _guarded():
+    with _report_errors():
         machine = {
             "python": f"{platform.python_version()} ({sys.executable})",
             "platform": f"{platform.platform()}, {os.cpu_count()} CPUs",
-            "compiler": compiler() or "none found: models run on the CasADi VM, more slowly",
+            "compiler": find_compiler() or "none found: models run on the CasADi VM, more slowly",
             "cache": cache_directory(),
         }
-        show_pairs(screen(), {n: version(n) for n in packages} | machine)
+        show_pairs(make_console(), {n: version(n) for n in packages} | machine)
 
 
 @contextmanager
-def _guarded() -> Iterator[None]:
+def _report_errors() -> Iterator[None]:
     """Turn what a user can mend into one message and an exit status, and a warning of the physics into one line."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", PhysicsWarning)
-            warnings.showwarning = _teller()
+            warnings.showwarning = _warning_printer()
             yield
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(BAD_INPUT) from None
+        raise typer.Exit(EXIT_BAD_INPUT) from None
     except ConvergenceError as error:
         typer.echo(f"NOT converged: {error}", err=True)
-        raise typer.Exit(NOT_GOOD) from None
+        raise typer.Exit(EXIT_FAILURE) from None
     except KeyboardInterrupt:
         typer.echo("interrupted: no file was left half-written", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-def _teller() -> Callable[..., None]:
+def _warning_printer() -> Callable[..., None]:
     """What shows a warning, once, as soon as it comes."""
     told: set[str] = set()
 
-    def show(message: Warning | str, *_: object) -> None:
+    def print_warning(message: Warning | str, *_: object) -> None:
         line = f"warning: {message}"
         if line not in told:
             told.add(line)
             typer.echo(line, err=True)
 
-    return show
+    return print_warning
 
 
-def _expanded(paths: Sequence[Path]) -> list[Path]:
+def _expand_patterns(paths: Sequence[Path]) -> list[Path]:
     """Patterns that the shell has left alone, as on Windows."""
     found: list[Path] = []
     for path in paths:

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
-    background,
     figure_writers,
+    file_hashes,
     finish,
-    hashes,
+    stats_and_provenance,
     warn,
-    warn_of,
+    warn_of_status,
     write_csv,
 )
 from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show_verdict
-from pneuopt.cli.terminal import progress, screen, show_status
+from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import Drive, read_drive, write_fit
 from pneuopt.identification.identifiability import Verdict, identifiability
@@ -44,7 +44,7 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LEVELS = (
+FRICTION_PARAMETERS = (
     "friction.coulomb",
     "friction.viscous",
     "friction.static",
@@ -56,43 +56,51 @@ LEVELS = (
 
 def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool) -> int:
     """Identify from logs; returns the exit status."""
-    outputs.check(_inputs(drive, logs), "friction", "residuals", "correlation")
-    model, parameters = _read_free(drive)
-    system, experiments = model.system(), _experiments(logs, window)
+    outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation")
+    model, parameters = _read_free_drive(drive)
+    system, experiments = model.system(), _read_experiments(logs, window)
     for sentence in identifiability(system, experiments, parameters).sentences:
         warn(f"before the fit: {sentence}")
-    with progress("identifying", quiet=quiet) as tell:
-        result = identify(system, experiments, parameters, method=LeastSquares(progress=tell), throw=False)
-    console = screen()
+    with progress("identifying", quiet=quiet) as report_progress:
+        result = identify(system, experiments, parameters, method=LeastSquares(progress=report_progress), throw=False)
+    console = make_console()
     show_status(console, result.status)
     show_estimates(console, result.estimates)
     show_verdict(console, result.verdict)
     show_fit(console, result.fit)
-    tables = {"estimates": records(result.estimates), "fit": records(result.fit), "verdict": _worded(result.verdict)}
+    tables = {
+        "estimates": records(result.estimates),
+        "fit": records(result.fit),
+        "verdict": _verdict_record(result.verdict),
+    }
     writers: Writers = {}
     if outputs.output is not None:
         writers[outputs.output] = partial(write_fit, outputs.output, drive, result)
     if outputs.plot is not None:
         writers |= figure_writers(outputs.plot, _fit_figures(system, result, experiments))
-    return finish(outputs, writers, tables | background(result), result.status)
+    return finish(outputs, writers, tables | stats_and_provenance(result), result.status)
 
 
 def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool) -> int:
     """Choose a friction model by the logs; returns the exit status."""
     remedy = "write the model that is chosen into [friction], and identify again without --select"
     require(outputs.output is None and outputs.plot is None, f"--select writes neither -o nor --plot; {remedy}")
-    outputs.check(_inputs(drive, logs))
-    model, parameters = _read_free(drive)
-    systems = _ladder(drive, model)
+    outputs.check(_input_files(drive, logs))
+    model, parameters = _read_free_drive(drive)
+    systems = _friction_systems(drive, model)
     free = [n for n in parameters.free_names if not n.startswith("friction.")]
     known = parameters.fixed("friction.*").select(
         n for n in parameters if any(n in s.parameters for s in systems.values())
     )
-    with progress("selecting", quiet=quiet) as tell:
+    with progress("selecting", quiet=quiet) as report_progress:
         chosen = select_model(
-            systems, _experiments(logs, window), known, free=[*free, *LEVELS], method=LeastSquares(progress=tell)
+            systems,
+            _read_experiments(logs, window),
+            known,
+            free=[*free, *FRICTION_PARAMETERS],
+            method=LeastSquares(progress=report_progress),
         )
-    show_selection(screen(), chosen)
+    show_selection(make_console(), chosen)
     tables = {"recommended": chosen.recommended, "reason": chosen.reason, "candidates": records(chosen.table)}
     return finish(outputs, {}, tables, chosen.fits[chosen.recommended].status)
 
@@ -102,9 +110,9 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
     outputs.check([fit, log, log.with_suffix(".toml")])
     model, parameters = read_drive(fit)
     system, experiment = model.system(), read_log(log)
-    warn_of(fit)
+    warn_of_status(fit)
     table = validate(system, [experiment], parameters)
-    show_fit(screen(), table)
+    show_fit(make_console(), table)
     writers: Writers = {}
     if outputs.output is not None or outputs.plot is not None:
         run = predict(system, experiment, parameters)
@@ -114,10 +122,10 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
             given = {q.name: experiment.trajectory[q.name] for q in system.inputs}
             columns = {q.name: (q.name, q.unit) for q in (*system.inputs, *system.outputs)}
             writers[outputs.output] = partial(write_csv, outputs.output, run.with_columns(given), columns)
-    return finish(outputs, writers, {"fit": records(table), "provenance": hashes(fit, log)}, None)
+    return finish(outputs, writers, {"fit": records(table), "provenance": file_hashes(fit, log)}, None)
 
 
-def _experiments(logs: Sequence[Path], window: float | None) -> list[Experiment]:
+def _read_experiments(logs: Sequence[Path], window: float | None) -> list[Experiment]:
     experiments = [read_log(path) for path in logs]
     if window is None:
         return experiments
@@ -125,11 +133,11 @@ def _experiments(logs: Sequence[Path], window: float | None) -> list[Experiment]
     return [part for e in experiments for part in split(e, window)]
 
 
-def _inputs(drive: Path, logs: Sequence[Path]) -> list[Path]:
+def _input_files(drive: Path, logs: Sequence[Path]) -> list[Path]:
     return [drive, *logs, *(log.with_suffix(".toml") for log in logs)]
 
 
-def _read_free(path: Path) -> tuple[Drive, ParameterSet]:
+def _read_free_drive(path: Path) -> tuple[Drive, ParameterSet]:
     """A drive of which something is to be identified."""
     model, parameters = read_drive(path)
     remedy = 'mark what to identify, as in coulomb = { value = "40 N", free = true }'
@@ -137,17 +145,17 @@ def _read_free(path: Path) -> tuple[Drive, ParameterSet]:
     return model, parameters
 
 
-def _ladder(path: Path, model: Drive) -> dict[str, System]:
+def _friction_systems(path: Path, model: Drive) -> dict[str, System]:
     """The drive with each friction model in turn."""
     if not isinstance(model, ForceDrive | MotionDrive | PneumaticDrive):
         raise InputError(f"{path}: --select chooses a drive's friction model; this plant is not built from one")
     return {name: replace(model, friction=friction).system() for name, friction in friction_ladder().items()}
 
 
-def _worded(verdict: Verdict | None) -> dict[str, Any]:
+def _verdict_record(verdict: Verdict | None) -> dict[str, Any]:
     if verdict is None:
         return {}
-    return {**verdict.worded(), "table": records(verdict.table)}
+    return {**verdict.to_dict(), "table": records(verdict.table)}
 
 
 def _fit_figures(

@@ -10,22 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.cli.terminal import screen, show_written
-from pneuopt.evaluation.requirements import Bounds, SettlingTime, StepEnvelope
+from pneuopt.cli.terminal import make_console, show_output_files
+from pneuopt.evaluation.requirements import EnvelopeBounds, SettlingTime, StepEnvelope
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.identify import IdentificationResult
 from pneuopt.plotting import check_figure_path, save_figure
-from pneuopt.quantities.output import check_outputs, write_json, write_text
+from pneuopt.quantities.output import check_output_paths, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.solution import Code, Status
 from pneuopt.tuning.tune import TuningResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-GOOD, NOT_GOOD, INTERRUPTED = 0, 1, 130
+EXIT_SUCCESS, EXIT_FAILURE, EXIT_INTERRUPTED = 0, 1, 130
 Columns = Mapping[str, tuple[str, str]]
 Writers = dict[Path, Callable[[], None]]
 
@@ -48,8 +48,8 @@ class Outputs:
         figures: list[Path] = []
         if self.plot is not None:
             check_figure_path(self.plot)
-            figures = [self.plot, *(beside(self.plot, name) for name in others)]
-        check_outputs([self.output, self.json, *figures], inputs)
+            figures = [self.plot, *(add_to_stem(self.plot, name) for name in others)]
+        check_output_paths([self.output, self.json, *figures], inputs)
 
 
 def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status: Status | None) -> int:
@@ -59,21 +59,21 @@ def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status
         writers = {**writers, outputs.json: partial(write_json, outputs.json, {**ended, **tables})}
     for write in writers.values():
         write()
-    show_written(screen(), list(writers))
+    show_output_files(make_console(), list(writers))
     if status is None or status.converged:
-        return GOOD
-    return INTERRUPTED if status.code is Code.INTERRUPTED else NOT_GOOD
+        return EXIT_SUCCESS
+    return EXIT_INTERRUPTED if status.code is Code.INTERRUPTED else EXIT_FAILURE
 
 
-def read_loop(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
+def read_fit_and_tuning(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
     """The loop, and all its numbers; of the plant nothing is free."""
     model, plant = read_drive(fit)
-    asked = read_tuning(tuning, model.system())
-    warn_of(fit)
-    return asked, plant.fixed(*plant.free_names) | asked.parameters
+    task = read_tuning(tuning, model.system())
+    warn_of_status(fit)
+    return task, plant.fixed(*plant.free_names) | task.parameters
 
 
-def warn_of(path: Path, what: str = "fit") -> None:
+def warn_of_status(path: Path, what: str = "fit") -> None:
     """Say on standard error if what wrote a file did not converge."""
     status = read_status(path)
     if status is not None and not status.converged:
@@ -82,28 +82,28 @@ def warn_of(path: Path, what: str = "fit") -> None:
 
 def warn(message: str) -> None:
     """Say on standard error what does not stop the command."""
-    screen(error=True).print(f"warning: {message}", soft_wrap=True)
+    make_console(error=True).print(f"warning: {message}", soft_wrap=True)
 
 
-def band_of(asked: Tuning) -> float:
+def settling_band(task: Tuning) -> float:
     """The settling band that the requirements name; 2 % otherwise."""
-    requirements = (*asked.minimise, *asked.subject_to)
+    requirements = (*task.minimise, *task.subject_to)
     return next((q.band for q in requirements if isinstance(q, SettlingTime)), 0.02)
 
 
-def envelope_of(asked: Tuning) -> Bounds:
+def step_envelope(task: Tuning) -> EnvelopeBounds:
     """The bounds over time that the requirements name; none without."""
-    requirements = (*asked.minimise, *asked.subject_to)
+    requirements = (*task.minimise, *task.subject_to)
     return next((q.bounds for q in requirements if isinstance(q, StepEnvelope)), ())
 
 
 def figure_writers(path: Path, figures: Mapping[str, "Figure"]) -> Writers:
     """Each figure in a file of its own, the one without a name at the path itself."""
-    places = {name: beside(path, name) if name else path for name in figures}
+    places = {name: add_to_stem(path, name) if name else path for name in figures}
     return {places[name]: partial(save_figure, figure, places[name]) for name, figure in figures.items()}
 
 
-def beside(path: Path, name: str) -> Path:
+def add_to_stem(path: Path, name: str) -> Path:
     """fit.png and "friction" make fit_friction.png."""
     return path.with_stem(f"{path.stem}_{name}")
 
@@ -116,11 +116,11 @@ def write_csv(path: Path, run: Trajectory, columns: Columns) -> None:
     write_text(path, "\n".join([header, *rows]) + "\n")
 
 
-def background(result: IdentificationResult | TuningResult) -> dict[str, Any]:
+def stats_and_provenance(result: IdentificationResult | TuningResult) -> dict[str, Any]:
     """What a JSON file holds beside the tables."""
     return {"stats": result.stats, "provenance": result.provenance}
 
 
-def hashes(*paths: Path) -> dict[str, str]:
+def file_hashes(*paths: Path) -> dict[str, str]:
     """The files' contents, in short."""
     return {f"sha256[{path.name}]": hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}

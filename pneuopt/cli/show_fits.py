@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
-from pneuopt.cli.terminal import figure, new_table
+from pneuopt.cli.terminal import format_number, new_table
 from pneuopt.identification.identifiability import Verdict
-from pneuopt.identification.review import NOT_TOLD
+from pneuopt.identification.review import UNIDENTIFIABLE_NOTE
 from pneuopt.identification.select_model import ModelSelection
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_ROWS = 12  # of a table of logs
+MAX_FIT_ROWS = 12  # of a table of logs
 
 
 def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
@@ -28,8 +28,8 @@ def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
     """
     table = new_table("parameter", "value", "95 % confidence interval", "unit", "")
     for parameter, row in estimates.iterrows():
-        value, interval = _interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
-        value = "-" if row["note"] == NOT_TOLD else value
+        value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
+        value = "-" if row["note"] == UNIDENTIFIABLE_NOTE else value
         table.add_row(str(parameter), value, interval, str(row["unit"]), str(row["note"]))
     console.print(table)
 
@@ -45,9 +45,16 @@ def show_selection(console: Console, chosen: ModelSelection) -> None:
     console.print(Text(chosen.reason, style="bold green"), soft_wrap=True)
     table = new_table("model", "free", "BIC above best", "contains", "p of chance", "")
     for row in chosen.table.reset_index(names="model").to_dict(orient="records"):
-        figures = [str(row["free"]), figure(row["bic_above"], 4), str(row["contains"]), figure(row["p_value"], 2)]
+        figures = [
+            str(row["free"]),
+            format_number(row["bic_above"], 4),
+            str(row["contains"]),
+            format_number(row["p_value"], 2),
+        ]
         note = "" if row["converged"] else "not converged"
-        table.add_row(str(row["model"]), *figures, note or (f"{NOT_TOLD}: {row['untold']}" if row["untold"] else ""))
+        table.add_row(
+            str(row["model"]), *figures, note or (f"{UNIDENTIFIABLE_NOTE}: {row['untold']}" if row["untold"] else "")
+        )
     console.print(table)
 
 
@@ -60,41 +67,41 @@ def show_fit(console: Console, fit: "pd.DataFrame") -> None:
     fit : DataFrame
         Of an `IdentificationResult`, or from `validate`.
     """
-    if len(fit) > MOST_ROWS:
-        _show_many(console, fit)
+    if len(fit) > MAX_FIT_ROWS:
+        _show_fit_summary(console, fit)
         return
     table = new_table("log", "channel", "NRMSE [%]", "RMSE", "unit")
     for row in fit.reset_index().to_dict(orient="records"):
-        figures = [figure(100 * row["nrmse"], 4), figure(row["rmse"], 4)]
+        figures = [format_number(100 * row["nrmse"], 4), format_number(row["rmse"], 4)]
         table.add_row(str(row["log"]), str(row["channel"]), *figures, str(row["unit"]))
     console.print(table)
 
 
-def _show_many(console: Console, fit: "pd.DataFrame") -> None:
+def _show_fit_summary(console: Console, fit: "pd.DataFrame") -> None:
     table = new_table("channel", "logs", "NRMSE [%]: median", "worst", "in log", "RMSE: median", "unit")
     flat = fit.reset_index()
     for channel in flat["channel"].unique():
         rows = flat[flat["channel"] == channel].sort_values("nrmse", na_position="first")
         worst, middle = rows.iloc[-1], rows[["nrmse", "rmse"]].median()
-        figures = [figure(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"])]
-        rmse = figure(middle["rmse"], 4)
+        figures = [format_number(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"])]
+        rmse = format_number(middle["rmse"], 4)
         table.add_row(str(channel), str(len(rows)), *figures, str(worst["log"]), rmse, str(worst["unit"]))
     console.print(table)
 
 
-def _interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
+def _format_interval(value: float, spread: float, low: float, high: float) -> tuple[str, str]:
     if math.isfinite(low) and math.isinf(high):
-        return figure(value, 4), f"above {figure(low, 4)}"
+        return format_number(value, 4), f"above {format_number(low, 4)}"
     if math.isinf(low) and math.isfinite(high):
-        return figure(value, 4), f"below {figure(high, 4)}"
+        return format_number(value, 4), f"below {format_number(high, 4)}"
     if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
-        return figure(value, 4), "not determined"
-    return _to_spread(value, spread), f"{_to_spread(low, spread)} to {_to_spread(high, spread)}"
+        return format_number(value, 4), "not determined"
+    return _format_to_stderr(value, spread), f"{_format_to_stderr(low, spread)} to {_format_to_stderr(high, spread)}"
 
 
-def _to_spread(value: float, spread: float) -> str:
+def _format_to_stderr(value: float, spread: float) -> str:
     """As many digits as two of the standard error say."""
     if not 0 < spread < math.inf or value == 0 or not spread < abs(value):
-        return figure(value, 4)
+        return format_number(value, 4)
     digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(spread)) + 2
     return f"{value:#.{min(digits, 12)}g}".rstrip(".")

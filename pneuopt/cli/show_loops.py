@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
-from pneuopt.cli.terminal import figure, new_table
+from pneuopt.cli.terminal import format_number, new_table
 from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
-from pneuopt.evaluation.evaluate import HUNTING
-from pneuopt.evaluation.requirements import AT_LEAST, PERCENT, Requirement, name
+from pneuopt.evaluation.evaluate import LIMIT_CYCLE_METRICS
+from pneuopt.evaluation.requirements import MINIMUM_REQUIREMENTS, PERCENT_METRICS, Requirement, metric_name
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.studies.sweep import INTERRUPTED
+from pneuopt.studies.sweep import INTERRUPTED_CASE
 from pneuopt.tuning.validation import DesignValidation
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_REFERENCES = 3  # beside each other
-MOST_CASES, MOST_REASONS = 40, 5  # of a study
-MOST_GAINS = 6  # of a front, on 80 columns
+MAX_REFERENCE_COLUMNS = 3  # beside each other
+MAX_CASE_ROWS, MAX_FAILURE_REASONS = 40, 5  # of a study
+MAX_GAIN_COLUMNS = 6  # of a front, on 80 columns
 SMALLEST_IS_WORST = ("GainMargin", "PhaseMargin")
 
 
@@ -34,14 +34,14 @@ def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> N
     table = new_table("parameter", "before", "tuned", "bounds", "")
     for n in after.free_names:
         p, unit = after[n], after[n].unit
-        bounds = f"{figure(p.lower, 4)} to {figure(p.upper, 4)}"
+        bounds = f"{format_number(p.lower, 4)} to {format_number(p.upper, 4)}"
         mark = "at its bound" if p.value in (p.lower, p.upper) else ""
         table.add_row(n, write_value(before.value(n), unit), write_value(p.value, unit), bounds, mark)
     console.print(table)
     console.print(_other_form(after), soft_wrap=True)
 
 
-def show_rejected(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet, word: str) -> None:
+def show_rejection(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet, word: str) -> None:
     """What stands when a tuning failed or was cut short, and what it had found.
 
     Parameters
@@ -84,13 +84,16 @@ def show_metrics(
         The same with the gains before.
     limits : sequence of Requirement
     """
-    units, allowed = metric_units(loop), {name(q): _allowed(q) for q in limits}
-    several = len(metrics.columns) > MOST_REFERENCES
+    units, allowed = metric_units(loop), {metric_name(q): _format_limit(q) for q in limits}
+    several = len(metrics.columns) > MAX_REFERENCE_COLUMNS
     columns = [f"worst of {len(metrics.columns)}"] if several else [f"{c} {loop.feedback.unit}" for c in metrics]
     table = new_table(title, *columns, *(["limit"] if allowed else []), "unit")
-    for metric in (m for m in units if m in metrics.index and _tells(m, metrics, loop)):
-        now, was = (_row(frame, metric, several) for frame in (metrics, before))
-        cells = [_metric(metric, v) + (f" (was {_metric(metric, was[k])})" if was else "") for k, v in enumerate(now)]
+    for metric in (m for m in units if m in metrics.index and _is_relevant(m, metrics, loop)):
+        now, was = (_metric_values(frame, metric, several) for frame in (metrics, before))
+        cells = [
+            _format_metric(metric, v) + (f" (was {_format_metric(metric, was[k])})" if was else "")
+            for k, v in enumerate(now)
+        ]
         limit = [allowed.get(metric, "")] if allowed else []
         table.add_row(metric, *cells, *limit, units[metric])
     console.print(table)
@@ -112,8 +115,8 @@ def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[
     units, grid = metric_units(loop), new_table("requirement", "claimed", "certified", "limit", "room", "", "unit")
     for row in table.reset_index(names="requirement").to_dict(orient="records"):
         metric = str(row["requirement"])
-        values = [100 * row[n] if metric in PERCENT else row[n] for n in ("claimed", "certified", "allowed")]
-        figures = [_metric(metric, v) for v in values[:2]] + [figure(values[2], 4)]
+        values = [100 * row[n] if metric in PERCENT_METRICS else row[n] for n in ("claimed", "certified", "allowed")]
+        figures = [_format_metric(metric, v) for v in values[:2]] + [format_number(values[2], 4)]
         room = "-" if math.isnan(row["room"]) else f"{100 * row['room']:.3g} %"
         grid.add_row(metric, *figures, room, "active" if row["active"] else "", units[metric])
     console.print(grid)
@@ -129,8 +132,8 @@ def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
     grid = new_table("relaxed alone", "asked", "would do", "by")
     for row in table.reset_index(names="limit").to_dict(orient="records"):
         share = "-" if math.isnan(row["share"]) else f"{100 * row['share']:.3g} %"
-        factor, unit = (100, " %") if row["limit"] in PERCENT else (1, "")
-        asked, needed = (figure(factor * row[n], 4) + unit for n in ("asked", "needed"))
+        factor, unit = (100, " %") if row["limit"] in PERCENT_METRICS else (1, "")
+        asked, needed = (format_number(factor * row[n], 4) + unit for n in ("asked", "needed"))
         if row["limit"] == "all":
             grid.add_row("all together", "", "", share)
         else:
@@ -145,8 +148,8 @@ def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop)
     table = new_table("fresh plants", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
     for row in found.summary.reset_index(names="metric").to_dict(orient="records"):
         metric = str(row["metric"])
-        figures = [_metric(metric, row[n]) for n in ("median", "p95", "worst", "certified")]
-        limit = "" if math.isnan(row["limit"]) else figure(row["limit"], 4)
+        figures = [_format_metric(metric, row[n]) for n in ("median", "p95", "worst", "certified")]
+        limit = "" if math.isnan(row["limit"]) else format_number(row["limit"], 4)
         table.add_row(metric, *figures, limit, str(row["violations"]), units[metric])
     console.print(table)
 
@@ -173,18 +176,18 @@ def show_cases(console: Console, table: "pd.DataFrame", axes: Mapping[str, str],
     """
     first = next(iter(metrics))
     ordered = table.sort_values(first, ascending=first in SMALLEST_IS_WORST, na_position="first", kind="stable")
-    shown = table if len(table) <= MOST_CASES else ordered.head(MOST_CASES)
+    shown = table if len(table) <= MAX_CASE_ROWS else ordered.head(MAX_CASE_ROWS)
     grid = new_table(*(f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items()))
     for row in shown.to_dict(orient="records"):
-        figures = [_metric(m, row[m]) for m in metrics]
+        figures = [_format_metric(m, row[m]) for m in metrics]
         if row["error"]:
-            figures = ["failed" if row["error"] != INTERRUPTED else INTERRUPTED] + [""] * (len(metrics) - 1)
-        grid.add_row(*(figure(row[n], 6) for n in axes), *figures)
+            figures = ["failed" if row["error"] != INTERRUPTED_CASE else INTERRUPTED_CASE] + [""] * (len(metrics) - 1)
+        grid.add_row(*(format_number(row[n], 6) for n in axes), *figures)
     console.print(grid)
     if len(shown) < len(table):
         console.print(f"the {len(shown)} worst of {len(table)} cases by {first}; -o FILE writes all")
-    reasons = table["error"][~table["error"].isin(["", INTERRUPTED])].value_counts()
-    for reason, count in list(reasons.items())[:MOST_REASONS]:
+    reasons = table["error"][~table["error"].isin(["", INTERRUPTED_CASE])].value_counts()
+    for reason, count in list(reasons.items())[:MAX_FAILURE_REASONS]:
         console.print(f"failed ({count} of {len(table)}): {reason}", soft_wrap=True)
 
 
@@ -202,21 +205,21 @@ def show_front(
         The two requirements, the limited one last, and the gains, with their units.
     """
     first, second = requirements
-    shown = dict(list(gains.items())[:MOST_GAINS])
-    grid = new_table(*(_stacked(n, unit) for n, unit in {**requirements, **shown}.items()))
+    shown = dict(list(gains.items())[:MAX_GAIN_COLUMNS])
+    grid = new_table(*(_narrow_heading(n, unit) for n, unit in {**requirements, **shown}.items()))
     grid.padding = (0, 1, 0, 0)
-    relation = ">=" if second in (kind.__name__ for kind in AT_LEAST) else "<="
+    relation = ">=" if second in (kind.__name__ for kind in MINIMUM_REQUIREMENTS) else "<="
     for row in table.to_dict(orient="records"):
-        figures = [figure(row[n], 4) for n in (first, second)]
+        figures = [format_number(row[n], 4) for n in (first, second)]
         if row["error"]:
-            word = INTERRUPTED if row["error"] == INTERRUPTED else "failed"
-            figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {figure(row['limit'], 4)}"]
-        grid.add_row(*figures, *(_gain(row[n]) for n in shown))
+            word = INTERRUPTED_CASE if row["error"] == INTERRUPTED_CASE else "failed"
+            figures = [word, "-" if math.isnan(row["limit"]) else f"{relation} {format_number(row['limit'], 4)}"]
+        grid.add_row(*figures, *(_format_gain(row[n]) for n in shown))
     console.print(grid)
     if len(shown) < len(gains):
         console.print(f"{len(shown)} of {len(gains)} gains; -o FILE writes all")
-    for row in table[~table["error"].isin(["", INTERRUPTED])].to_dict(orient="records"):
-        console.print(f"failed ({second} {relation} {figure(row['limit'], 4)}): {row['error']}", soft_wrap=True)
+    for row in table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records"):
+        console.print(f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}", soft_wrap=True)
 
 
 def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
@@ -247,25 +250,25 @@ def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
     }
 
 
-def _gain(value: float) -> str:
+def _format_gain(value: float) -> str:
     """Four digits, as gains are rounded, and no exponent where it is the longer one: 68130."""
-    return f"{float(figure(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else figure(value, 4)
+    return f"{float(format_number(value, 4)):.0f}" if 1e4 <= abs(value) < 1e7 else format_number(value, 4)
 
 
-def _stacked(column: str, unit: str) -> str:
+def _narrow_heading(column: str, unit: str) -> str:
     """A heading in narrow lines, "Peak / Control / [V]" or "pid. / Kp / [V*s/m]"."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=\.)", "\n", column)
     return words if unit in ("", "1") else f"{words}\n[{unit}]"
 
 
-def _tells(metric: str, metrics: "pd.DataFrame", loop: ClosedLoop) -> bool:
+def _is_relevant(metric: str, metrics: "pd.DataFrame", loop: ClosedLoop) -> bool:
     """Ripple only under dither, a limit cycle only where there is one."""
     if metric == "Ripple":
         return loop.dither is not None
-    return metric not in HUNTING or bool((metrics.loc[HUNTING[0]] > 0).any())
+    return metric not in LIMIT_CYCLE_METRICS or bool((metrics.loc[LIMIT_CYCLE_METRICS[0]] > 0).any())
 
 
-def _row(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float]:
+def _metric_values(frame: "pd.DataFrame | None", metric: str, several: bool) -> list[float]:
     if frame is None or metric not in frame.index:
         return []
     values: list[float] = frame.T[metric].tolist()
@@ -290,12 +293,12 @@ def _other_form(parameters: ParameterSet) -> str:
     return f"standard form: Kp {form.Kp:.4g}{integral}{derivative}"
 
 
-def _allowed(requirement: Requirement) -> str:
-    if isinstance(requirement, AT_LEAST):
-        return "" if requirement.min is None else f">= {figure(requirement.min, 4)}"
-    factor = 100 if name(requirement) in PERCENT else 1
-    return "" if requirement.max is None else f"<= {figure(factor * requirement.max, 4)}"
+def _format_limit(requirement: Requirement) -> str:
+    if isinstance(requirement, MINIMUM_REQUIREMENTS):
+        return "" if requirement.min is None else f">= {format_number(requirement.min, 4)}"
+    factor = 100 if metric_name(requirement) in PERCENT_METRICS else 1
+    return "" if requirement.max is None else f"<= {format_number(factor * requirement.max, 4)}"
 
 
-def _metric(metric: str, value: float) -> str:
-    return "never" if metric == "SettlingTime" and math.isnan(value) else figure(value, 4)
+def _format_metric(metric: str, value: float) -> str:
+    return "never" if metric == "SettlingTime" and math.isnan(value) else format_number(value, 4)

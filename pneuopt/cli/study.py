@@ -7,43 +7,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.cli.shared import (
-    GOOD,
-    INTERRUPTED,
-    NOT_GOOD,
+    EXIT_FAILURE,
+    EXIT_INTERRUPTED,
+    EXIT_SUCCESS,
     Outputs,
     Writers,
-    band_of,
     figure_writers,
+    file_hashes,
     finish,
-    hashes,
-    read_loop,
-    warn_of,
+    read_fit_and_tuning,
+    settling_band,
+    warn_of_status,
 )
 from pneuopt.cli.show_loops import SMALLEST_IS_WORST, metric_units, show_cases, show_front
-from pneuopt.cli.terminal import progress, screen
+from pneuopt.cli.terminal import make_console, progress
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import (
-    AT_LEAST,
-    PERCENT,
+    MINIMUM_REQUIREMENTS,
+    PERCENT_METRICS,
     Requirement,
     SettlingTime,
     StepEnvelope,
-    bound,
-    bounded,
-    most,
-    name,
+    metric_name,
+    upper_limit,
+    user_limit,
+    with_user_limit,
 )
-from pneuopt.files.loop import checked
-from pneuopt.files.requirements import KEYS, bound_units
+from pneuopt.files.loop import construct_at
+from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.study import Axis, Pareto, Study, read_axes, read_pareto, read_study
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import plot_front, plot_map
-from pneuopt.quantities.errors import InputError, check_known, require
+from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.units import write_value
-from pneuopt.studies.sweep import INTERRUPTED as CUT_SHORT
-from pneuopt.studies.sweep import grid, sweep
+from pneuopt.studies.sweep import INTERRUPTED_CASE, grid, sweep
 from pneuopt.tuning.pareto import pareto_front
 
 if TYPE_CHECKING:
@@ -64,130 +63,137 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
     require(
         outputs.plot is None or count <= 2, f"{file}: --plot draws one or two axes, there are {count}; leave it out"
     )
-    asked, parameters = read_loop(study.drive, study.tuning)
-    warn_of(study.tuning, "tuning")
-    axes, units = read_axes(study, parameters), metric_units(asked.loop)
-    check_known("metric", study.show, units, f"{file}: [metrics] show")
+    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning, "tuning")
+    axes, units = read_axes(study, parameters), metric_units(task.loop)
+    check_names("metric", study.show, units, f"{file}: [metrics] show")
     try:
         cases = grid(parameters, {axis.name: axis.points for axis in axes})
     except InputError as error:
         raise InputError(f"{file}: [axes] {error}") from None
-    certify = partial(evaluate, asked.loop, asked.references, band=study.band or band_of(asked))
-    with progress("certifying", quiet=quiet) as tell:
-        table = sweep(certify, parameters, cases, progress=tell)
-    verdict, status = _verdict(table, len(asked.references))
-    screen().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
+    certify = partial(evaluate, task.loop, task.references, band=study.band or settling_band(task))
+    with progress("certifying", quiet=quiet) as report_progress:
+        table = sweep(certify, parameters, cases, progress=report_progress)
+    verdict, status = _grid_verdict(table, len(task.references))
+    make_console().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
     seen = _worst_of_references(table, axes, study.show)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
-    show_cases(screen(), seen, written, metrics)
+    show_cases(make_console(), seen, written, metrics)
     writers: Writers = {}
     if outputs.output is not None:
-        text = _in_si(table, {n: parameters[n].unit for n in written}, asked.loop)
+        text = _grid_csv(table, {n: parameters[n].unit for n in written}, task.loop)
         writers[outputs.output] = partial(write_text, outputs.output, text)
     if outputs.plot is not None:
         writers |= figure_writers(outputs.plot, {"": plot_map(seen, written, metrics)})
-    tables = {"verdict": verdict, "cases": records(table), "provenance": hashes(file, study.drive, study.tuning)}
+    tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
     finish(outputs, writers, tables, None)
     return status
 
 
 def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
     """Tune a loop along a front between two requirements; returns the exit status."""
-    asked, parameters = read_loop(study.drive, study.tuning)
-    warn_of(study.tuning, "tuning")
-    said = read_pareto(study, bound_units(asked.loop))
-    first, second, until = _between(study, said, asked)
-    free = asked.parameters.free_names
+    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
+    warn_of_status(study.tuning, "tuning")
+    front_spec = read_pareto(study, bound_units(task.loop))
+    first, second, until = _front_requirements(study, front_spec, task)
+    free = task.parameters.free_names
     require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
-    with progress("finding the front's ends", quiet=quiet) as tell:
+    with progress("finding the front's ends", quiet=quiet) as report_progress:
         front = pareto_front(
-            asked.loop,
-            asked.references,
+            task.loop,
+            task.references,
             parameters,
             minimise=(first, second),
-            subject_to=[q for q in asked.subject_to if name(q) != name(second)],
-            scenarios=asked.scenarios(parameters),
-            points=said.points,
+            subject_to=[q for q in task.subject_to if metric_name(q) != metric_name(second)],
+            scenarios=task.scenarios(parameters),
+            points=front_spec.points,
             until=until,
-            progress=tell,
+            progress=report_progress,
         )
-    front, known = _in_percent(front, first, second), metric_units(asked.loop)
+    front, known = _convert_to_percent(front, first, second), metric_units(task.loop)
     pair, gains = (
-        {name(q): known[name(q)] for q in (first, second)},
+        {metric_name(q): known[metric_name(q)] for q in (first, second)},
         {n: parameters[n].unit for n in front if n in free},
     )
     verdict, status = _front_verdict(front, pair)
-    screen().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
-    show_front(screen(), front, pair, gains)
+    make_console().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
+    show_front(make_console(), front, pair, gains)
     writers: Writers = {}
     if outputs.output is not None:
         claimed = {f"claimed {n}": unit for n, unit in pair.items()}
-        units = {**pair, **claimed, "limit": pair[name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
-        writers[outputs.output] = partial(write_text, outputs.output, _as_csv(front, units))
+        units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
+        writers[outputs.output] = partial(write_text, outputs.output, _to_csv(front, units))
     if outputs.plot is not None:
         writers |= figure_writers(outputs.plot, {"": plot_front(front, pair)})
     tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}}
-    finish(outputs, writers, tables | {"provenance": hashes(study.path, study.drive, study.tuning)}, None)
+    finish(outputs, writers, tables | {"provenance": file_hashes(study.path, study.drive, study.tuning)}, None)
     return status
 
 
-def _between(study: Study, said: Pareto, asked: Tuning) -> tuple[Requirement, Requirement, float | None]:
+def _front_requirements(
+    study: Study, front_spec: Pareto, task: Tuning
+) -> tuple[Requirement, Requirement, float | None]:
     """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
     where = f"{study.path}: [pareto]"
-    given = {name(q): q for q in (*asked.minimise, *asked.subject_to)}
-    first, second = (_requirement(key, given, asked, f"{where} between") for key in said.between)
-    ends = {"lower": said.lower, "upper": said.upper}
-    begin, end = ("lower", "upper") if isinstance(second, AT_LEAST) else ("upper", "lower")
+    given = {metric_name(q): q for q in (*task.minimise, *task.subject_to)}
+    first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
+    ends = {"lower": front_spec.lower, "upper": front_spec.upper}
+    begin, end = ("lower", "upper") if isinstance(second, MINIMUM_REQUIREMENTS) else ("upper", "lower")
     start, until = ends[begin], ends[end]
-    loosest = second if start is None else checked(lambda: bounded(second, start), f"{where} {begin}")
+    loosest = second if start is None else construct_at(lambda: with_user_limit(second, start), f"{where} {begin}")
     if until is not None:
-        tightest = checked(lambda: bounded(second, until), f"{where} {end}")
-        side, unit = "below" if end == "lower" else "above", bound_units(asked.loop)[said.between[1]]
-        ends_at, begins_at = (write_value(bound(q) or math.inf, unit) for q in (tightest, loosest))
-        told = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
-        require(most(tightest) < most(loosest), told)
+        tightest = construct_at(lambda: with_user_limit(second, until), f"{where} {end}")
+        side, unit = "below" if end == "lower" else "above", bound_units(task.loop)[front_spec.between[1]]
+        ends_at, begins_at = (write_value(user_limit(q) or math.inf, unit) for q in (tightest, loosest))
+        message = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
+        require(upper_limit(tightest) < upper_limit(loosest), message)
     return first, loosest, until
 
 
-def _requirement(key: str, given: Mapping[str, Requirement], asked: Tuning, where: str) -> Requirement:
+def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
     """As the tuning has it, its bound included; else a plain one."""
-    kind: Any = KEYS[key]
+    kind: Any = REQUIREMENTS_BY_KEY[key]
     if kind.__name__ in given:
         return given[kind.__name__]
     require(kind is not StepEnvelope, f"{where}: the tuning says no bounds for step_envelope; add them under [limits]")
-    plain: Requirement = SettlingTime(band_of(asked)) if kind is SettlingTime else kind()
+    plain: Requirement = SettlingTime(settling_band(task)) if kind is SettlingTime else kind()
     return plain
 
 
 def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str, int]:
     """How many designs are not certified, and the exit status."""
-    interrupted = int((front["error"] == CUT_SHORT).sum())
+    interrupted = int((front["error"] == INTERRUPTED_CASE).sum())
     failed = int((front["error"] != "").sum()) - interrupted
     parts = [f"{count} {what}" for count, what in ((interrupted, "interrupted"), (failed, "not certified")) if count]
-    status = INTERRUPTED if interrupted else NOT_GOOD if failed else GOOD
+    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
     one = " (one is best by both)" if len(front) == 1 and not parts else ""
     what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
     return f"{what}: {', '.join(parts) or 'all certified'}{one}", status
 
 
-def _in_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
+def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
     """The front with figures as the metrics are shown, overshoot in percent."""
-    columns = [c for q in (first, second) if name(q) in PERCENT for c in (name(q), f"claimed {name(q)}")]
-    columns += ["limit"] if name(second) in PERCENT else []
+    columns = [
+        c
+        for q in (first, second)
+        if metric_name(q) in PERCENT_METRICS
+        for c in (metric_name(q), f"claimed {metric_name(q)}")
+    ]
+    columns += ["limit"] if metric_name(second) in PERCENT_METRICS else []
     return front.assign(**{c: 100 * front[c] for c in columns})
 
 
-def _verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
+def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
     """How a study went, and the exit status."""
-    settling = table[[c for c in table if _metric_of(c) == "SettlingTime"]]
+    settling = table[[c for c in table if _metric_name(c) == "SettlingTime"]]
     good = table["error"] == ""
     counts = {
-        "interrupted": int((table["error"] == CUT_SHORT).sum()),
-        "failed": int((~good & (table["error"] != CUT_SHORT)).sum()),
+        "interrupted": int((table["error"] == INTERRUPTED_CASE).sum()),
+        "failed": int((~good & (table["error"] != INTERRUPTED_CASE)).sum()),
         "never settle": int((good & settling.isna().any(axis=1)).sum()),
     }
     parts = [f"{count} {what}" for what, count in counts.items() if count]
-    status = INTERRUPTED if counts["interrupted"] else NOT_GOOD if parts else GOOD
+    status = EXIT_INTERRUPTED if counts["interrupted"] else EXIT_FAILURE if parts else EXIT_SUCCESS
     each = f", each the worst of {references} references" if references > 1 else ""
     return f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}", status
 
@@ -196,27 +202,27 @@ def _worst_of_references(table: "pd.DataFrame", axes: Sequence[Axis], metrics: S
     """What is shown of a study: the axes in the units of the file, each metric at its worst."""
     seen = table[["error"]].copy()
     for axis in axes:
-        seen[axis.name] = axis.shown(table[axis.name])
+        seen[axis.name] = axis.in_axis_unit(table[axis.name])
     for metric in metrics:
-        own = table[[c for c in table if _metric_of(c) == metric]]
+        own = table[[c for c in table if _metric_name(c) == metric]]
         worst = own.min if metric in SMALLEST_IS_WORST else own.max
         seen[metric] = worst(axis=1, skipna=False) if len(own.columns) else math.nan
     return seen
 
 
-def _metric_of(column: Hashable) -> str:
+def _metric_name(column: Hashable) -> str:
     """What "Overshoot[0 to 0.2]" is, as it is called where there are several references."""
     return str(column).partition("[")[0]
 
 
-def _in_si(table: "pd.DataFrame", axes: Mapping[str, str], loop: ClosedLoop) -> str:
+def _grid_csv(table: "pd.DataFrame", axes: Mapping[str, str], loop: ClosedLoop) -> str:
     """As CSV, each column with its unit."""
     known = {**axes, **metric_units(loop), "PeakTime": "s", "OvershootFinal": "%", "Undershoot": "%", "seconds": "s"}
     known |= dict.fromkeys(("SettlingMin", "SettlingMax", "Peak", "SteadyStateValue"), loop.feedback.unit)
-    return _as_csv(table, {str(c): known.get(_metric_of(c), "") for c in table})
+    return _to_csv(table, {str(c): known.get(_metric_name(c), "") for c in table})
 
 
-def _as_csv(table: "pd.DataFrame", units: Mapping[str, str]) -> str:
+def _to_csv(table: "pd.DataFrame", units: Mapping[str, str]) -> str:
     """As CSV, the units in the header."""
     header = {n: f"{n} [{unit}]" for n, unit in units.items() if unit}
     return str(table.rename(columns=header).to_csv(index=False, float_format="%.9g", lineterminator="\n"))

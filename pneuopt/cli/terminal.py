@@ -12,17 +12,16 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from pneuopt.shooting.least_squares import Progress as Tell
-from pneuopt.shooting.solution import Status
+from pneuopt.quantities.status import ProgressCallback, Status
 
 
-def screen(*, error: bool = False) -> Console:
+def make_console(*, error: bool = False) -> Console:
     """Standard output, or standard error; nothing is read as markup, for names of logs have brackets."""
     return Console(file=sys.stderr if error else sys.stdout, markup=False, highlight=False, emoji=False)
 
 
 @contextmanager
-def progress(label: str, *, quiet: bool) -> Iterator[Tell]:
+def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
     """A line that shows the latest news and the time; nothing where standard error is no terminal, or if quiet.
 
     Parameters
@@ -36,7 +35,7 @@ def progress(label: str, *, quiet: bool) -> Iterator[Tell]:
     callable
         Takes a line of text.
     """
-    console = screen(error=True)
+    console = make_console(error=True)
     silent = quiet or not console.is_terminal
     clock = TimeElapsedColumn(table_column=Column(min_width=7))
     news = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
@@ -51,7 +50,7 @@ def show_status(console: Console, status: Status) -> None:
     console.print(Text(str(status), style="bold green" if status.converged else "bold red"), soft_wrap=True)
 
 
-def show_written(console: Console, paths: Sequence[Any]) -> None:
+def show_output_files(console: Console, paths: Sequence[Any]) -> None:
     """The files that were written."""
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
@@ -89,6 +88,6 @@ def new_table(*columns: str) -> Table:
     return table
 
 
-def figure(value: float, digits: int) -> str:
+def format_number(value: float, digits: int) -> str:
     """A number for a table, "-" where there is none."""
     return "-" if math.isnan(value) else f"{value:.{digits}g}"

@@ -8,43 +8,43 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.cli.shared import (
-    INTERRUPTED,
+    EXIT_INTERRUPTED,
     Columns,
     Outputs,
     Writers,
-    background,
-    band_of,
-    beside,
-    envelope_of,
+    add_to_stem,
     figure_writers,
+    file_hashes,
     finish,
-    hashes,
-    read_loop,
+    read_fit_and_tuning,
+    settling_band,
+    stats_and_provenance,
+    step_envelope,
     write_csv,
 )
 from pneuopt.cli.show_loops import (
     show_dither,
     show_gains,
     show_metrics,
-    show_rejected,
+    show_rejection,
     show_relaxations,
     show_requirements,
     show_validation,
 )
-from pneuopt.cli.terminal import progress, screen, show_status
+from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.dither_verdict import judge_dither
-from pneuopt.evaluation.evaluate import evaluate, point_of_operation, respond
+from pneuopt.evaluation.evaluate import evaluate, final_operating_point, respond
 from pneuopt.files.tuning import Tuning, write_tuned
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
-from pneuopt.quantities.output import check_outputs, records
+from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.solution import Code
-from pneuopt.tuning.space import cut
+from pneuopt.tuning.space import linearise_open_loop
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.validation import DesignValidation, validate_design
 
@@ -57,110 +57,110 @@ if TYPE_CHECKING:
 def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     """Tune a loop; returns the exit status."""
     outputs.check([fit, tuning], "bode")
-    asked, parameters = read_loop(fit, tuning)
+    task, parameters = read_fit_and_tuning(fit, tuning)
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
-    require(bool(asked.minimise), f"{tuning}: says nothing to minimise; {remedy}")
-    require(len(asked.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
-    with progress("tuning", quiet=quiet) as tell:
+    require(bool(task.minimise), f"{tuning}: says nothing to minimise; {remedy}")
+    require(len(task.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
+    with progress("tuning", quiet=quiet) as report_progress:
         result = tune(
-            asked.loop,
-            asked.references,
+            task.loop,
+            task.references,
             parameters,
-            minimise=asked.minimise,
-            subject_to=asked.subject_to,
-            scenarios=asked.scenarios(parameters),
+            minimise=task.minimise,
+            subject_to=task.subject_to,
+            scenarios=task.scenarios(parameters),
             throw=False,
-            progress=tell,
+            progress=report_progress,
         )
-    result = replace(result, provenance={**result.provenance, **hashes(fit, tuning)})
-    console, shown = screen(), dict[str, Any]()
+    result = replace(result, provenance={**result.provenance, **file_hashes(fit, tuning)})
+    console, shown = make_console(), dict[str, Any]()
     show_status(console, result.status)
     if result.status.converged:
-        shown = _show_tuned(console, asked, parameters, result)
+        shown = _show_design(console, task, parameters, result)
     else:
         word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
-        show_rejected(console, tuning, result.stats, parameters, word)
-        show_metrics(console, result.certified, asked.loop, title=word, limits=asked.subject_to)
+        show_rejection(console, tuning, result.stats, parameters, word)
+        show_metrics(console, result.certified, task.loop, title=word, limits=task.subject_to)
         show_relaxations(console, result.relaxations)
     if result.status.code is Code.INTERRUPTED:
         console.print("no file is written")
-        return INTERRUPTED
+        return EXIT_INTERRUPTED
     writers: Writers = {}
     if outputs.output is not None:
         writers[outputs.output] = partial(write_tuned, outputs.output, tuning, result)
     if outputs.plot is not None:
         before_gains = parameters if result.status.converged else None
-        writers |= figure_writers(outputs.plot, _loop_figures(asked, result.parameters, before_gains))
-    return finish(outputs, writers, _tuning_tables(result) | shown | background(result), result.status)
+        writers |= figure_writers(outputs.plot, _loop_figures(task, result.parameters, before_gains))
+    return finish(outputs, writers, _tuning_tables(result) | shown | stats_and_provenance(result), result.status)
 
 
 def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     """Simulate the closed loop of a tuning's file; returns the exit status."""
     outputs.check([fit, tuning], "bode")
-    asked, parameters = read_loop(fit, tuning)
-    scenarios = asked.scenarios(parameters)
+    task, parameters = read_fit_and_tuning(fit, tuning)
+    scenarios = task.scenarios(parameters)
     metrics = evaluate(
-        asked.loop,
-        asked.references,
+        task.loop,
+        task.references,
         parameters,
         scenarios=scenarios,
-        band=band_of(asked),
-        envelope=envelope_of(asked),
+        band=settling_band(task),
+        envelope=step_envelope(task),
     )
-    show_metrics(screen(), metrics, asked.loop, limits=asked.subject_to)
+    show_metrics(make_console(), metrics, task.loop, limits=task.subject_to)
     writers: Writers = {}
     if outputs.output is not None:
-        runs = [_with_reference(r) for r in _responses(asked, parameters)]
-        paths = numbered(outputs.output, len(runs))
-        check_outputs(paths, [fit, tuning])
-        columns = _loop_columns(asked.loop)
+        runs = [_with_reference(r) for r in _simulate_responses(task, parameters)]
+        paths = number_paths(outputs.output, len(runs))
+        check_output_paths(paths, [fit, tuning])
+        columns = _loop_columns(task.loop)
         writers |= {p: partial(write_csv, p, run, columns) for p, run in zip(paths, runs, strict=True)}
     if outputs.plot is not None:
-        writers |= figure_writers(outputs.plot, _loop_figures(asked, parameters, None))
-    tables = {"certified": records(metrics.T), "provenance": hashes(fit, tuning)}
+        writers |= figure_writers(outputs.plot, _loop_figures(task, parameters, None))
+    tables = {"certified": records(metrics.T), "provenance": file_hashes(fit, tuning)}
     return finish(outputs, writers, tables, None)
 
 
-def _validation(asked: Tuning, parameters: ParameterSet, result: TuningResult) -> DesignValidation | None:
+def _validate_on_new_plants(task: Tuning, parameters: ParameterSet, result: TuningResult) -> DesignValidation | None:
     """Fresh plants from the boxes of the scenarios; None without scenarios."""
-    fresh = asked.fresh(parameters)
+    fresh = task.validation_scenarios(parameters)
     if not fresh:
         return None
     return validate_design(
-        asked.loop,
-        asked.references,
+        task.loop,
+        task.references,
         result.parameters,
-        minimise=asked.minimise,
-        subject_to=asked.subject_to,
+        minimise=task.minimise,
+        subject_to=task.subject_to,
         scenarios=fresh,
     )
 
 
-def _show_tuned(console: "Console", asked: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
+def _show_design(console: "Console", task: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
     """Gains, metrics, fresh plants, and whether the dither is worth it; the last two as tables."""
     show_gains(console, before, result.parameters)
-    show_metrics(console, result.certified, asked.loop, before=_before(asked, before), limits=asked.subject_to)
-    show_requirements(console, result.requirements, result.active, asked.loop)
+    show_metrics(console, result.certified, task.loop, before=_initial_metrics(task, before), limits=task.subject_to)
+    show_requirements(console, result.requirements, result.active, task.loop)
     slopes = [v for n, v in result.stats.items() if n.startswith("friction_slope")]
     if slopes:
         ends = " to ".join(dict.fromkeys(f"{v:.4g}" for v in (min(slopes), max(slopes))))
         console.print(f"margins are read with the slope that friction has where a step ends: {ends} N*s/m")
     tables: dict[str, Any] = {}
-    validation = _validation(asked, before, result)
+    validation = _validate_on_new_plants(task, before, result)
     if validation is not None:
-        show_validation(console, validation, asked.loop)
+        show_validation(console, validation, task.loop)
         tables["validation"] = records(validation.summary)
-    if asked.loop.dither_period(result.parameters) is not None:
-        tables |= _judged(console, asked, result.parameters)
+    if task.loop.dither_period(result.parameters) is not None:
+        tables |= _show_dither_verdict(console, task, result.parameters)
     elif "dither.amplitude" in result.parameters.free_names:
         console.print("the dither's amplitude is 0: the tuning found no use for it")
     return tables
 
 
-def _judged(console: "Console", asked: Tuning, parameters: ParameterSet) -> dict[str, Any]:
+def _show_dither_verdict(console: "Console", task: Tuning, parameters: ParameterSet) -> dict[str, Any]:
     """The dither's verdict; without it the loop may be one that cannot be simulated."""
     try:
-        verdict = judge_dither(asked.loop, asked.references, parameters, band=band_of(asked))
+        verdict = judge_dither(task.loop, task.references, parameters, band=settling_band(task))
     except ConvergenceError as error:
         console.print(f"the dither is not judged: {error}", soft_wrap=True)
         return {}
@@ -168,32 +168,32 @@ def _judged(console: "Console", asked: Tuning, parameters: ParameterSet) -> dict
     return {"dither": {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons)}}
 
 
-def _before(asked: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
+def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
     """The metrics with the gains as given; None where that loop cannot be simulated."""
     try:
         return evaluate(
-            asked.loop,
-            asked.references,
+            task.loop,
+            task.references,
             parameters,
-            scenarios=asked.scenarios(parameters),
-            band=band_of(asked),
-            envelope=envelope_of(asked),
+            scenarios=task.scenarios(parameters),
+            band=settling_band(task),
+            envelope=step_envelope(task),
         )
     except (ConvergenceError, InputError):
         return None
 
 
-def _responses(asked: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> list[Response]:
-    loop, units = asked.loop, (asked.loop.feedback.unit, asked.loop.command.unit)
+def _simulate_responses(task: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> list[Response]:
+    loop, units = task.loop, (task.loop.feedback.unit, task.loop.command.unit)
     found = []
-    for reference in asked.references:
-        run = _run(loop, reference, parameters)
-        earlier = None if before is None else _run_before(loop, reference, before)
+    for reference in task.references:
+        run = _simulate_response(loop, reference, parameters)
+        earlier = None if before is None else _simulate_initial_response(loop, reference, before)
         found.append(Response(run, reference, loop.feedback.name, units, earlier, loop.dither_period(parameters)))
     return found
 
 
-def _run(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory:
+def _simulate_response(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory:
     """The response, with the friction force where the plant has one."""
     run, plant = respond(loop, reference, parameters), loop.plant
     if not plant.states or not has_friction_map(plant):
@@ -203,29 +203,29 @@ def _run(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Traject
     return run.with_columns({"friction.force": friction_force(plant, whole, loop.parameters | parameters)})
 
 
-def _run_before(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
+def _simulate_initial_response(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
     try:
-        return _run(loop, reference, parameters)
+        return _simulate_response(loop, reference, parameters)
     except (ConvergenceError, InputError):
         return None
 
 
-def _loop_figures(asked: Tuning, parameters: ParameterSet, before: ParameterSet | None) -> dict[str, "Figure"]:
+def _loop_figures(task: Tuning, parameters: ParameterSet, before: ParameterSet | None) -> dict[str, "Figure"]:
     """The steps, and the Bode plot about the state in which the first one ends, before about where that one did."""
-    responses = _responses(asked, parameters, before)
+    responses = _simulate_responses(task, parameters, before)
     first = responses[0]
-    earlier = None if first.before is None or before is None else _cut(asked.loop, before, first.before)
-    bode = plot_bode(_cut(asked.loop, parameters, first.run), earlier)
-    return {"": plot_steps(responses, band=band_of(asked)), "bode": bode}
+    earlier = None if first.before is None or before is None else _open_loop(task.loop, before, first.before)
+    bode = plot_bode(_open_loop(task.loop, parameters, first.run), earlier)
+    return {"": plot_steps(responses, band=settling_band(task)), "bode": bode}
 
 
-def _cut(loop: ClosedLoop, parameters: ParameterSet, run: Trajectory) -> Linearisation:
-    return cut(loop, parameters, *point_of_operation(loop, parameters, run))
+def _open_loop(loop: ClosedLoop, parameters: ParameterSet, run: Trajectory) -> Linearisation:
+    return linearise_open_loop(loop, parameters, *final_operating_point(loop, parameters, run))
 
 
-def numbered(path: Path, count: int) -> list[Path]:
+def number_paths(path: Path, count: int) -> list[Path]:
     """One file a run: run.csv, or run_1.csv, run_2.csv."""
-    return [path] if count == 1 else [beside(path, str(k)) for k in range(1, count + 1)]
+    return [path] if count == 1 else [add_to_stem(path, str(k)) for k in range(1, count + 1)]
 
 
 def _loop_columns(loop: ClosedLoop) -> Columns:

@@ -1,4 +1,4 @@
-"""`averaged`: what a fast dither makes of a plant, without the dither's own oscillation.
+"""`average_dither`: what a fast dither makes of a plant, without the dither's own oscillation.
 
 Every state swings about its mean, ``x = m + X(theta)``; the means obey ``dm/dt = mean over theta of f(m + X, u + A sin
 theta)``, or with a triangle in place of the sine. That smooths at once what the spool's ripple does to the openings and
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 
 from pneuopt.control.dither import Waveform
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.system import Symbols, System, define, names, stacked, symbols, vector
-from pneuopt.quantities.errors import ConvergenceError, check_known, require
+from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Array = NDArray[np.float64]
-AMPLITUDE, OFFSET, FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
-RISE = np.geomspace(1e-3, 1.0, 13)  # fractions of the amplitude, where the whole is too much at once
-ITERATIONS, TOLERANCE, SHORTEST = 50, 1e-9, 1e-3
+DITHER_AMPLITUDE, DITHER_OFFSET, DITHER_FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
+AMPLITUDE_FRACTIONS = np.geomspace(1e-3, 1.0, 13)  # fractions of the amplitude, where the whole is too much at once
+MAX_NEWTON_ITERATIONS, NEWTON_TOLERANCE, MIN_NEWTON_STEP = 50, 1e-9, 1e-3
 
 
-def averaged(
+def average_dither(
     model: System | ClosedLoop,
     parameters: ParameterSet,
     *,
@@ -86,8 +86,8 @@ def averaged(
     0.67
     """
     swing = ripple(model, parameters, at=at, reference=reference, actuated=actuated, nodes=nodes, waveform=waveform)
-    share = np.array([*swing.values()], dtype=np.complex128) / parameters.value(AMPLITUDE)
-    return _dithered(model, parameters, actuated, waveform).mean(share, nodes)
+    share = np.array([*swing.values()], dtype=np.complex128) / parameters.value(DITHER_AMPLITUDE)
+    return _add_dither(model, parameters, actuated, waveform).mean_system(share, nodes)
 
 
 def ripple(
@@ -102,16 +102,16 @@ def ripple(
 ) -> dict[str, complex]:
     """How every state swings under dither: the balance of the first harmonic, with friction and openings as they are.
 
-    Parameters and errors as for `averaged`.
+    Parameters and errors as for `average_dither`.
 
     Returns
     -------
     dict of str to complex
         By state: the peak, and the phase by which it leads the sine, or the triangle.
     """
-    dithered = _dithered(model, parameters, actuated, waveform)
+    dithered = _add_dither(model, parameters, actuated, waveform)
     given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
-    swing = _first_harmonic(dithered, given, _point(model, dithered, given, at, reference), nodes)
+    swing = _first_harmonic(dithered, given, _operating_point(model, dithered, given, at, reference), nodes)
     return dict(zip(names(dithered.system.states), swing.tolist(), strict=True))
 
 
@@ -141,41 +141,46 @@ def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Arra
 
 
 @dataclass(frozen=True, eq=False)
-class _Dithered:
+class _DitheredSystem:
     """A system and where the wave enters: an input, or, of a loop, the dither's offset."""
 
     system: System
     parameters: ParameterSet
     frequency: float
-    entrance: str | None
+    dithered_input: str | None
     waveform: Waveform
 
     def rates(self, t: ca.SX, x: ca.SX, u: Symbols, p: Symbols, wave: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Rates and outputs while the wave has this value."""
         own = {n: p[n] for n in self.system.parameters}
-        if self.entrance is None:
-            own |= {AMPLITUDE: ca.SX(0), OFFSET: p[OFFSET] + wave}
+        if self.dithered_input is None:
+            own |= {DITHER_AMPLITUDE: ca.SX(0), DITHER_OFFSET: p[DITHER_OFFSET] + wave}
         else:
-            u = {**u, self.entrance: u[self.entrance] + p[OFFSET] + wave}
-        xdot, y = self.system.ode(t, x, stacked(u), stacked(own))
+            u = {**u, self.dithered_input: u[self.dithered_input] + p[DITHER_OFFSET] + wave}
+        xdot, y = self.system.ode(t, x, stack(u), stack(own))
         return xdot, y
 
-    def mean(self, unit: NDArray[np.complex128], nodes: int) -> System:
+    def mean_system(self, unit: NDArray[np.complex128], nodes: int) -> System:
         """The system of the means, for a ripple of `unit` per amplitude."""
-        system, (phases, weights) = self.system, _phases(nodes, self.waveform)
+        system, (phases, weights) = self.system, _phase_quadrature(nodes, self.waveform)
         waves, swings = (
             self.waveform.at(phases),
             np.outer(np.sin(phases), unit.real) + np.outer(np.cos(phases), unit.imag),
         )
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
-            A, z = p[AMPLITUDE], stacked(x)
+            A, z = p[DITHER_AMPLITUDE], stack(x)
             found = [self.rates(t, z + A * ca.DM(X), u, p, A * w) for w, X in zip(waves.tolist(), swings, strict=True)]
-            rates, outputs = (_weighted(column, weights) for column in zip(*found, strict=True))
-            return _named(system.states, rates), _named(system.outputs, outputs)
+            rates, outputs = (_sum_with_weights(column, weights) for column in zip(*found, strict=True))
+            return _by_name(system.states, rates), _by_name(system.outputs, outputs)
 
         mean = define(system.states, system.inputs, system.outputs, self.parameters, rhs)
-        return replace(mean, rest_finder=system.rest_finder, checker=system.checker, guards=system.guards)
+        return replace(
+            mean,
+            rest_hook=system.rest_hook,
+            hardware_check_hook=system.hardware_check_hook,
+            validity_limits=system.validity_limits,
+        )
 
     def imbalance(self, nodes: int) -> ca.Function:
         """``(a, b; x, u, p) -> first harmonic of the rates, less that of the swing a sin theta + b cos theta``."""
@@ -183,40 +188,40 @@ class _Dithered:
         a, b, x = (ca.SX.sym(k, n) for k in "abx")
         u, p = symbols(self.system.inputs), {n: ca.SX.sym(n) for n in self.parameters}
         inphase, quadrature = ca.SX(n, 1), ca.SX(n, 1)
-        for phase, weight in zip(*_phases(nodes, self.waveform), strict=True):
+        for phase, weight in zip(*_phase_quadrature(nodes, self.waveform), strict=True):
             sine, cosine, wave = np.sin(phase), np.cos(phase), float(self.waveform.at(phase))
-            rate = self.rates(ca.SX(0), x + a * sine + b * cosine, u, p, p[AMPLITUDE] * wave)[0]
+            rate = self.rates(ca.SX(0), x + a * sine + b * cosine, u, p, p[DITHER_AMPLITUDE] * wave)[0]
             inphase, quadrature = inphase + 2 * weight * sine * rate, quadrature + 2 * weight * cosine * rate
         unknown, left = ca.vertcat(a, b), ca.vertcat(quadrature - w * a, inphase + w * b) / w
-        values = [unknown, x, stacked(u), stacked(p)]
+        values = [unknown, x, stack(u), stack(p)]
         return ca.Function("imbalance", values, [left, ca.jacobian(left, unknown)])
 
 
-def _dithered(
+def _add_dither(
     model: System | ClosedLoop, parameters: ParameterSet, actuated: str | None, waveform: Waveform | None
-) -> _Dithered:
-    for name in (AMPLITUDE, FREQUENCY):
+) -> _DitheredSystem:
+    for name in (DITHER_AMPLITUDE, DITHER_FREQUENCY):
         positive = name in parameters and parameters.value(name) > 0
         require(positive, f"averaging needs a dither: parameters with {name} > 0")
-    frequency = parameters.value(FREQUENCY)
+    frequency = parameters.value(DITHER_FREQUENCY)
     if isinstance(model, ClosedLoop):
         sampled = "the controller is sampled; average the plant, ClosedLoop(averaged(plant, parameters), pid)"
         require(model.dither is not None, "averaging needs a loop with dither: ClosedLoop(plant, pid, Dither())")
         require(model.pid.sample_time is None, sampled)
         own = model.dither.waveform if model.dither else Waveform.SINE
         require(waveform in (None, own), f"the loop's dither is a {own.value}; leave waveform= out")
-        return _Dithered(model.system(), model.parameters, frequency, None, own)
+        return _DitheredSystem(model.system(), model.parameters, frequency, None, own)
     inputs = {q.name: q for q in model.inputs}
     name = actuated or next(iter(inputs), "")
     require(actuated is not None or len(inputs) == 1, f"the plant has the inputs {', '.join(inputs)}; choose actuated=")
-    check_known("input", [name], inputs, "averaged: actuated")
-    added = ParameterSet({n: Parameter(0.0, inputs[name].unit) for n in (AMPLITUDE, OFFSET)})
-    return _Dithered(model, model.parameters | added, frequency, name, waveform or Waveform.SINE)
+    check_names("input", [name], inputs, "averaged: actuated")
+    added = ParameterSet({n: Parameter(0.0, inputs[name].unit) for n in (DITHER_AMPLITUDE, DITHER_OFFSET)})
+    return _DitheredSystem(model, model.parameters | added, frequency, name, waveform or Waveform.SINE)
 
 
-def _point(
+def _operating_point(
     model: System | ClosedLoop,
-    dithered: _Dithered,
+    dithered: _DitheredSystem,
     parameters: ParameterSet,
     at: Mapping[str, float] | None,
     reference: float,
@@ -224,14 +229,14 @@ def _point(
     """The operating point: states and inputs."""
     states, inputs = names(dithered.system.states), names(dithered.system.inputs)
     if at is not None:
-        check_known("state or input", at, [*states, *inputs], "averaged: at")
+        check_names("state or input", at, [*states, *inputs], "averaged: at")
         return np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
     if isinstance(model, ClosedLoop):
         x = model.initial(parameters, reference=reference)
         return x, np.array([reference if n == "reference" else 0.0 for n in inputs])
-    if model.rest_finder is None:
+    if model.rest_hook is None:
         return np.zeros(len(states)), np.zeros(len(inputs))
-    rest = model.rest_finder(parameters, {"speed": reference})
+    rest = model.rest_hook(parameters, {"speed": reference})
     return (
         np.array([rest.states.get(n, 0.0) for n in states]),
         np.array([rest.inputs.get(n, 0.0) for n in inputs]),
@@ -239,22 +244,22 @@ def _point(
 
 
 def _first_harmonic(
-    dithered: _Dithered, parameters: ParameterSet, point: tuple[Array, Array], nodes: int
+    dithered: _DitheredSystem, parameters: ParameterSet, point: tuple[Array, Array], nodes: int
 ) -> NDArray[np.complex128]:
     """Newton's method; where it fails, the amplitude is raised step by step."""
     require(nodes >= 8, f"nodes must be at least 8, got {nodes}")
-    imbalance, full = dithered.imbalance(nodes), parameters.value(AMPLITUDE)
+    imbalance, full = dithered.imbalance(nodes), parameters.value(DITHER_AMPLITUDE)
     scale = np.tile([q.nominal for q in dithered.system.states], 2)
 
-    def harmonic(fraction: float, start: Array) -> Array | None:
-        p = vector(dithered.parameters, parameters.with_values({AMPLITUDE: fraction * full}))
-        return _root(lambda z: imbalance(z * scale, *point, p), scale, start)
+    def solve_harmonic(fraction: float, start: Array) -> Array | None:
+        p = parameter_vector(dithered.parameters, parameters.with_values({DITHER_AMPLITUDE: fraction * full}))
+        return _newton_root(lambda z: imbalance(z * scale, *point, p), scale, start)
 
-    found = harmonic(1.0, np.zeros_like(scale))
+    found = solve_harmonic(1.0, np.zeros_like(scale))
     if found is None:
-        found, before = np.zeros_like(scale), RISE[0]
-        for fraction in RISE:
-            found, before = harmonic(fraction, found * fraction / before), fraction
+        found, before = np.zeros_like(scale), AMPLITUDE_FRACTIONS[0]
+        for fraction in AMPLITUDE_FRACTIONS:
+            found, before = solve_harmonic(fraction, found * fraction / before), fraction
             where = f"for a dither of {fraction * full:g} at {dithered.frequency:g} Hz"
             if found is None:
                 raise ConvergenceError(f"no ripple found {where}; give another operating point, or more nodes")
@@ -262,26 +267,26 @@ def _first_harmonic(
     return np.asarray(a + 1j * b)
 
 
-def _root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: Array) -> Array | None:
+def _newton_root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: Array) -> Array | None:
     """A zero by Newton's method with halved steps; None where it does not come."""
 
-    def at(z: Array) -> tuple[Array, Array]:
+    def residual_and_slope(z: Array) -> tuple[Array, Array]:
         left, slope = function(z)
         return left.full().ravel() / scale, slope.full() * scale / scale[:, None]
 
-    left, slope = at(z)
-    for _ in range(ITERATIONS):
+    left, slope = residual_and_slope(z)
+    for _ in range(MAX_NEWTON_ITERATIONS):
         step, size, part = np.linalg.solve(slope, -left), np.abs(left).max(), 1.0
-        while not np.abs(at(z + part * step)[0]).max() < size and part > SHORTEST:
+        while not np.abs(residual_and_slope(z + part * step)[0]).max() < size and part > MIN_NEWTON_STEP:
             part /= 2
         z = z + part * step
-        if part * np.abs(step).max() <= TOLERANCE * np.abs(z).max():
+        if part * np.abs(step).max() <= NEWTON_TOLERANCE * np.abs(z).max():
             return z
-        left, slope = at(z)
+        left, slope = residual_and_slope(z)
     return None
 
 
-def _phases(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
+def _phase_quadrature(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
     """Phases of a period, and their weights: for a sine evenly, on no turning point; for a triangle on either slope."""
     if waveform is Waveform.SINE:
         return (2 * np.arange(1, nodes + 1) - 1) * pi / nodes, np.full(nodes, 1 / nodes)
@@ -289,9 +294,9 @@ def _phases(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
     return np.concatenate([at * pi / 2, at * pi / 2 + pi]), np.tile(weights / 4, 2)
 
 
-def _weighted(values: Sequence[ca.SX], weights: Array) -> ca.SX:
+def _sum_with_weights(values: Sequence[ca.SX], weights: Array) -> ca.SX:
     return sum((w * v for w, v in zip(weights.tolist(), values, strict=True)), start=ca.SX(0))
 
 
-def _named(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
+def _by_name(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
     return {q.name: column[k] for k, q in enumerate(quantities)}

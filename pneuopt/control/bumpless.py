@@ -3,17 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
-Array = NDArray[np.float64]
 
-
-def take_over(loop: ClosedLoop, x: ArrayLike, old: ParameterSet, new: ParameterSet, *, reference: float = 0.0) -> Array:
+def bumpless_transfer(
+    loop: ClosedLoop, x: ArrayLike, old: ParameterSet, new: ParameterSet, *, reference: float = 0.0
+) -> Array:
     """The state from which a running loop goes on with new gains as if nothing had happened (bumpless transfer).
 
     The next command that the new gains give, before the clip, is the one that the old gains would have given. What
@@ -57,17 +58,17 @@ def take_over(loop: ClosedLoop, x: ArrayLike, old: ParameterSet, new: ParameterS
     order, state = names(loop.states), np.array(x, dtype=float)
     require(state.shape == (len(order),), f"x has shape {state.shape}, the loop has {len(order)} states")
     remembered = order.index("pid.filter" if loop.pid.sample_time is None else "pid.previous_error")
-    c, c_new = (loop.numbers(p)[list(loop.parameters).index("pid.c")] for p in (old, new))
-    before = _command(loop, state, old, reference)
+    c, c_new = (loop.parameter_vector(p)[list(loop.parameters).index("pid.c")] for p in (old, new))
+    before = _next_command(loop, state, old, reference)
     state[remembered] += (c_new - c) * reference
-    state[order.index("pid.integral")] += before - _command(loop, state, new, reference)
+    state[order.index("pid.integral")] += before - _next_command(loop, state, new, reference)
     return state
 
 
-def _command(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:
+def _next_command(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:
     """The next one that is computed, before the clip; at t = 0, where a dither's wave is zero."""
     free = replace(loop, pid=replace(loop.pid, limits=False))
-    u, p = np.zeros(len(loop.inputs)), free.numbers(parameters)
+    u, p = np.zeros(len(loop.inputs)), free.parameter_vector(parameters)
     u[0] = reference
     if loop.pid.sample_time is None:
         return float(free.system().ode(0.0, x, u, p)[1][-1])

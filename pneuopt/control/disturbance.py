@@ -1,4 +1,4 @@
-"""`disturbed`: a loop with inputs that disturb parameters and inputs of its plant."""
+"""`add_disturbances`: a loop with inputs that disturb parameters and inputs of its plant."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -6,13 +6,13 @@ from dataclasses import replace
 import casadi as ca
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbing
+from pneuopt.control.reference import Step, disturbance_input
 from pneuopt.dynamics.system import System, names
-from pneuopt.quantities.errors import check_known
+from pneuopt.quantities.errors import check_names
 from pneuopt.quantities.parameters import Quantity
 
 
-def disturbed(loop: ClosedLoop, references: Iterable[Step]) -> ClosedLoop:
+def add_disturbances(loop: ClosedLoop, references: Iterable[Step]) -> ClosedLoop:
     """The loop whose plant takes what the references disturb it with, as inputs named by `disturbing`.
 
     A parameter becomes its value plus that input, an input of the plant likewise; so 0 is the plant as it was.
@@ -23,16 +23,16 @@ def disturbed(loop: ClosedLoop, references: Iterable[Step]) -> ClosedLoop:
         If a disturbance is neither a parameter nor an input of the plant.
     """
     wanted = dict.fromkeys(n for reference in references for n in reference.disturbance)
-    new = [n for n in wanted if disturbing(n) not in names(loop.plant.inputs)]
+    new = [n for n in wanted if disturbance_input(n) not in names(loop.plant.inputs)]
     known = [*names(loop.plant.inputs), *loop.plant.parameters]
-    check_known("parameter or input of the plant", new, known, "Step: disturbance")
+    check_names("parameter or input of the plant", new, known, "Step: disturbance")
     if not new:
         return loop
-    plant = _disturbed(loop.plant, new)
+    plant = _add_plant_disturbances(loop.plant, new)
     return replace(loop, plant=plant, actuated=loop.command.name, measured=loop.feedback.name)
 
 
-def _disturbed(plant: System, wanted: list[str]) -> System:
+def _add_plant_disturbances(plant: System, wanted: list[str]) -> System:
     u, p = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in ((2, "u"), (3, "p")))
     t, x, d = ca.SX.sym("t"), ca.SX.sym("x", plant.ode.size1_in(1)), ca.SX.sym("d", len(wanted))
     inputs, parameters = list(names(plant.inputs)), list(plant.parameters)
@@ -43,12 +43,12 @@ def _disturbed(plant: System, wanted: list[str]) -> System:
         else:
             ps[parameters.index(n)] += d[k]
 
-    def wrapped(function: ca.Function) -> ca.Function:
+    def wrap(function: ca.Function) -> ca.Function:
         arguments, given = [t, x, ca.vertcat(u, d), p], ["t", "x", "u", "p"]
         found = list(function(t, x, us, ps))
         return ca.Function(function.name(), arguments, found, given, list(function.name_out()))
 
     units = {q.name: q.unit for q in plant.inputs} | {n: q.unit for n, q in plant.parameters.items()}
-    more = tuple(Quantity(disturbing(n), units[n]) for n in wanted)
-    meter = None if plant.meter is None else wrapped(plant.meter)
-    return replace(plant, inputs=(*plant.inputs, *more), ode=wrapped(plant.ode), meter=meter)
+    more = tuple(Quantity(disturbance_input(n), units[n]) for n in wanted)
+    meter = None if plant.meter is None else wrap(plant.meter)
+    return replace(plant, inputs=(*plant.inputs, *more), ode=wrap(plant.ode), meter=meter)

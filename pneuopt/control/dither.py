@@ -1,6 +1,5 @@
 """Dither: a fast small oscillation added to the command, so that spool and piston do not stick."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
@@ -10,12 +9,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
-Symbols = Mapping[str, ca.SX]
-JOINED = 20  # periods, at most, that make a whole number of samples
-BEAT = 1e-3  # of the amplitude: what averaging may leave of it
+MAX_AVERAGED_PERIODS = 20  # periods, at most, that make a whole number of samples
+MAX_BEAT_AMPLITUDE = 1e-3  # of the amplitude: what averaging may leave of it
 
 
 class Waveform(Enum):
@@ -115,8 +114,10 @@ class Dither:
         if sample_time is None:
             return 1 / frequency
         step = frequency * sample_time
-        for joined in range(1, JOINED + 1):
+        for joined in range(1, MAX_AVERAGED_PERIODS + 1):
             beyond = (joined / step) % 1.0
-            if 20 * step**3 * beyond * (1 - beyond) <= BEAT * joined:  # (w h)^2/8 of the part of a sample at the end
+            if (
+                20 * step**3 * beyond * (1 - beyond) <= MAX_BEAT_AMPLITUDE * joined
+            ):  # (w h)^2/8 of the part of a sample at the end
                 return joined / frequency
-        return Fraction(1 / step).limit_denominator(JOINED).denominator / frequency
+        return Fraction(1 / step).limit_denominator(MAX_AVERAGED_PERIODS).denominator / frequency

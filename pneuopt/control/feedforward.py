@@ -1,17 +1,16 @@
 """Transient feedforward: what a change of the reference adds to the command at once, and then takes back."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 
 import casadi as ca
 
-from pneuopt.control.pid import ratio
+from pneuopt.control.pid import unit_ratio
+from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Symbols = Mapping[str, ca.SX]
-SHORTEST = 1e-6  # [s]
+MIN_FEEDFORWARD_TIME = 1e-6  # [s]
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,10 @@ class Feedforward:
     time: float = 0.05
 
     def __post_init__(self) -> None:
-        require(SHORTEST <= self.time < inf, f"Feedforward: time must be at least {SHORTEST:g} s, got {self.time:g} s")
+        require(
+            MIN_FEEDFORWARD_TIME <= self.time < inf,
+            f"Feedforward: time must be at least {MIN_FEEDFORWARD_TIME:g} s, got {self.time:g} s",
+        )
 
     def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
         """The gain [output_unit/input_unit], zero by default, and the time [s].
@@ -43,8 +45,8 @@ class Feedforward:
         >>> [(n, p.unit) for n, p in Feedforward().parameters("m/s", "V").items()]
         [('gain', 'V*s/m'), ('time', 's')]
         """
-        gain = Parameter(0.0, ratio(output_unit, input_unit))
-        return ParameterSet({"gain": gain, "time": Parameter(self.time, "s", lower=SHORTEST)})
+        gain = Parameter(0.0, unit_ratio(output_unit, input_unit))
+        return ParameterSet({"gain": gain, "time": Parameter(self.time, "s", lower=MIN_FEEDFORWARD_TIME)})
 
     def states(self, measured: Quantity) -> tuple[Quantity, ...]:
         """The filtered reference r_f, as "filter"."""

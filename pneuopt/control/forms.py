@@ -14,7 +14,7 @@ import casadi as ca
 
 from pneuopt.quantities.errors import require
 
-UNUSED = 0.01  # [s], the filter of a standard form's derivative that is switched off, Td = 0
+UNUSED_FILTER_TIME = 0.01  # [s], the filter of a standard form's derivative that is switched off, Td = 0
 
 
 class Form(Enum):
@@ -27,10 +27,10 @@ class Form(Enum):
     @property
     def gains(self) -> tuple[str, ...]:
         """The names of its parameters, which are the fields of the form."""
-        return _GAINS[self]
+        return _GAIN_NAMES[self]
 
 
-_GAINS = {
+_GAIN_NAMES = {
     Form.PARALLEL: ("Kp", "Ki", "Kd", "Tf"),
     Form.STANDARD: ("Kp", "Ti", "Td", "N"),
     Form.SERIES: ("K", "Ti", "Td", "Tf"),
@@ -164,24 +164,24 @@ def to_parallel(gains: StandardForm | SeriesForm) -> ParallelForm:
     >>> to_parallel(SeriesForm(K=2.0, Ti=0.5, Td=0.25))
     ParallelForm(Kp=3.0, Ki=4.0, Kd=0.5, Tf=0.0)
     """
-    require(gains.Ti != 0, NO_TI)
+    require(gains.Ti != 0, ZERO_TI_MESSAGE)
     if isinstance(gains, SeriesForm):
-        return ParallelForm(*_of_series(gains.K, gains.Ti, gains.Td, gains.Tf))
-    require(gains.N != 0 or gains.Td == 0, NO_N)
-    return ParallelForm(*_of_standard(gains.Kp, gains.Ti, gains.Td, gains.N or inf))
+        return ParallelForm(*_series_to_parallel(gains.K, gains.Ti, gains.Td, gains.Tf))
+    require(gains.N != 0 or gains.Td == 0, ZERO_N_MESSAGE)
+    return ParallelForm(*_standard_to_parallel(gains.Kp, gains.Ti, gains.Td, gains.N or inf))
 
 
-NO_TI = "Ti = 0 would be an infinite integral gain; no integral action is Ti = inf"
-NO_N = "N = 0 would switch the derivative off; the ISA ratio N is 5 to 20, inf unfiltered"
+ZERO_TI_MESSAGE = "Ti = 0 would be an infinite integral gain; no integral action is Ti = inf"
+ZERO_N_MESSAGE = "N = 0 would switch the derivative off; the ISA ratio N is 5 to 20, inf unfiltered"
 
 
 def parallel_gains(form: Form, p: Mapping[str, ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
     """Kp, Ki, Kd, Tf of the parallel form, which is what runs; p by the names of the form's own gains."""
     own = [p[n] for n in form.gains]
     if form is Form.STANDARD:
-        Kp, Ki, Kd, Tf = _of_standard(*own)
-        return Kp, Ki, Kd, ca.if_else(p["Td"] > 0, Tf, UNUSED)
-    Kp, Ki, Kd, Tf = own if form is Form.PARALLEL else _of_series(*own)
+        Kp, Ki, Kd, Tf = _standard_to_parallel(*own)
+        return Kp, Ki, Kd, ca.if_else(p["Td"] > 0, Tf, UNUSED_FILTER_TIME)
+    Kp, Ki, Kd, Tf = own if form is Form.PARALLEL else _series_to_parallel(*own)
     return Kp, Ki, Kd, Tf
 
 
@@ -235,11 +235,11 @@ def proportional_gain(band: float, measured_span: float, command_span: float) ->
     return 100.0 * command_span / (band * measured_span)
 
 
-def _of_standard(Kp: Any, Ti: Any, Td: Any, N: Any) -> tuple[Any, Any, Any, Any]:
+def _standard_to_parallel(Kp: Any, Ti: Any, Td: Any, N: Any) -> tuple[Any, Any, Any, Any]:
     return Kp, Kp / Ti, Kp * Td, Td / N
 
 
-def _of_series(K: Any, Ti: Any, Td: Any, Tf: Any) -> tuple[Any, Any, Any, Any]:
+def _series_to_parallel(K: Any, Ti: Any, Td: Any, Tf: Any) -> tuple[Any, Any, Any, Any]:
     return K * (1 + Td / Ti), K / Ti, K * Td * (1 - Tf / Ti), Tf
 
 

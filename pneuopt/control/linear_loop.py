@@ -9,13 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.rest import find_rest
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     from pneuopt.control.loop import ClosedLoop
-
-Array = NDArray[np.float64]
 
 
 def linear_plant(
@@ -29,7 +28,7 @@ def linear_plant(
     plant = loop.plant.linearise(x, u or {}, parameters)
     j, i = plant.inputs.index(loop.command.name), plant.outputs.index(loop.feedback.name)
     A, B, C, D = plant.A, plant.B[:, j : j + 1], plant.C[i : i + 1], plant.D[i : i + 1, j : j + 1]
-    states, lag = plant.states, loop.sensor_lag(loop.numbers(parameters))
+    states, lag = plant.states, loop.sensor_lag(loop.parameter_vector(parameters))
     if lag:
         n = len(A)
         A = np.block([[A, np.zeros((n, 1))], [C / lag, np.array([[-1 / lag]])]])
@@ -42,7 +41,7 @@ def open_loop(
     loop: "ClosedLoop", parameters: ParameterSet, x: Array | None, u: Mapping[str, float] | None
 ) -> Linearisation:
     """As `ClosedLoop.open_loop`."""
-    plant, controller = linear_plant(loop, parameters, x, u), _controller(loop, parameters)
+    plant, controller = linear_plant(loop, parameters, x, u), _linear_controller(loop, parameters)
     m, n = len(controller.A), len(plant.A)
     return Linearisation(
         np.block([[plant.A, plant.B @ controller.C], [np.zeros((m, n)), controller.A]]),
@@ -75,7 +74,7 @@ def linear_gains(loop: "ClosedLoop", p: Any) -> Any:
     return ca.vertcat(gains[0, :] + half * gains[1, :], gains[1:3, :], gains[3, :] + half)
 
 
-def delayed(omega: ArrayLike, dead_time: float) -> NDArray[np.complex128]:
+def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.complex128]:
     """``e^(-jw dead_time)`` as Padé's approximant of second order has it, shape (n,); omega [rad/s].
 
     Examples
@@ -87,12 +86,12 @@ def delayed(omega: ArrayLike, dead_time: float) -> NDArray[np.complex128]:
     return np.asarray((1 - s / 2 + s**2 / 12) / (1 + s / 2 + s**2 / 12))
 
 
-def _controller(loop: "ClosedLoop", parameters: ParameterSet) -> Linearisation:
-    Kp, Ki, Kd, Tf = linear_gains(loop, loop.numbers(parameters)).full().ravel().tolist()
+def _linear_controller(loop: "ClosedLoop", parameters: ParameterSet) -> Linearisation:
+    Kp, Ki, Kd, Tf = linear_gains(loop, loop.parameter_vector(parameters)).full().ravel().tolist()
     require(Tf > 0, "a continuous derivative needs a filter, Tf > 0")
     A, B = np.diag([0.0, -1 / Tf]), np.array([[Ki], [1 / Tf]])
     C, D, dead_time = np.array([[1.0, -Kd / Tf]]), np.array([[Kp + Kd / Tf]]), loop.dead_time
-    if dead_time:  # `delayed` is 1 - (12 s/T)/(s^2 + 6 s/T + 12/T^2), here with states of one size
+    if dead_time:  # `pade_delay_response` is 1 - (12 s/T)/(s^2 + 6 s/T + 12/T^2), here with states of one size
         root = np.sqrt(12) / dead_time
         lags, fed = np.array([[0.0, root], [-root, -6 / dead_time]]), np.array([[0.0], [1.0]])
         taken = np.array([[0.0, -12 / dead_time]])

@@ -13,16 +13,15 @@ from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
 from pneuopt.control.linear_loop import linear_plant, open_loop
 from pneuopt.control.pid import PID
-from pneuopt.control.rest import find_rest, sliding
-from pneuopt.control.sensor import Encoder, Feedback, SensorLag
-from pneuopt.control.wiring import check_lag, check_reach, chosen, wired
+from pneuopt.control.rest import find_rest, set_sliding_direction
+from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
+from pneuopt.control.wiring import Signals, check_algebraic_loop, check_initial_command, evaluate_plant, select_signal
 from pneuopt.dynamics.system import (
     DiscreteSystem,
     Linearisation,
@@ -31,14 +30,13 @@ from pneuopt.dynamics.system import (
     define,
     discretise,
     names,
-    stacked,
+    stack,
     symbols,
 )
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 
-Array = NDArray[np.float64]
-Signals = dict[str, ca.SX]
 T = TypeVar("T")
 
 
@@ -79,9 +77,9 @@ class ClosedLoop:
 
     def __post_init__(self) -> None:
         if self.sensor is not None:
-            self.sensor.check(self._fed_back)
+            self.sensor.check(self._sensor_feedback)
         if not isinstance(self.sensor, SensorLag):
-            check_lag(
+            check_algebraic_loop(
                 self.plant, self.command.name, self.feedback.name if self.sensor is None else self.sensor.position
             )
         reserved = {"reference": names(self.plant.inputs), "control": names(self.plant.outputs)}
@@ -98,12 +96,12 @@ class ClosedLoop:
     @cached_property
     def command(self) -> Quantity:
         """The plant's input that the controller drives."""
-        return chosen("input", self.actuated, self.plant.inputs, None)
+        return select_signal("input", self.actuated, self.plant.inputs, None)
 
     @cached_property
     def feedback(self) -> Quantity:
         """The plant's output that is fed back."""
-        return chosen("output", self.measured, self.plant.outputs, "speed")
+        return select_signal("output", self.measured, self.plant.outputs, "speed")
 
     @cached_property
     def parameters(self) -> ParameterSet:
@@ -112,16 +110,16 @@ class ClosedLoop:
         parts = {
             "pid": self.pid.parameters(measured, unit),
             "dither": self.dither.parameters(unit, h) if self.dither else ParameterSet(),
-            "sensor": self.sensor.parameters(self._fed_back) if self.sensor else ParameterSet(),
+            "sensor": self.sensor.parameters(self._sensor_feedback) if self.sensor else ParameterSet(),
             "feedforward": self.feedforward.parameters(measured, unit) if self.feedforward else ParameterSet(),
         }
-        return reduce(or_, (own.prefixed(name) for name, own in parts.items()), self.plant.parameters)
+        return reduce(or_, (own.with_prefix(name) for name, own in parts.items()), self.plant.parameters)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
         """The plant's, the sensor's ("sensor.reading"), then the controller's ("pid.*", "feedforward.filter")."""
         parts = {
-            "sensor": self.sensor.states(self._fed_back) if self.sensor else (),
+            "sensor": self.sensor.states(self._sensor_feedback) if self.sensor else (),
             "pid": self.pid.states(self.feedback, self.command),
             "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
         }
@@ -145,21 +143,21 @@ class ClosedLoop:
         Raises
         ------
         ModelError
-            If the PID is sampled: use `discrete`, or `held` and `update`.
+            If the PID is sampled: use `discrete`, or `hold_system` and `update`.
         """
         h = self.pid.sample_time
         require(
             h is None, f"a loop sampled every {h} s is no ODE; use discrete(), or held() between samples", ModelError
         )
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._continuous)
+        return define(self.states, self.inputs, self.outputs, self.parameters, self._continuous_rhs)
 
-    def held(self) -> System:
+    def hold_system(self) -> System:
         """Between two samples of a sampled PID: the plant runs on the held command, the controller's states rest.
 
         An analogue dither is in here, as a function of time; a sampled one is part of the held command.
         """
         require(self.pid.sample_time is not None, "a continuous loop holds nothing; use system()", ModelError)
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._between)
+        return define(self.states, self.inputs, self.outputs, self.parameters, self._hold_rhs)
 
     @cached_property
     def update(self) -> ca.Function:
@@ -167,13 +165,21 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        (lead, added), seen, y = self._led(x, u, p), Signals(), self._plant(t, x, u, p, ca.SX(0))[1]
+        (lead, added), seen, y = self._feedforward_terms(x, u, p), Signals(), self._plant_rates(t, x, u, p, ca.SX(0))[1]
         if self.sensor:
-            seen = self.sensor.update(_part("sensor", x), y, self._fed_back, _part("sensor", p))
+            seen = self.sensor.update(
+                _without_prefix("sensor", x), y, self._sensor_feedback, _without_prefix("sensor", p)
+            )
         measured = seen.get("reading", y[self.feedback.name])
-        own = self.pid.update(_part("pid", x), u["reference"], measured, self._dither(t, p) + added, _part("pid", p))
-        after = stacked({**x, **_named("sensor", seen), **_named("pid", own), **lead})
-        return ca.Function("update", [t, *map(stacked, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
+        own = self.pid.update(
+            _without_prefix("pid", x),
+            u["reference"],
+            measured,
+            self._dither_command(t, p) + added,
+            _without_prefix("pid", p),
+        )
+        after = stack({**x, **_with_prefix("sensor", seen), **_with_prefix("pid", own), **lead})
+        return ca.Function("update", [t, *map(stack, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
 
     def discrete(self, substeps: int = 1) -> DiscreteSystem:
         """The loop as a sampled step of RK4; its inputs are held from sample to sample.
@@ -185,12 +191,12 @@ class ClosedLoop:
         """
         if self.pid.sample_time is None:
             return discretise(self.system(), substeps)
-        return replace(discretise(self.held(), substeps), update=self.update, sample_time=self.pid.sample_time)
+        return replace(discretise(self.hold_system(), substeps), update=self.update, sample_time=self.pid.sample_time)
 
     def check(self, parameters: ParameterSet) -> None:
         """Refuse values that no loop can run with, whatever their bounds: `InputError` names the parameter."""
         self.plant.check(parameters)
-        value = dict(zip(self.parameters, self.numbers(parameters), strict=True))
+        value = dict(zip(self.parameters, self.parameter_vector(parameters), strict=True))
         h = self.pid.sample_time
         if self.dither:
             self.dither.check(value["dither.frequency"], h)
@@ -198,9 +204,9 @@ class ClosedLoop:
             time = value["feedforward.time"]
             require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
         Tf = float(self.gains(list(value.values()))[3])
-        self.pid.check({**_part("pid", value), "Tf": Tf}, self.command.unit)
+        self.pid.check({**_without_prefix("pid", value), "Tf": Tf}, self.command.unit)
 
-    def numbers(self, parameters: ParameterSet) -> Array:
+    def parameter_vector(self, parameters: ParameterSet) -> Array:
         """The vector p of `parameters` in the loop's order; a missing one keeps the loop's default."""
         return np.array([parameters.value(n) if n in parameters else q.value for n, q in self.parameters.items()])
 
@@ -208,16 +214,16 @@ class ClosedLoop:
     def gains(self) -> ca.Function:
         """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form, which is what runs, from the parameters of any `Form`."""
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        return ca.Function("gains", [stacked(p)], [ca.vertcat(*parallel_gains(self.pid.form, _part("pid", p)))])
+        return ca.Function("gains", [stack(p)], [ca.vertcat(*parallel_gains(self.pid.form, _without_prefix("pid", p)))])
 
-    def parallel(self, parameters: ParameterSet) -> ParallelForm:
+    def parallel_form(self, parameters: ParameterSet) -> ParallelForm:
         """The gains in the parallel form, from the parameters of any `Form`."""
-        return ParallelForm(*self.gains(self.numbers(parameters)).full().ravel().tolist())
+        return ParallelForm(*self.gains(self.parameter_vector(parameters)).full().ravel().tolist())
 
     def sensor_lag(self, p: Array) -> Any:
         """The sensor's time constant in the loop linearised [s]; p of shape (n_parameters,) or (n_parameters, m)."""
-        value = _part("sensor", dict(zip(self.parameters, p, strict=True)))
-        return self.sensor.time_constant(self._fed_back, value) if self.sensor else 0.0
+        value = _without_prefix("sensor", dict(zip(self.parameters, p, strict=True)))
+        return self.sensor.time_constant(self._sensor_feedback, value) if self.sensor else 0.0
 
     @property
     def dead_time(self) -> float:
@@ -226,7 +232,7 @@ class ClosedLoop:
 
     def dither_period(self, parameters: ParameterSet) -> float | None:
         """The time over which averages and ripple are taken [s] (`Dither.period`); None without dither."""
-        value = dict(zip(self.parameters, self.numbers(parameters), strict=True))
+        value = dict(zip(self.parameters, self.parameter_vector(parameters), strict=True))
         if self.dither is None or value["dither.amplitude"] == 0:
             return None
         return self.dither.period(value["dither.frequency"], self.pid.sample_time)
@@ -269,19 +275,19 @@ class ClosedLoop:
             or `start` names what this plant does not start from.
         """
         self.check(parameters)
-        parameters = sliding(self, parameters, reference)
-        p = self.numbers(parameters)
+        parameters = set_sliding_direction(self, parameters, reference)
+        p = self.parameter_vector(parameters)
         value = dict(zip(self.parameters, p, strict=True))
         if x_plant is None:
             x, command = find_rest(self, parameters, reference, start or {})
         else:
             x, shape = np.asarray(x_plant, dtype=float), (len(self.plant.states),)
             require(x.shape == shape, f"x_plant has shape {x.shape}, the plant's state has {shape}")
-        check_reach(command, value, self.command.unit)
-        y = dict(zip(names(self.plant.outputs), self._shown(0, x, p).full().ravel().tolist(), strict=True))
-        sensor = self.sensor.start(y, self._fed_back, _part("sensor", value)) if self.sensor else []
+        check_initial_command(command, value, self.command.unit)
+        y = dict(zip(names(self.plant.outputs), self._plant_outputs(0, x, p).full().ravel().tolist(), strict=True))
+        sensor = self.sensor.start(y, self._sensor_feedback, _without_prefix("sensor", value)) if self.sensor else []
         seen = sensor[0] if sensor else y[self.feedback.name]
-        own = self.pid.start(reference, seen, command, {**_part("pid", value), "Kp": float(self.gains(p)[0])})
+        own = self.pid.start(reference, seen, command, {**_without_prefix("pid", value), "Kp": float(self.gains(p)[0])})
         return np.concatenate([x, sensor, own, [reference] if self.feedforward else []])
 
     def linear_plant(
@@ -315,63 +321,75 @@ class ClosedLoop:
         """
         return open_loop(self, parameters, x, u)
 
-    def _continuous(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        lead, added = self._led(x, u, p)
-        seen = x["sensor.reading"] if self.sensor else self._plant(t, x, u, p, ca.SX(0))[1][self.feedback.name]
+    def _continuous_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+        lead, added = self._feedforward_terms(x, u, p)
+        seen = x["sensor.reading"] if self.sensor else self._plant_rates(t, x, u, p, ca.SX(0))[1][self.feedback.name]
         rates, command = self.pid.rates(
-            _part("pid", x), u["reference"], seen, self._dither(t, p) + added, _part("pid", p)
+            _without_prefix("pid", x),
+            u["reference"],
+            seen,
+            self._dither_command(t, p) + added,
+            _without_prefix("pid", p),
         )
-        xdot, y = self._plant(t, x, u, p, command)
-        own = _named("pid", rates) | lead | self._sensing(x, y, p)
+        xdot, y = self._plant_rates(t, x, u, p, command)
+        own = _with_prefix("pid", rates) | lead | self._sensor_rates(x, y, p)
         return xdot | own, y | {"control": command}
 
-    def _between(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
+    def _hold_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         command = x["pid.command"]
         if self.dither and self.dither.analogue:
-            command = self.pid.clip(command + self.dither.wave(t, _part("dither", p)), _part("pid", p))
-        xdot, y = self._plant(t, x, u, p, command)
-        own = {n: ca.SX(0) for n in x if n.startswith(("pid.", "feedforward."))} | self._sensing(x, y, p)
+            command = self.pid.clip(
+                command + self.dither.wave(t, _without_prefix("dither", p)), _without_prefix("pid", p)
+            )
+        xdot, y = self._plant_rates(t, x, u, p, command)
+        own = {n: ca.SX(0) for n in x if n.startswith(("pid.", "feedforward."))} | self._sensor_rates(x, y, p)
         return xdot | own, y | {"control": command}
 
-    def _dither(self, t: ca.SX, p: Symbols) -> ca.SX:
+    def _dither_command(self, t: ca.SX, p: Symbols) -> ca.SX:
         """What the controller itself adds."""
         if self.dither is None:
             return ca.SX(0)
-        own = _part("dither", p)
+        own = _without_prefix("dither", p)
         sampled_apart = self.dither.analogue and self.pid.sample_time is not None
         return own["offset"] if sampled_apart else own["offset"] + self.dither.wave(t, own)
 
-    def _led(self, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
+    def _feedforward_terms(self, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The feedforward's state, its rate or with a sampled PID its next value, and what it adds to the command."""
         if self.feedforward is None:
             return {}, ca.SX(0)
-        own, h = (_part("feedforward", x), u["reference"], _part("feedforward", p)), self.pid.sample_time
+        own, h = (
+            (_without_prefix("feedforward", x), u["reference"], _without_prefix("feedforward", p)),
+            self.pid.sample_time,
+        )
         moved, added = self.feedforward.rates(*own) if h is None else self.feedforward.update(*own, h)
-        return _named("feedforward", moved), added
+        return _with_prefix("feedforward", moved), added
 
-    def _sensing(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
+    def _sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
         if self.sensor is None:
             return {}
-        return _named("sensor", self.sensor.rates(_part("sensor", x), y, self._fed_back, _part("sensor", p)))
+        return _with_prefix(
+            "sensor",
+            self.sensor.rates(_without_prefix("sensor", x), y, self._sensor_feedback, _without_prefix("sensor", p)),
+        )
 
-    def _plant(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
-        return wired(self.plant, self.command.name, t, x, u, p, command)
+    def _plant_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
+        return evaluate_plant(self.plant, self.command.name, t, x, u, p, command)
 
     @cached_property
-    def _fed_back(self) -> Feedback:
-        return Feedback(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time)
+    def _sensor_feedback(self) -> SensedSignal:
+        return SensedSignal(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time)
 
     @cached_property
-    def _shown(self) -> ca.Function:
+    def _plant_outputs(self) -> ca.Function:
         """The plant's outputs without a command."""
         t, x, u = ca.SX.sym("t"), symbols(self.plant.states), {q.name: ca.SX(0) for q in self.plant.inputs}
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        return ca.Function("shown", [t, stacked(x), stacked(p)], [stacked(self._plant(t, x, u, p, ca.SX(0))[1])])
+        return ca.Function("shown", [t, stack(x), stack(p)], [stack(self._plant_rates(t, x, u, p, ca.SX(0))[1])])
 
 
-def _part(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
+def _without_prefix(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
     return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
 
 
-def _named(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
+def _with_prefix(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
     return {f"{prefix}.{n}": v for n, v in values.items()}

@@ -10,11 +10,10 @@ from math import inf
 
 import casadi as ca
 
-from pneuopt.control.forms import NO_N, NO_TI, Form, parallel_gains
+from pneuopt.control.forms import ZERO_N_MESSAGE, ZERO_TI_MESSAGE, Form, parallel_gains
+from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import UnitError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-
-Symbols = Mapping[str, ca.SX]
 
 
 @dataclass(frozen=True)
@@ -95,13 +94,13 @@ class PID:
         >>> list(PID(limits=False, form=Form.STANDARD).parameters("m/s", "V"))
         ['Kp', 'Ti', 'Td', 'N', 'b', 'c']
         """
-        h, gain = self.sample_time or 0.0, ratio(output_unit, input_unit)
+        h, gain = self.sample_time or 0.0, unit_ratio(output_unit, input_unit)
         shortest = h or 1e-6
         known = {
             "Kp": Parameter(1.0, gain),
             "K": Parameter(1.0, gain),
-            "Ki": Parameter(0.0, ratio(output_unit, f"{_difference(input_unit)}*s")),
-            "Kd": Parameter(0.0, ratio(f"{_difference(output_unit)}*s", input_unit)),
+            "Ki": Parameter(0.0, unit_ratio(output_unit, f"{_difference_unit(input_unit)}*s")),
+            "Kd": Parameter(0.0, unit_ratio(f"{_difference_unit(output_unit)}*s", input_unit)),
             "Tf": Parameter(0.01, "s", lower=0.0 if h else shortest),
             "Ti": Parameter(inf, "s", lower=0.0),
             "Td": Parameter(0.0, "s", lower=0.0),
@@ -109,7 +108,7 @@ class PID:
         }
         core = {n: known[n] for n in self.form.gains}
         core |= {n: Parameter(1.0, "1", lower=0.0) for n in ("b", "c")}
-        core |= {"dead_band": Parameter(0.0, _difference(input_unit), lower=0.0)} if self.dead_band else {}
+        core |= {"dead_band": Parameter(0.0, _difference_unit(input_unit), lower=0.0)} if self.dead_band else {}
         saturation = {
             "Tt": Parameter(max(0.1, 10 * h), "s", lower=shortest),
             "lower": Parameter(-inf, output_unit),
@@ -118,7 +117,7 @@ class PID:
         return ParameterSet(core | saturation if self.limits else core)
 
     @property
-    def positive(self) -> tuple[str, ...]:
+    def positive_parameters(self) -> tuple[str, ...]:
         """Parameters that a search must keep above zero: what is divided by."""
         needed = {"Ti", "N"} | (set() if self.sample_time else {"Td"} if self.form is Form.STANDARD else set())
         return tuple(n for n in self.form.gains if n in needed)
@@ -134,8 +133,8 @@ class PID:
             The command's.
         """
         h = self.sample_time
-        require(p.get("Ti", inf) != 0, f"pid.{NO_TI}")
-        require(p.get("N", inf) != 0, f"pid.{NO_N}")
+        require(p.get("Ti", inf) != 0, f"pid.{ZERO_TI_MESSAGE}")
+        require(p.get("N", inf) != 0, f"pid.{ZERO_N_MESSAGE}")
         filtered = "pid.N = inf" if self.form is Form.STANDARD else f"pid.Tf = {p['Tf']:g} s"
         require(p["Tf"] > 0 or h is not None, f"{filtered}: a continuous derivative needs a filter, Tf > 0")
         band = p.get("dead_band", 0.0)
@@ -197,7 +196,7 @@ class PID:
         v = Kp * (p["b"] * r - y) + x["integral"] + Kd / Tf * (error - x["filter"])
         u = self.clip(v + added, p)
         windup = (u - v - added) / p["Tt"] if self.limits else 0.0
-        return {"integral": Ki * self._integrated(r - y, p) + windup, "filter": (error - x["filter"]) / Tf}, u
+        return {"integral": Ki * self._integrand(r - y, p) + windup, "filter": (error - x["filter"]) / Tf}, u
 
     def update(self, x: Symbols, r: ca.SX, y: ca.SX, added: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The sampled law at a sample: the next value of each state, "command" being what is held.
@@ -208,7 +207,7 @@ class PID:
         h, (Kp, Ki, Kd, Tf) = self.sample_time or 0.0, parallel_gains(self.form, p)
         error = p["c"] * r - y
         derivative = (Tf * x["derivative"] + Kd * (error - x["previous_error"])) / (Tf + h)
-        integral = x["integral"] + Ki * h * self._integrated(r - y, p)
+        integral = x["integral"] + Ki * h * self._integrand(r - y, p)
         w = Kp * (p["b"] * r - y) + integral + derivative + added
         u = self.clip(w, p)
         windup = h / p["Tt"] * (u - w) if self.limits else 0.0
@@ -219,13 +218,13 @@ class PID:
         """The saturated command: hard, as in a real controller; exact derivatives on either side of the corner."""
         return ca.fmin(ca.fmax(w, p["lower"]), p["upper"]) if self.limits else w
 
-    def _integrated(self, error: ca.SX, p: Symbols) -> ca.SX:
+    def _integrand(self, error: ca.SX, p: Symbols) -> ca.SX:
         if not self.dead_band:
             return error
         return error - ca.fmin(ca.fmax(error, -p["dead_band"]), p["dead_band"])
 
 
-def ratio(numerator: str, denominator: str) -> str:
+def unit_ratio(numerator: str, denominator: str) -> str:
     """Divide two unit texts and simplify; a level such as "Pa(a)" counts as a difference.
 
     Examples
@@ -233,24 +232,24 @@ def ratio(numerator: str, denominator: str) -> str:
     >>> ratio("V", "m/s"), ratio("V*s", "m/s"), ratio("V", "m/s*s"), ratio("N", "N"), ratio("1", "Pa(g)")
     ('V*s/m', 'V*s^2/m', 'V/m', '1', '1/Pa')
     """
-    powers = _powers(_difference(numerator))
-    for name, power in _powers(_difference(denominator)).items():
+    powers = _unit_powers(_difference_unit(numerator))
+    for name, power in _unit_powers(_difference_unit(denominator)).items():
         powers[name] = powers.get(name, 0) - power
-    above = [_factor(n, k) for n, k in powers.items() if k > 0]
-    below = [_factor(n, -k) for n, k in powers.items() if k < 0]
+    above = [_unit_factor(n, k) for n, k in powers.items() if k > 0]
+    below = [_unit_factor(n, -k) for n, k in powers.items() if k < 0]
     divisor = "*".join(below) if len(below) < 2 else f"({'*'.join(below)})"
     return ("*".join(above) or "1") + (f"/{divisor}" if below else "")
 
 
-def _difference(unit: str) -> str:
+def _difference_unit(unit: str) -> str:
     return re.sub(r"\([ag]\)", "", unit)
 
 
-def _factor(name: str, power: int) -> str:
+def _unit_factor(name: str, power: int) -> str:
     return name if power == 1 else f"{name}^{power}"
 
 
-def _powers(unit: str) -> dict[str, int]:
+def _unit_powers(unit: str) -> dict[str, int]:
     powers: dict[str, int] = {}
     rest = "*" + unit.replace(" ", "")
     while rest:
@@ -258,7 +257,7 @@ def _powers(unit: str) -> dict[str, int]:
         if match is None:
             raise UnitError(f"cannot read the unit {unit!r}; write it like 'V*s/m' or 'm^3/(s*Pa)'")
         sign = 1 if match[1] == "*" else -1
-        factors = _powers(match[2]) if match[2] else {match[3]: int(match[4] or 1)}
+        factors = _unit_powers(match[2]) if match[2] else {match[3]: int(match[4] or 1)}
         for name, power in factors.items():
             if name != "1":
                 powers[name] = powers.get(name, 0) + sign * power

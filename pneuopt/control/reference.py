@@ -15,7 +15,7 @@ class Step:
     """A step of the reference, of a disturbance, or of both at one instant.
 
     What a disturbance alone shows is measured as of a step: Overshoot is the largest deviation, either side, and
-    SettlingTime the time until the signal is back in the band, each for what `whole` is.
+    SettlingTime the time until the signal is back in the band, each for what `nominal_size` is.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Step:
         return self.size != 0
 
     @property
-    def whole(self) -> float:
+    def nominal_size(self) -> float:
         """What fractions are of: the step's size with its sign, or what stands for it [unit of the measured signal]."""
         return self.size or self.scale or abs(self.initial)
 
@@ -125,10 +125,10 @@ class Step:
         )
         k = np.arange(int(np.ceil(self.horizon / step - 1e-9)) + 1)
         columns = {"reference": np.where(k >= first, self.final, self.initial)}
-        columns |= {disturbing(n): np.where(k >= first, v, 0.0) for n, v in self.disturbance.items()}
+        columns |= {disturbance_input(n): np.where(k >= first, v, 0.0) for n, v in self.disturbance.items()}
         return Trajectory(k * step, columns)
 
 
-def disturbing(name: str) -> str:
+def disturbance_input(name: str) -> str:
     """The loop's input by which a parameter or input of the plant is disturbed."""
     return f"disturbance.{name}"

@@ -5,19 +5,17 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.control.wiring import wired
-from pneuopt.dynamics.system import DIRECTION, Symbols, System, define, names, vector
+from pneuopt.control.wiring import Signals, evaluate_plant
+from pneuopt.dynamics.system import FRICTION_DIRECTION, Symbols, System, define, names, parameter_vector
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 
 if TYPE_CHECKING:
     from pneuopt.control.loop import ClosedLoop
 
-Array = NDArray[np.float64]
-Signals = dict[str, ca.SX]
-INTEGRAL = "pid.integral"
+INTEGRAL_STATE = "pid.integral"
 
 
 def find_rest(
@@ -46,13 +44,13 @@ def find_rest(
     """
     plant, measured = loop.plant, loop.feedback.name
     require(measured not in start, f"start: {measured!r} is what the loop controls; give it as initial=")
-    if plant.rest_finder is not None:
-        rest = plant.rest_finder(parameters, {measured: reference, **start})
+    if plant.rest_hook is not None:
+        rest = plant.rest_hook(parameters, {measured: reference, **start})
         return np.array([rest.states.get(n, 0.0) for n in names(plant.states)]), rest.inputs.get(loop.command.name, 0.0)
-    free = drifting(plant, measured)
+    free = unobservable_states(plant, measured)
     others = ", ".join(sorted(start.keys() - free))
     require(not others, f"start: this plant cannot start from {others}, only from {', '.join(free) or 'its rest'}")
-    system = _resting(loop, free, parameters)
+    system = _rest_system(loop, free, parameters)
     guess = {measured: reference} if measured in names(system.states) else {}
     try:
         x = system.equilibrium({"reference": reference}, parameters, guess)
@@ -61,18 +59,18 @@ def find_rest(
         raise ConvergenceError(f"{message}, or give x_plant", error.solution) from None
     found = {**start, **dict(zip(names(system.states), x.tolist(), strict=True))}
     u = [reference] + [0.0] * (len(system.inputs) - 1)
-    command = float(system.ode(0, x, u, vector(system.parameters, parameters))[1][-1])
+    command = float(system.ode(0, x, u, parameter_vector(system.parameters, parameters))[1][-1])
     return np.array([found.get(n, 0.0) for n in names(plant.states)]), command
 
 
-def sliding(loop: "ClosedLoop", parameters: ParameterSet, reference: float) -> ParameterSet:
+def set_sliding_direction(loop: "ClosedLoop", parameters: ParameterSet, reference: float) -> ParameterSet:
     """The parameters with which a loop begins: Karnopp's friction already slides where the plant moves."""
-    if loop.feedback.name != "speed" or DIRECTION not in loop.parameters:
+    if loop.feedback.name != "speed" or FRICTION_DIRECTION not in loop.parameters:
         return parameters
-    return (loop.parameters | parameters).with_values({DIRECTION: float(np.sign(reference))})
+    return (loop.parameters | parameters).with_values({FRICTION_DIRECTION: float(np.sign(reference))})
 
 
-def drifting(plant: System, measured: str) -> tuple[str, ...]:
+def unobservable_states(plant: System, measured: str) -> tuple[str, ...]:
     """States on which no rate and not the measured output depends."""
     t, x, u, p = (ca.SX.sym(k, plant.ode.size1_in(i)) for i, k in enumerate("txup"))
     xdot, y = plant.ode(t, x, u, p)
@@ -81,19 +79,19 @@ def drifting(plant: System, measured: str) -> tuple[str, ...]:
     return tuple(n for n, counts in zip(names(plant.states), matters, strict=True) if not counts)
 
 
-def _resting(loop: "ClosedLoop", free: tuple[str, ...], parameters: ParameterSet) -> System:
+def _rest_system(loop: "ClosedLoop", free: tuple[str, ...], parameters: ParameterSet) -> System:
     """The loop with the integral as its controller's only state, and without the plant's free ones."""
-    plant, acts = loop.plant, bool(loop.parallel(parameters).Ki)
-    integral = [Quantity(INTEGRAL, loop.command.unit, loop.command.nominal)] if acts else []
+    plant, acts = loop.plant, bool(loop.parallel_form(parameters).Ki)
+    integral = [Quantity(INTEGRAL_STATE, loop.command.unit, loop.command.nominal)] if acts else []
     states = [*(q for q in plant.states if q.name not in free), *integral]
 
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
-        y = wired(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1][loop.feedback.name]
+        y = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1][loop.feedback.name]
         gains = loop.gains(ca.vertcat(*p.values()))
-        command = gains[0] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL, 0.0)
-        rates, outputs = wired(plant, loop.command.name, t, moving, u, p, command)
-        rates |= {INTEGRAL: gains[1] * (u["reference"] - y)}
+        command = gains[0] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL_STATE, 0.0)
+        rates, outputs = evaluate_plant(plant, loop.command.name, t, moving, u, p, command)
+        rates |= {INTEGRAL_STATE: gains[1] * (u["reference"] - y)}
         return {n: rates[n] for n in x}, outputs | {"control": command}
 
     return define(states, loop.inputs, loop.outputs, loop.parameters, rhs)

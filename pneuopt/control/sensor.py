@@ -7,16 +7,16 @@ from typing import Any
 
 import casadi as ca
 
-from pneuopt.control.pid import ratio
-from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.control.pid import unit_ratio
+from pneuopt.dynamics.system import Symbols
+from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Symbols = Mapping[str, ca.SX]
-SHORTEST = 1e-6  # [s]
+MIN_SENSOR_LAG = 1e-6  # [s]
 
 
 @dataclass(frozen=True)
-class Feedback:
+class SensedSignal:
     """What a sensor is put on.
 
     Parameters
@@ -55,34 +55,35 @@ class SensorLag:
 
     def __post_init__(self) -> None:
         require(
-            SHORTEST <= self.lag < inf,
-            f"SensorLag: lag must be at least {SHORTEST:g} s, got {self.lag:g} s; without a lag leave the sensor out",
+            MIN_SENSOR_LAG <= self.lag < inf,
+            f"SensorLag: lag must be at least {MIN_SENSOR_LAG:g} s, got {self.lag:g} s; "
+            "without a lag leave the sensor out",
         )
 
-    def check(self, _on: Feedback) -> None:
+    def check(self, _on: SensedSignal) -> None:
         """It fits any signal."""
 
-    def parameters(self, _on: Feedback) -> ParameterSet:
+    def parameters(self, _on: SensedSignal) -> ParameterSet:
         """The lag [s]."""
-        return ParameterSet({"lag": Parameter(self.lag, "s", lower=SHORTEST)})
+        return ParameterSet({"lag": Parameter(self.lag, "s", lower=MIN_SENSOR_LAG)})
 
-    def states(self, on: Feedback) -> tuple[Quantity, ...]:
+    def states(self, on: SensedSignal) -> tuple[Quantity, ...]:
         """The reading."""
         return (replace(on.measured, name="reading"),)
 
-    def start(self, y: Mapping[str, float], on: Feedback, _p: Mapping[str, float]) -> list[float]:
+    def start(self, y: Mapping[str, float], on: SensedSignal, _p: Mapping[str, float]) -> list[float]:
         """The reading is the truth."""
         return [y[on.measured.name]]
 
-    def rates(self, x: Symbols, y: Symbols, on: Feedback, p: Symbols) -> dict[str, ca.SX]:
+    def rates(self, x: Symbols, y: Symbols, on: SensedSignal, p: Symbols) -> dict[str, ca.SX]:
         """Time derivatives of the states; y are the plant's outputs."""
         return {"reading": (y[on.measured.name] - x["reading"]) / p["lag"]}
 
-    def update(self, x: Symbols, _y: Symbols, _on: Feedback, _p: Symbols) -> dict[str, ca.SX]:
+    def update(self, x: Symbols, _y: Symbols, _on: SensedSignal, _p: Symbols) -> dict[str, ca.SX]:
         """The states after a sample: as before."""
         return dict(x)
 
-    def time_constant(self, _on: Feedback, p: Mapping[str, Any]) -> Any:
+    def time_constant(self, _on: SensedSignal, p: Mapping[str, Any]) -> Any:
         """Of the loop linearised [s]."""
         return p["lag"]
 
@@ -120,23 +121,23 @@ class Encoder:
             value = getattr(self, name)
             require(0 <= value < inf, f"Encoder: {name} must not be negative, got {value:g}{unit}; 0 is none")
 
-    def check(self, on: Feedback) -> None:
+    def check(self, on: SensedSignal) -> None:
         """Refuse a continuous controller, a plant without a position, and what no difference of it gives."""
         told = "an Encoder is read once a sample: give the PID a sample_time, or take SensorLag(filter + half a sample)"
         require(on.sample_time is not None, told, ModelError)
-        check_known("output", [self.position], on.outputs, "Encoder: position")
+        check_names("output", [self.position], on.outputs, "Encoder: position")
         unit, measured = on.outputs[self.position].unit, on.measured
         require(
-            not self.differentiates(on) or ratio(unit, "s") == ratio(measured.unit, "1"),
+            not self.differentiates(on) or unit_ratio(unit, "s") == unit_ratio(measured.unit, "1"),
             f"Encoder: the difference of {self.position!r} [{unit}] is not {measured.name!r} [{measured.unit}]",
             ModelError,
         )
 
-    def differentiates(self, on: Feedback) -> bool:
+    def differentiates(self, on: SensedSignal) -> bool:
         """Whether the controller wants the speed, and not the position itself."""
         return on.measured.name != self.position
 
-    def parameters(self, on: Feedback) -> ParameterSet:
+    def parameters(self, on: SensedSignal) -> ParameterSet:
         """The filter's time constant [s] where there is a speed, and the resolution [the position's unit]."""
         found = {"filter": Parameter(self.filter, "s", lower=0.0)} if self.differentiates(on) else {}
         if self.resolution:
@@ -144,32 +145,32 @@ class Encoder:
             found["resolution"] = Parameter(self.resolution, unit, lower=1e-9 * self.resolution)
         return ParameterSet(found)
 
-    def states(self, on: Feedback) -> tuple[Quantity, ...]:
+    def states(self, on: SensedSignal) -> tuple[Quantity, ...]:
         """The reading, and for a speed the count before."""
         reading = replace(on.measured, name="reading")
         return (reading, replace(on.outputs[self.position], name="count"))[: 1 + self.differentiates(on)]
 
-    def start(self, y: Mapping[str, float], on: Feedback, p: Mapping[str, float]) -> list[float]:
+    def start(self, y: Mapping[str, float], on: SensedSignal, p: Mapping[str, float]) -> list[float]:
         """The speed is the truth, and the count before fits it."""
-        now = float(self._counted(y[self.position], p))
+        now = float(self._quantise(y[self.position], p))
         speed = y[on.measured.name]
         return [speed, now - on.h * speed] if self.differentiates(on) else [now]
 
-    def rates(self, x: Symbols, _y: Symbols, _on: Feedback, _p: Symbols) -> dict[str, ca.SX]:
+    def rates(self, x: Symbols, _y: Symbols, _on: SensedSignal, _p: Symbols) -> dict[str, ca.SX]:
         """Nothing moves between two samples."""
         return {n: ca.SX(0) for n in x}
 
-    def update(self, x: Symbols, y: Symbols, on: Feedback, p: Symbols) -> dict[str, ca.SX]:
+    def update(self, x: Symbols, y: Symbols, on: SensedSignal, p: Symbols) -> dict[str, ca.SX]:
         """The states after a sample; y are the plant's outputs."""
-        now = self._counted(y[self.position], p)
+        now = self._quantise(y[self.position], p)
         if not self.differentiates(on):
             return {"reading": now}
         step = on.h / (on.h + p["filter"]) * ((now - x["count"]) / on.h - x["reading"])
         return {"reading": x["reading"] + step, "count": now}
 
-    def time_constant(self, on: Feedback, p: Mapping[str, Any]) -> Any:
+    def time_constant(self, on: SensedSignal, p: Mapping[str, Any]) -> Any:
         """Of the loop linearised [s]; half a sample of it is the difference's."""
         return p["filter"] + 0.5 * on.h if self.differentiates(on) else 0.0
 
-    def _counted(self, position: Any, p: Mapping[str, Any]) -> Any:
+    def _quantise(self, position: Any, p: Mapping[str, Any]) -> Any:
         return p["resolution"] * ca.floor(position / p["resolution"] + 0.5) if self.resolution else position

@@ -6,13 +6,13 @@ from math import inf
 import casadi as ca
 
 from pneuopt.dynamics.system import Symbols, System, names
-from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Quantity
 
 Signals = dict[str, ca.SX]
 
 
-def wired(
+def evaluate_plant(
     plant: System, actuated: str, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX
 ) -> tuple[Signals, Signals]:
     """Rates and outputs of the plant under a command."""
@@ -23,7 +23,7 @@ def wired(
     return {n: xdot[k] for k, n in enumerate(states)}, {n: y[k] for k, n in enumerate(outputs)}
 
 
-def chosen(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:
+def select_signal(kind: str, name: str | None, known: Sequence[Quantity], usual: str | None) -> Quantity:
     """The signal of that name, by default the usual one or the only one.
 
     Raises
@@ -36,11 +36,11 @@ def chosen(kind: str, name: str | None, known: Sequence[Quantity], usual: str | 
         name = usual if usual in by_name else next(iter(by_name)) if len(by_name) == 1 else None
     field = "actuated" if kind == "input" else "measured"
     require(name is not None, f"the plant has the {kind}s {', '.join(by_name) or 'none'}; choose {field}=", ModelError)
-    check_known(kind, [str(name)], by_name, f"ClosedLoop {field}")
+    check_names(kind, [str(name)], by_name, f"ClosedLoop {field}")
     return by_name[str(name)]
 
 
-def check_lag(plant: System, command: str, output: str) -> None:
+def check_algebraic_loop(plant: System, command: str, output: str) -> None:
     """Refuse an algebraic loop: an output that depends on the command without any lag."""
     t, x, u = (ca.SX.sym(k, plant.ode.size1_in(i)) for i, k in enumerate("txu"))
     y = plant.ode(t, x, u, ca.SX.sym("p", plant.ode.size1_in(3)))[1]
@@ -53,7 +53,7 @@ def check_lag(plant: System, command: str, output: str) -> None:
     )
 
 
-def check_reach(command: float, value: Mapping[str, float], unit: str) -> None:
+def check_initial_command(command: float, value: Mapping[str, float], unit: str) -> None:
     """Refuse a start that takes a command beyond the limits."""
     low, high = value.get("pid.lower", -inf), value.get("pid.upper", inf)
     require(

@@ -1,4 +1,4 @@
-"""What a plant refuses to be (`Checker`), and what a simulation of it watches (`Guard`) and tells (`Contact`)."""
+"""Which hardware a plant refuses (`HardwareCheckHook`), and where its model ends (`ValidityLimit`, `Contact`)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.units import write_value
 
 
-class Checker(Protocol):
+class HardwareCheckHook(Protocol):
     """What a model knows about hardware that cannot exist."""
 
     def __call__(self, parameters: ParameterSet, start: Mapping[str, float] | None = None) -> None:
@@ -17,7 +17,7 @@ class Checker(Protocol):
 
 
 @dataclass(frozen=True)
-class Guard:
+class ValidityLimit:
     """A value of a state beyond which a response is no longer what the model is meant for: an end stop, a vacuum.
 
     Attributes
@@ -51,16 +51,17 @@ class Contact:
     value, rate : float
         The state there and its rate [its unit, and that over s].
     state : Quantity
-    guard : Guard
+    validity_limit : Guard
     """
 
     t: float
     value: float
     rate: float
     state: Quantity
-    guard: Guard
+    validity_limit: ValidityLimit
 
     def __str__(self) -> str:
         where = f"{self.state.name} {write_value(self.value, self.state.unit, 4)}"
         speed = f" with {self.rate:.3g} m/s" if self.state.unit == "m" else ""
-        return f"{self.guard.event} ({where}) at t = {self.t:.4g} s{speed}; from there {self.guard.meaning}"
+        limit = self.validity_limit
+        return f"{limit.event} ({where}) at t = {self.t:.4g} s{speed}; from there {limit.meaning}"

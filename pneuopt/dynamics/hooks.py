@@ -26,17 +26,17 @@ class Start:
     parameters : mapping of str to float
         By name; a `per_log` one as "name[log]".
     label : str
-    tried : tuple of str
+    trial_parameters : tuple of str
         Those of the parameters that the log does not tell, and the candidates try: one value each.
     """
 
     states: Mapping[str, Trajectory]
     parameters: Mapping[str, float]
     label: str = ""
-    tried: tuple[str, ...] = ()
+    trial_parameters: tuple[str, ...] = ()
 
 
-class StartFinder(Protocol):
+class StartHook(Protocol):
     """What a model knows about starting from logs (equation error); see `System.starts`."""
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -51,7 +51,7 @@ class Rest(NamedTuple):
     inputs: Mapping[str, float]
 
 
-class RestFinder(Protocol):
+class RestHook(Protocol):
     """What a model knows about resting where an equilibrium from zeros would not be found (a drive under pressure)."""
 
     def __call__(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
@@ -59,7 +59,7 @@ class RestFinder(Protocol):
         ...
 
 
-class Doubter(Protocol):
+class LogWarningHook(Protocol):
     """What a model can tell against the logs themselves, as a sensor's zero point; see `System.doubts`."""
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[str]:

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.compiled.rollout import compiled
+from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.guards import Contact
-from pneuopt.dynamics.smooth import Run, Smooth, Watch
-from pneuopt.dynamics.stick_slip import Event, StickSlip
-from pneuopt.dynamics.system import DIRECTION, System, names, vector
-from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_known, require
+from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration
+from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
+from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-Update = Callable[..., tuple[Array, ...]]
-RESTS_AT = "position"  # where a plant can be asked to rest
+CompiledUpdate = Callable[..., tuple[Array, ...]]
+REST_COORDINATE = "position"  # where a plant can be asked to rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +99,8 @@ def simulate(
     >>> round(run["speed"][-1].item(), 6)
     0.632121
     """
-    run, met = _integrated(model, inputs, parameters, initial, t_out, (rtol, atol))
-    warn_of(met)
+    run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol))
+    warn_contacts(met)
     return run.trajectory()
 
 
@@ -131,10 +131,10 @@ def simulate_stick_slip(
     >>> [(round(e.t, 4), e.kind.value) for e in run.events]
     [(0.1, 'breaks away'), (0.4364, 'sticks')]
     """
-    run, met = _integrated(model, inputs, parameters, initial, t_out, (rtol, atol))
-    if not isinstance(run, StickSlip):
+    run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol))
+    if not isinstance(run, StickSlipIntegration):
         raise ModelError("the model has no Karnopp friction, say ForceDrive(Karnopp(Stribeck())); take simulate")
-    warn_of(met)
+    warn_contacts(met)
     return StickSlipResult(run.trajectory(), run.events)
 
 
@@ -162,42 +162,44 @@ def contacts(trajectory: Trajectory, model: System | ClosedLoop, parameters: Par
     >>> print(str(contacts(run, drive, drive.parameters)[0]).partition(";")[0])
     the piston reached the front end stop (position 199.9 mm) at t = 0.04975 s with 0.4 m/s
     """
-    plant = _plant(model)
+    plant = _plant_of(model)
     rows = trajectory.matrix(names(plant.states))
-    watch = Watch(plant, parameters, trajectory.t[0], rows[0])
+    watch = LimitMonitor(plant, parameters, trajectory.t[0], rows[0])
     for t, row in zip(trajectory.t, rows, strict=True):
-        watch.look(t, row)
+        watch.observe(t, row)
     return watch.contacts
 
 
-def warn_of(met: Sequence[Contact]) -> None:
+def warn_contacts(met: Sequence[Contact]) -> None:
     """Give a `PhysicsWarning` for each contact, in the name of the caller's caller."""
     for contact in met:
         warnings.warn(str(contact), PhysicsWarning, stacklevel=3)
 
 
-def new_run(system: System, p: Array, grid: Array, rtol: float, atol: float) -> Run:
+def new_integration(system: System, p: Array, grid: Array, rtol: float, atol: float) -> Integration:
     """The integration that a plant needs; it records at the instants of `grid` [s]."""
-    return (StickSlip if DIRECTION in system.parameters else Smooth)(system, p, grid, rtol, atol)
+    return (StickSlipIntegration if FRICTION_DIRECTION in system.parameters else SmoothIntegration)(
+        system, p, grid, rtol, atol
+    )
 
 
-def _integrated(
+def _integrate(
     model: System | ClosedLoop,
     inputs: Trajectory,
     parameters: ParameterSet,
     initial: Mapping[str, float] | ArrayLike | None,
     t_out: ArrayLike | None,
     tolerances: tuple[float, float],
-) -> tuple[Run, tuple[Contact, ...]]:
-    system, update, sample_time = _pieces(model)
-    u, grid = held_inputs(system.inputs, inputs), _instants(t_out, inputs.t)
-    x, p = first_state(model, parameters, initial), vector(system.parameters, parameters)
-    slack = _slack(inputs.t)
-    breaks, is_sample = _breaks(inputs.t, u, sample_time, slack)
+) -> tuple[Integration, tuple[Contact, ...]]:
+    system, update, sample_time = _ode_and_update(model)
+    u, grid = input_rows(system.inputs, inputs), _report_times(t_out, inputs.t)
+    x, p = initial_state(model, parameters, initial), parameter_vector(system.parameters, parameters)
+    slack = _time_tolerance(inputs.t)
+    breaks, is_sample = _restart_times(inputs.t, u, sample_time, slack)
     rows = u[np.searchsorted(inputs.t, breaks + slack, side="right") - 1]
-    run, done = new_run(system, p, grid, *tolerances), 0
-    watch = Watch(_plant(model), parameters, inputs.t[0], x)
-    with watch.telling():
+    run, done = new_integration(system, p, grid, *tolerances), 0
+    watch = LimitMonitor(_plant_of(model), parameters, inputs.t[0], x)
+    with watch.report_contacts():
         for at, end, row, acts in zip(breaks, [*breaks[1:], np.inf], rows, is_sample, strict=True):
             run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row)
             until = int(np.searchsorted(grid, end - slack))
@@ -210,16 +212,16 @@ def _integrated(
     return run, watch.contacts
 
 
-def _pieces(model: System | ClosedLoop) -> tuple[System, Update | None, float | None]:
+def _ode_and_update(model: System | ClosedLoop) -> tuple[System, CompiledUpdate | None, float | None]:
     """The ODE between two samples, the update at a sample, the sample time."""
     if isinstance(model, System):
         return model, None, None
     if model.pid.sample_time is None:
         return model.system(), None, None
-    return model.held(), compiled(model.update), model.pid.sample_time
+    return model.hold_system(), compile_function(model.update), model.pid.sample_time
 
 
-def held_inputs(wanted: Sequence[Quantity], inputs: Trajectory) -> Array:
+def input_rows(wanted: Sequence[Quantity], inputs: Trajectory) -> Array:
     """The inputs as rows, one an instant; a missing value is an error."""
     u = inputs.matrix(names(wanted))
     for q, column in zip(wanted, u.T, strict=True):
@@ -229,23 +231,23 @@ def held_inputs(wanted: Sequence[Quantity], inputs: Trajectory) -> Array:
     return u
 
 
-def _instants(t_out: ArrayLike | None, t: Array) -> Array:
+def _report_times(t_out: ArrayLike | None, t: Array) -> Array:
     """The instants to report, within the inputs' time."""
     if t_out is None:
         return t
-    grid, slack = np.array(t_out, dtype=float, ndmin=1), _slack(t)
+    grid, slack = np.array(t_out, dtype=float, ndmin=1), _time_tolerance(t)
     require(grid.size > 0 and bool(np.all(np.diff(grid) > 0)), "t_out must be instants that increase strictly")
     inside = t[0] - slack <= grid[0] and grid[-1] <= t[-1] + slack
     require(bool(inside), f"t_out runs from {grid[0]:g} to {grid[-1]:g} s, the inputs from {t[0]:g} to {t[-1]:g} s")
     return grid
 
 
-def _slack(t: Array) -> float:
+def _time_tolerance(t: Array) -> float:
     """Instants closer than this are one [s]."""
     return float(max(1e-6 * np.min(np.diff(t), initial=1.0), 4 * np.spacing(np.abs(t).max())))
 
 
-def _breaks(t: Array, u: Array, sample_time: float | None, slack: float) -> tuple[Array, NDArray[np.bool_]]:
+def _restart_times(t: Array, u: Array, sample_time: float | None, slack: float) -> tuple[Array, NDArray[np.bool_]]:
     """Where the integration restarts (at the start, where an input changes, at each sample), and which are samples."""
     changes = t[np.append(True, np.any(u[1:] != u[:-1], axis=1))]
     if sample_time is None:
@@ -257,17 +259,17 @@ def _breaks(t: Array, u: Array, sample_time: float | None, slack: float) -> tupl
     return np.concatenate([samples, between])[order], order < len(samples)
 
 
-def first_state(
+def initial_state(
     model: System | ClosedLoop, parameters: ParameterSet, initial: Mapping[str, float] | ArrayLike | None
 ) -> Array:
     """The state from which `simulate` starts; one where the plant cannot be is an error."""
-    states, plant = model.states, _plant(model)
+    states, plant = model.states, _plant_of(model)
     if initial is None:
-        x = _at_rest(model, parameters, {}) if isinstance(model, System) else model.initial(parameters)
+        x = _rest_state(model, parameters, {}) if isinstance(model, System) else model.initial(parameters)
     elif isinstance(initial, Mapping):
-        check_known("state", initial, names(states), "initial")
-        held = {n: float(v) for n, v in initial.items() if n == RESTS_AT}
-        base = _at_rest(model, parameters, held) if initial.keys() < set(names(states)) else np.zeros(len(states))
+        check_names("state", initial, names(states), "initial")
+        held = {n: float(v) for n, v in initial.items() if n == REST_COORDINATE}
+        base = _rest_state(model, parameters, held) if initial.keys() < set(names(states)) else np.zeros(len(states))
         x = np.array([initial.get(q.name, value) for q, value in zip(states, base, strict=True)], dtype=float)
     else:
         x = np.array(initial, dtype=float)
@@ -281,17 +283,17 @@ def first_state(
     return x
 
 
-def _at_rest(model: System | ClosedLoop, parameters: ParameterSet, held: Mapping[str, float]) -> Array:
+def _rest_state(model: System | ClosedLoop, parameters: ParameterSet, held: Mapping[str, float]) -> Array:
     """The model at rest where the held outputs have these values; zeros where the plant knows no rest."""
-    plant = _plant(model)
-    if plant.rest_finder is None:
+    plant = _plant_of(model)
+    if plant.rest_hook is None:
         return np.zeros(len(model.states))
-    rest = plant.rest_finder(parameters, held)
+    rest = plant.rest_hook(parameters, held)
     x = np.array([rest.states.get(n, 0.0) for n in names(plant.states)])
     if isinstance(model, System):
         return x
     return model.initial(parameters, x, command=rest.inputs.get(model.command.name, 0.0))
 
 
-def _plant(model: System | ClosedLoop) -> System:
+def _plant_of(model: System | ClosedLoop) -> System:
     return model.plant if isinstance(model, ClosedLoop) else model

@@ -7,22 +7,21 @@ from contextlib import contextmanager
 from typing import Any, NoReturn, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import integrate
 
-from pneuopt.dynamics.compiled.rollout import compiled
+from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.guards import Contact
 from pneuopt.dynamics.system import System, names
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-MOST_STEPS = 200_000
-LOOK = 1e-3  # [s] between two looks at the guards; a stop holds a piston for longer
+MAX_INTERNAL_STEPS = 200_000
+LIMIT_CHECK_PERIOD = 1e-3  # [s] between two looks at the guards; a stop holds a piston for longer
 
 
-class Run(Protocol):
+class Integration(Protocol):
     """An integration under way: restarted where an input jumps, advanced from instant to instant, recorded at some."""
 
     def restart(self, t: float, x: Array, u: Array) -> None:
@@ -46,7 +45,7 @@ class Run(Protocol):
         ...
 
 
-class Watch:
+class LimitMonitor:
     """Looks at a run between the instants that are asked for, so that none of the plant's guards is passed unseen.
 
     The states of `plant` come first in the vectors that it sees.
@@ -54,7 +53,7 @@ class Watch:
 
     def __init__(self, plant: System, parameters: ParameterSet, t: float, x: Array) -> None:
         full = plant.parameters | parameters.select(n for n in parameters if n in plant.parameters)
-        self._guards, self._contacts = plant.guards, dict[int, Contact]()
+        self._guards, self._contacts = plant.validity_limits, dict[int, Contact]()
         self._indices = [names(plant.states).index(g.state) for g in self._guards]
         self._states = [plant.states[k] for k in self._indices]
         self._limits = np.array([g.limit(full) for g in self._guards])
@@ -67,7 +66,7 @@ class Watch:
         return tuple(sorted(self._contacts.values(), key=lambda contact: contact.t))
 
     @contextmanager
-    def telling(self) -> Iterator[None]:
+    def report_contacts(self) -> Iterator[None]:
         """Add what was met to the message of a run that stops."""
         try:
             yield
@@ -77,17 +76,17 @@ class Watch:
             met = "; ".join(map(str, self.contacts))
             raise ConvergenceError(f"{error}. Before that, {met}", error.solution) from None
 
-    def advance(self, run: Run, t: float) -> Array:
+    def advance(self, run: Integration, t: float) -> Array:
         """As ``run.advance(t)``, looking every millisecond on the way."""
         if len(self._contacts) < len(self._guards):
             begin = self._t
-            for k in range(1, math.ceil((t - begin) / LOOK)):
-                self.look(begin + k * LOOK, run.advance(begin + k * LOOK))
+            for k in range(1, math.ceil((t - begin) / LIMIT_CHECK_PERIOD)):
+                self.observe(begin + k * LIMIT_CHECK_PERIOD, run.advance(begin + k * LIMIT_CHECK_PERIOD))
         x = run.advance(t)
-        self.look(t, x)
+        self.observe(t, x)
         return x
 
-    def look(self, t: float, x: Array) -> None:
+    def observe(self, t: float, x: Array) -> None:
         """Compare with what was seen last."""
         before, values = self._values, x[self._indices]
         room = self._sides * (self._limits - before)
@@ -99,7 +98,7 @@ class Watch:
         self._t, self._values = t, values
 
 
-class Record:
+class Recorder:
     """States and outputs, a row an instant of the grid, and more columns if there are `flags`."""
 
     def __init__(self, system: System, grid: Array, flags: Sequence[str] = ()) -> None:
@@ -126,28 +125,28 @@ class Record:
         )
 
 
-class Smooth:
+class SmoothIntegration:
     """SciPy's integrator on the compiled right-hand side (it restarts in microseconds), and what it has recorded."""
 
     def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
-        self._system, self._p, self._ode = system, p, compiled(system.ode)
+        self._system, self._p, self._ode = system, p, compile_function(system.ode)
         self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
         self._u = np.zeros(len(system.inputs))
-        self._record = Record(system, grid)
+        self._record = Recorder(system, grid)
         scale = np.array([q.nominal for q in system.states])
-        options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MOST_STEPS}
+        options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MAX_INTERNAL_STEPS}
         self._integrator = integrate.ode(self._rate).set_integrator(**options)
 
     def _rate(self, t: float, x: Array) -> Array:
         return self._ode(self._origin + t, x, self._u, self._p)[0]
 
     def restart(self, t: float, x: Array, u: Array) -> None:
-        """See `Run`."""
+        """See `Integration`."""
         self._u = u
         self._integrator.set_initial_value(x, t - self._origin)
 
     def advance(self, t: float) -> Array:
-        """See `Run`."""
+        """See `Integration`."""
         before, start = self._integrator.t, np.array(self._integrator.y)
         if t - self._origin - before <= 8 * np.spacing(abs(t)) or not self._system.states:
             return start  # LSODA refuses a step of rounding's size
@@ -159,13 +158,13 @@ class Smooth:
         return x
 
     def outputs(self) -> Array:
-        """See `Run`."""
+        """See `Integration`."""
         return self._ode(self._origin + self._integrator.t, self._integrator.y, self._u, self._p)[1]
 
     def record(self) -> None:
-        """See `Run`."""
+        """See `Integration`."""
         self._record.add(np.array(self._integrator.y), self.outputs())
 
     def trajectory(self) -> Trajectory:
-        """See `Run`."""
+        """See `Integration`."""
         return self._record.trajectory()

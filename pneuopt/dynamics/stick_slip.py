@@ -1,4 +1,4 @@
-"""`StickSlip`: a plant under Karnopp's friction, integrated from event to event; `simulate` takes it by itself.
+"""`StickSlipIntegration`: a plant under Karnopp's friction, integrated from event to event; `simulate` chooses it.
 
 While the piston slides, its friction keeps one sign, and the model is smooth: the standstill is a root of the speed on
 the integrator's own interpolant. While it sticks, the speed is exactly 0, the rest of the plant runs on, and what is
@@ -15,18 +15,17 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import integrate, optimize
 
-from pneuopt.dynamics.compiled.rollout import compiled
-from pneuopt.dynamics.smooth import Record
-from pneuopt.dynamics.system import DIRECTION, System, names
+from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.smooth import Recorder
+from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-MOST_EVENTS = 100_000
-LOOKS = 4  # a step
+MAX_EVENTS = 100_000
+ROOT_PROBES_PER_STEP = 4  # a step
 
 
 class EventKind(Enum):
@@ -55,25 +54,31 @@ class Event:
     direction: int
 
 
-class StickSlip:
+class StickSlipIntegration:
     """An integration (`integration.Run`) that finds its events; records a column "stuck", 0 or 1, too."""
 
     def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
         message = "Karnopp's friction needs a plant with a state 'speed' and a parameter 'friction.direction'"
-        require("speed" in names(system.states) and DIRECTION in system.parameters, message, ModelError)
-        self._speed, self._direction = names(system.states).index("speed"), list(system.parameters).index(DIRECTION)
+        require("speed" in names(system.states) and FRICTION_DIRECTION in system.parameters, message, ModelError)
+        self._speed, self._direction = (
+            names(system.states).index("speed"),
+            list(system.parameters).index(FRICTION_DIRECTION),
+        )
         self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
         self._end = 1.001 * (grid[-1] - grid[0]) + 1e-3  # LSODA derives its first step from it
-        self._p = {d: self._directed(p, d) for d in (-1, 0, 1)}
-        self._ode, self._pushes = compiled(system.ode), compiled(_pushes(system, self._speed, self._direction))
+        self._p = {d: self._with_direction(p, d) for d in (-1, 0, 1)}
+        self._ode, self._accelerations = (
+            compile_function(system.ode),
+            compile_function(_acceleration_function(system, self._speed, self._direction)),
+        )
         atols = atol * np.array([q.nominal for q in system.states])
         self._options: dict[str, Any] = {"rtol": rtol, "atol": atols}
-        self._still = 10 * atols[self._speed]  # rounding must not end a motion that has just begun
+        self._standstill_speed = 10 * atols[self._speed]  # rounding must not end a motion that has just begun
         self._mode: int | None = None
         self._solver: integrate.OdeSolver
-        self._event, self._edge = inf, 0.0
+        self._event_time, self._last_indicator = inf, 0.0
         self._dense: Callable[[float], Array] | None = None
-        self._record = Record(system, grid, ("stuck",))
+        self._record = Recorder(system, grid, ("stuck",))
         self._events = list[Event]()
 
     @property
@@ -84,30 +89,30 @@ class StickSlip:
     def restart(self, t: float, x: Array, u: Array) -> None:
         """See `integration.Run`."""
         self._u = u
-        if abs(x[self._speed]) > self._still:
-            self._begin(t - self._origin, x, int(np.sign(x[self._speed])))
+        if abs(x[self._speed]) > self._standstill_speed:
+            self._begin_mode(t - self._origin, x, int(np.sign(x[self._speed])))
         else:
-            x = self._stopped(x)
-            self._begin(t - self._origin, x, self._yields(t - self._origin, x))
+            x = self._with_zero_speed(x)
+            self._begin_mode(t - self._origin, x, self._breakaway_direction(t - self._origin, x))
 
     def advance(self, t: float) -> Array:
         """See `integration.Run`."""
         until = t - self._origin
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            while self._event <= until or self._solver.t < until:
-                if self._event <= until:
-                    self._switch()
+            while self._event_time <= until or self._solver.t < until:
+                if self._event_time <= until:
+                    self._switch_mode()
                 else:
                     self._step()
-        self._now, self._x = until, self._state(until)
+        self._now, self._x = until, self._state_at(until)
         return self._x
 
     def outputs(self) -> Array:
         """See `integration.Run`."""
         p = self._p[self._mode or 0]
         if self._mode == 0:
-            p = self._directed(p, self._balance(self._now, self._x))
+            p = self._with_direction(p, self._balance_direction(self._now, self._x))
         return self._ode(self._origin + self._now, self._x, self._u, p)[1]
 
     def record(self) -> None:
@@ -118,29 +123,29 @@ class StickSlip:
         """See `integration.Run`."""
         return self._record.trajectory()
 
-    def _begin(self, t: float, x: Array, mode: int) -> None:
+    def _begin_mode(self, t: float, x: Array, mode: int) -> None:
         """Go on from t in this mode: 0 sticks, 1 and -1 slide."""
         before = self._mode if self._mode is not None else mode * int(x[self._speed] != 0)
         if mode != before:
-            self._note(t, mode, before)
-        self._mode, self._event, self._dense = mode, inf, None
+            self._note_event(t, mode, before)
+        self._mode, self._event_time, self._dense = mode, inf, None
         self._now, self._x = t, x
         self._solver = integrate.LSODA(self._rate, t, x, self._end, **self._options)
-        self._edge = self._watched(t, x)
+        self._last_indicator = self._mode_indicator(t, x)
 
-    def _note(self, t: float, mode: int, before: int) -> None:
+    def _note_event(self, t: float, mode: int, before: int) -> None:
         kind = EventKind.STANDSTILL if mode == 0 else EventKind.BREAK_AWAY if before == 0 else EventKind.REVERSAL
         self._events.append(Event(float(self._origin + t), kind, mode))
         require(
-            len(self._events) <= MOST_EVENTS,
-            f"the piston stuck or slipped {MOST_EVENTS} times by t = {self._origin + t:.9g} s: the loop chatters; "
+            len(self._events) <= MAX_EVENTS,
+            f"the piston stuck or slipped {MAX_EVENTS} times by t = {self._origin + t:.9g} s: the loop chatters; "
             "simulate a shorter time, or mend the gains",
             ConvergenceError,
         )
 
     def _rate(self, t: float, x: Array) -> Array:
         """Of the state; while stuck, the speed's entry is an impulse, so that the step size heeds the driving force."""
-        at_rest = x if self._mode else self._stopped(x)
+        at_rest = x if self._mode else self._with_zero_speed(x)
         return self._ode(self._origin + t, at_rest, self._u, self._p[self._mode or 0])[0]
 
     def _step(self) -> None:
@@ -148,85 +153,87 @@ class StickSlip:
         self._solver.step()
         self._dense = None
         if self._solver.t <= t or not np.isfinite(self._solver.y).all():
-            self._record.fail(self._origin + t, x if self._mode else self._stopped(x))
-        self._event = inf if self._is_quiet() else _first_root(self._excess, self._solver.t_old, self._solver.t)
+            self._record.fail(self._origin + t, x if self._mode else self._with_zero_speed(x))
+        self._event_time = (
+            inf if self._mode_persists() else _first_root(self._event_function, self._solver.t_old, self._solver.t)
+        )
 
-    def _is_quiet(self) -> bool:
+    def _mode_persists(self) -> bool:
         """Whether the mode surely lasts through the step, by what is cheap to look at."""
         begin, end = self._solver.t_old, self._solver.t
-        before, self._edge = self._edge, self._watched(end, self._solver.y)
+        before, self._last_indicator = self._last_indicator, self._mode_indicator(end, self._solver.y)
         if self._mode:
-            return bool(self._mode * self._solver.y[self._speed] > 0 and not before < 0 < self._edge)
-        values = (before, self._excess((begin + end) / 2), self._edge)
+            return bool(self._mode * self._solver.y[self._speed] > 0 and not before < 0 < self._last_indicator)
+        values = (before, self._event_function((begin + end) / 2), self._last_indicator)
         return 2 * max(values) < min(values)
 
-    def _watched(self, t: float, x: Array) -> float:
-        """What `_is_quiet` compares at a step's ends: sliding, the gain of speed; sticking, the excess of force."""
-        return float(self._mode * self._rate(t, x)[self._speed]) if self._mode else self._excess(t)
+    def _mode_indicator(self, t: float, x: Array) -> float:
+        """What `_mode_persists` compares at a step's ends: sliding, the gain of speed; sticking, the excess force."""
+        return float(self._mode * self._rate(t, x)[self._speed]) if self._mode else self._event_function(t)
 
-    def _excess(self, t: float) -> float:
+    def _event_function(self, t: float) -> float:
         """Positive where the mode has ended."""
-        x = self._state(t)
+        x = self._state_at(t)
         if self._mode:
-            return float(-self._mode * x[self._speed] - self._still)
-        forward, backward = self._push(t, x)
+            return float(-self._mode * x[self._speed] - self._standstill_speed)
+        forward, backward = self._breakaway_accelerations(t, x)
         return max(forward, -backward)
 
-    def _switch(self) -> None:
-        t = self._event
-        x = self._state(t)
+    def _switch_mode(self) -> None:
+        t = self._event_time
+        x = self._state_at(t)
         if self._mode:
-            x = self._stopped(x)
-            self._begin(t, x, self._yields(t, x))
+            x = self._with_zero_speed(x)
+            self._begin_mode(t, x, self._breakaway_direction(t, x))
         else:
-            forward, backward = self._push(t, x)
-            self._begin(t, x, 1 if forward > -backward else -1)
+            forward, backward = self._breakaway_accelerations(t, x)
+            self._begin_mode(t, x, 1 if forward > -backward else -1)
 
-    def _yields(self, t: float, x: Array) -> int:
+    def _breakaway_direction(self, t: float, x: Array) -> int:
         """The direction in which a piston at rest breaks away; 0 if it sticks."""
-        forward, backward = self._push(t, x)
+        forward, backward = self._breakaway_accelerations(t, x)
         message = f"the static friction is negative at t = {self._origin + t:.9g} s; check its pressure coefficients"
         require(forward <= backward, message, ModelError)
         return 1 if forward > 0 else -1 if backward < 0 else 0
 
-    def _balance(self, t: float, x: Array) -> float:
+    def _balance_direction(self, t: float, x: Array) -> float:
         """The direction, between -1 and 1, at which the friction of a piston at rest balances the rest."""
-        forward, backward = self._push(t, x)
+        forward, backward = self._breakaway_accelerations(t, x)
         if not forward < 0 < backward:
             return float(np.sign(forward + backward))
 
-        def push(direction: float) -> float:
-            p = self._directed(self._p[0], direction)
+        def acceleration(direction: float) -> float:
+            p = self._with_direction(self._p[0], direction)
             return float(self._ode(self._origin + t, x, self._u, p)[0][self._speed])
 
-        return float(optimize.brentq(push, -1.0, 1.0))
+        return float(optimize.brentq(acceleration, -1.0, 1.0))
 
-    def _push(self, t: float, x: Array) -> tuple[float, float]:
+    def _breakaway_accelerations(self, t: float, x: Array) -> tuple[float, float]:
         """Accelerations that a piston at rest would have if it slid forwards, and backwards [m/s^2]."""
-        forward, backward = self._pushes(self._origin + t, x, self._u, self._p[0])[0]
+        forward, backward = self._accelerations(self._origin + t, x, self._u, self._p[0])[0]
         return float(forward), float(backward)
 
-    def _state(self, t: float) -> Array:
+    def _state_at(self, t: float) -> Array:
         """On the last step."""
         if t >= self._solver.t:
             x = np.array(self._solver.y)
         else:
             self._dense = self._dense or self._solver.dense_output()
             x = self._dense(t)
-        return x if self._mode else self._stopped(x)
+        return x if self._mode else self._with_zero_speed(x)
 
-    def _stopped(self, x: Array) -> Array:
+    def _with_zero_speed(self, x: Array) -> Array:
         at_rest = np.array(x)
         at_rest[self._speed] = 0.0
         return at_rest
 
-    def _directed(self, p: Array, direction: float) -> Array:
+    def _with_direction(self, p: Array, direction: float) -> Array:
         directed = np.array(p)
         directed[self._direction] = direction
         return directed
 
 
-def _pushes(system: System, speed: int, direction: int) -> ca.Function:
+def _acceleration_function(system: System, speed: int, direction: int) -> ca.Function:
     """``(t, x, u, p) -> (a_forward, a_backward)``: the speed's rate with either sign of the friction."""
     t, x, u, p = (ca.SX.sym(k, system.ode.size1_in(i)) for i, k in enumerate("txup"))
     rates = []
@@ -242,7 +249,7 @@ def _first_root(f: Callable[[float], float], begin: float, end: float) -> float:
 
     f is looked at a few times; where it has a hump between the looks, its top is found first.
     """
-    t = np.linspace(begin, end, LOOKS + 1)
+    t = np.linspace(begin, end, ROOT_PROBES_PER_STEP + 1)
     values = np.array([f(at) for at in t])
     if not np.any(values[1:] > 0):
         k = 1 + int(np.argmax(values[1:-1]))

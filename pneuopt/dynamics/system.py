@@ -6,21 +6,20 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Pieces
-from pneuopt.dynamics.guards import Checker, Guard
-from pneuopt.dynamics.hooks import Doubter, Log, RestFinder, Start, StartFinder
+from pneuopt.dynamics.guards import HardwareCheckHook, ValidityLimit
+from pneuopt.dynamics.hooks import Log, LogWarningHook, RestHook, Start, StartHook
 from pneuopt.dynamics.runge_kutta import rk4
-from pneuopt.quantities.errors import ConvergenceError, ModelError, check_known, require
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError, ModelError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 Symbols = Mapping[str, ca.SX]
 Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
-Update = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
-DIRECTION = "friction.direction"  # of Karnopp's friction: what a simulation switches
+SymbolicUpdate = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
+FRICTION_DIRECTION = "friction.direction"  # of Karnopp's friction: what a simulation switches
 
 
 @dataclass(frozen=True)
@@ -48,15 +47,15 @@ class System:
         Every parameter with its default; their order is that of the vector p.
     ode : casadi.Function
         ``(t, x, u, p) -> (xdot, y)`` in SI units, built from SX.
-    start_finder : StartFinder, optional
+    start_hook : StartFinder, optional
         How this model starts from a log.
-    rest_finder : RestFinder, optional
+    rest_hook : RestFinder, optional
         How this model comes to rest.
-    checker : Checker, optional
+    hardware_check_hook : Checker, optional
         Which of its numbers are impossible.
-    guards : tuple of Guard
+    validity_limits : tuple of Guard
         What a simulation of it watches.
-    doubter : Doubter, optional
+    log_warning_hook : Doubter, optional
         What it can tell against logs.
     meter : casadi.Function, optional
         ``(t, x, u, p) -> (air, spool)``: mass flow from the supply [kg/s], the spool's position [half travels]; no
@@ -68,11 +67,11 @@ class System:
     outputs: tuple[Quantity, ...]
     parameters: ParameterSet
     ode: ca.Function
-    start_finder: StartFinder | None = None
-    rest_finder: RestFinder | None = None
-    checker: Checker | None = None
-    guards: tuple[Guard, ...] = ()
-    doubter: Doubter | None = None
+    start_hook: StartHook | None = None
+    rest_hook: RestHook | None = None
+    hardware_check_hook: HardwareCheckHook | None = None
+    validity_limits: tuple[ValidityLimit, ...] = ()
+    log_warning_hook: LogWarningHook | None = None
     meter: ca.Function | None = None
 
     def __repr__(self) -> str:
@@ -93,8 +92,8 @@ class System:
         InputError
             If hardware is impossible or the start lies outside; the message names value, source and remedy.
         """
-        if self.checker is not None:
-            self.checker(parameters, start)
+        if self.hardware_check_hook is not None:
+            self.hardware_check_hook(parameters, start)
 
     def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Candidates from which an identification can start.
@@ -109,16 +108,16 @@ class System:
         sequence of Start
             The most plausible first; without a finder, the measured outputs of a state's name and the given values.
         """
-        if self.start_finder is not None:
-            return self.start_finder(logs)
-        return [Start({name: self._as_logged(log.measured) for name, log in logs.items()}, {}, "as given")]
+        if self.start_hook is not None:
+            return self.start_hook(logs)
+        return [Start({name: self._states_from_log(log.measured) for name, log in logs.items()}, {}, "as given")]
 
-    def doubts(self, logs: Mapping[str, Log]) -> Sequence[str]:
+    def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """What speaks against the logs, a sentence each; of a model without a doubter, nothing."""
-        return self.doubter(logs) if self.doubter is not None else ()
+        return self.log_warning_hook(logs) if self.log_warning_hook is not None else ()
 
-    def _as_logged(self, measured: Trajectory) -> Trajectory:
-        columns = {s.name: _filled(measured, s.name) for s in self.states}
+    def _states_from_log(self, measured: Trajectory) -> Trajectory:
+        columns = {s.name: _interpolate_missing(measured, s.name) for s in self.states}
         return Trajectory(measured.t, columns)
 
     def equilibrium(self, u: Mapping[str, float], p: ParameterSet, guess: Mapping[str, float] | None = None) -> Array:
@@ -137,10 +136,10 @@ class System:
         """
         self.check(p)
         guess = dict(guess or {})
-        check_known("state", guess, names(self.states))
+        check_names("state", guess, names(self.states))
         scale = np.array([s.nominal for s in self.states])
         x = np.array([guess.get(s.name, 0.0) for s in self.states])
-        us, ps = self._inputs(u), vector(self.parameters, p)
+        us, ps = self._input_vector(u), parameter_vector(self.parameters, p)
         for _ in range(100):
             rate = np.array(self.ode(0, x, us, ps)[0]).ravel()
             step, *_ = np.linalg.lstsq(np.array(self._jacobian(0, x, us, ps)[0]) * scale, -rate, rcond=1e-12)
@@ -176,7 +175,7 @@ class System:
             If the hardware is impossible.
         """
         self.check(p)
-        matrices = self._jacobian(0, x, self._inputs(u), vector(self.parameters, p))
+        matrices = self._jacobian(0, x, self._input_vector(u), parameter_vector(self.parameters, p))
         A, B, C, D = (np.array(m) for m in matrices)
         return Linearisation(A, B, C, D, names(self.states), names(self.inputs), names(self.outputs))
 
@@ -186,8 +185,8 @@ class System:
         xdot, y = self.ode(t, x, u, p)
         return ca.Function("jacobian", [t, x, u, p], [ca.jacobian(f, v) for f in (xdot, y) for v in (x, u)])
 
-    def _inputs(self, u: Mapping[str, float]) -> Array:
-        check_known("input", u, names(self.inputs))
+    def _input_vector(self, u: Mapping[str, float]) -> Array:
+        check_names("input", u, names(self.inputs))
         return np.array([u.get(q.name, 0.0) for q in self.inputs], dtype=float)
 
 
@@ -234,7 +233,7 @@ class DiscreteSystem:
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}")
         return replace(self, substeps=substeps)
 
-    def sample(self, t: ca.MX, h: ca.MX, x: ca.MX, u: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX]:
+    def advance_sample(self, t: ca.MX, h: ca.MX, x: ca.MX, u: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Advance symbolically by one whole sample of length h; returns (x_next, y at the sample)."""
         if self.update is not None:
             x = self.update(t, x, u, p)
@@ -251,8 +250,8 @@ def define(
     outputs: Sequence[Quantity],
     parameters: ParameterSet,
     rhs: Rhs,
-    start_finder: StartFinder | None = None,
-    rest_finder: RestFinder | None = None,
+    start_hook: StartHook | None = None,
+    rest_hook: RestHook | None = None,
 ) -> System:
     """Make a `System` from a right-hand side written with names.
 
@@ -262,8 +261,8 @@ def define(
     parameters : ParameterSet
     rhs : callable
         ``rhs(t, x, u, p) -> (xdot, y)``: t an SX, the others mappings from name to SX.
-    start_finder : StartFinder, optional
-    rest_finder : RestFinder, optional
+    start_hook : StartFinder, optional
+    rest_hook : RestFinder, optional
 
     Returns
     -------
@@ -275,15 +274,15 @@ def define(
         If the right-hand side leaves out a state's rate or an output, or if two signals of a kind share a name.
     """
     for kind, quantities in (("state", states), ("input", inputs), ("output", outputs)):
-        _check_distinct(kind, quantities)
+        _check_unique_names(kind, quantities)
     t = ca.SX.sym("t")
     x, u = symbols(states), symbols(inputs)
     p = {n: ca.SX.sym(n) for n in parameters}
     rates, measured = rhs(t, x, u, p)
-    xdot = _ordered("rate of state", rates, states)
-    y = _ordered("output", measured, outputs)
-    ode = ca.Function("ode", [t, *map(stacked, (x, u, p))], [xdot, y], ["t", "x", "u", "p"], ["xdot", "y"])
-    return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_finder, rest_finder)
+    xdot = _stack_in_order("rate of state", rates, states)
+    y = _stack_in_order("output", measured, outputs)
+    ode = ca.Function("ode", [t, *map(stack, (x, u, p))], [xdot, y], ["t", "x", "u", "p"], ["xdot", "y"])
+    return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_hook, rest_hook)
 
 
 def discretise(system: System, substeps: int = 1) -> DiscreteSystem:
@@ -319,7 +318,7 @@ def symbols(quantities: Sequence[Quantity]) -> dict[str, ca.SX]:
     return {q.name: ca.SX.sym(q.name) for q in quantities}
 
 
-def stacked(values: Symbols) -> ca.SX:
+def stack(values: Symbols) -> ca.SX:
     """The values of a mapping as one column, in order."""
     return ca.vertcat(*values.values()) if values else ca.SX(0, 1)
 
@@ -329,7 +328,7 @@ def names(quantities: Sequence[Quantity]) -> tuple[str, ...]:
     return tuple(q.name for q in quantities)
 
 
-def vector(order: ParameterSet, values: ParameterSet) -> Array:
+def parameter_vector(order: ParameterSet, values: ParameterSet) -> Array:
     """The numbers of `values` in the order of `order`; a missing one keeps the default of `order`."""
     return np.array([values.value(n) if n in values else order.value(n) for n in order], dtype=float)
 
@@ -343,21 +342,21 @@ def describe(system: System | DiscreteSystem) -> str:
     return "\n".join(lines)
 
 
-def _filled(measured: Trajectory, name: str) -> Array:
+def _interpolate_missing(measured: Trajectory, name: str) -> Array:
     """The channel with its missing samples interpolated; zeros where it was not logged."""
     column = measured[name] if name in measured else np.full(len(measured), np.nan)
     known = np.isfinite(column)
     return np.interp(measured.t, measured.t[known], column[known]) if known.any() else np.zeros(len(measured))
 
 
-def _check_distinct(kind: str, quantities: Sequence[Quantity]) -> None:
+def _check_unique_names(kind: str, quantities: Sequence[Quantity]) -> None:
     listed = names(quantities)
     twice = {n for n in listed if listed.count(n) > 1}
     require(not twice, f"{kind} {', '.join(map(repr, sorted(twice)))} is declared twice; rename one", ModelError)
 
 
-def _ordered(kind: str, values: Symbols, quantities: Sequence[Quantity]) -> ca.SX:
-    check_known(kind, values, names(quantities))
+def _stack_in_order(kind: str, values: Symbols, quantities: Sequence[Quantity]) -> ca.SX:
+    check_names(kind, values, names(quantities))
     for q in quantities:
         require(q.name in values, f"the right-hand side gives no {kind} {q.name!r}", ModelError)
     return ca.vertcat(*(values[q.name] for q in quantities)) if quantities else ca.SX(0, 1)

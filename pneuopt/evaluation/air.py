@@ -4,20 +4,19 @@ from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-NORMAL_DENSITY = 1.185  # [kg/m^3] of air as normal litres count it: ISO 8778 (ANR), 100 kPa, 20 degC, 65 %
-LITRES = 1e3  # in a cubic metre
+ANR_DENSITY = 1.185  # [kg/m^3] of air as normal litres count it: ISO 8778 (ANR), 100 kPa, 20 degC, 65 %
+LITRES_PER_CUBIC_METRE = 1e3  # in a cubic metre
 
 
-def metered(loop: ClosedLoop, x: ca.SX, u: ca.SX, p: ca.SX, control: ca.SX) -> ca.SX:
+def meter_outputs(loop: ClosedLoop, x: ca.SX, u: ca.SX, p: ca.SX, control: ca.SX) -> ca.SX:
     """The mass flow from the supply [kg/s] and the spool's position [half travels], of a loop's vectors.
 
     Raises
@@ -35,7 +34,7 @@ def metered(loop: ClosedLoop, x: ca.SX, u: ca.SX, p: ca.SX, control: ca.SX) -> c
     return ca.vertcat(ca.SX(flow), ca.SX(spool))
 
 
-def consumption(t: Array, flow: Array, spool: Array, start: float) -> dict[str, Array]:
+def air_consumption(t: Array, flow: Array, spool: Array, start: float) -> dict[str, Array]:
     """Air and travel of many responses on one grid.
 
     Parameters
@@ -67,10 +66,12 @@ def consumption(t: Array, flow: Array, spool: Array, start: float) -> dict[str, 
     kept = t >= start
     mass = np.trapezoid(flow[:, kept], t[kept], axis=1)
     travel = np.abs(np.diff(spool[:, kept], axis=1)).sum(axis=1)
-    return {"AirUse": LITRES / NORMAL_DENSITY * mass, "ValveTravel": travel}
+    return {"AirUse": LITRES_PER_CUBIC_METRE / ANR_DENSITY * mass, "ValveTravel": travel}
 
 
-def consumed(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory, start: float) -> Mapping[str, float]:
+def response_air_consumption(
+    loop: ClosedLoop, parameters: ParameterSet, response: Trajectory, start: float
+) -> Mapping[str, float]:
     """AirUse [l(ANR)] and ValveTravel [half travels] of one response; nothing of a plant without a meter.
 
     Parameters
@@ -85,9 +86,9 @@ def consumed(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory, s
     plant = loop.plant
     if plant.meter is None:
         return {}
-    p = loop.numbers(parameters)[[list(loop.parameters).index(n) for n in plant.parameters]]
+    p = loop.parameter_vector(parameters)[[list(loop.parameters).index(n) for n in plant.parameters]]
     given = {q.name: response[q.name] if q.name in response else np.zeros(len(response)) for q in plant.inputs}
     inputs = np.array([*(given | {loop.command.name: response["control"]}).values()])
     states = response.matrix(names(plant.states)).T
     flow, spool = (np.asarray(row) for row in plant.meter.map(len(response))(0, states, inputs, p))
-    return {n: float(value[0]) for n, value in consumption(response.t, flow, spool, start).items()}
+    return {n: float(value[0]) for n, value in air_consumption(response.t, flow, spool, start).items()}

@@ -8,16 +8,20 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.linear_loop import delayed, linear_gains
+from pneuopt.control.linear_loop import linear_gains, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.compiled.rollout import compiled
-from pneuopt.dynamics.system import Array, names
-from pneuopt.evaluation.margins import ComplexArray, controller_parts, solved
+from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.system import names
+from pneuopt.evaluation.margins import ComplexArray, batch_frequency_response, controller_parts
+from pneuopt.quantities.arrays import Array
 
-ZOOMS, ZOOMED = 3, 9  # grids about a coarse peak, each within two steps of the last, and their frequencies
+PEAK_REFINEMENTS, PEAK_GRID_POINTS = (
+    3,
+    9,
+)  # grids about a coarse peak, each within two steps of the last, and their frequencies
 
 
-def robustness(
+def batch_margin_function(
     loop: ClosedLoop, omega: ArrayLike
 ) -> Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]:
     """Margins and the like on a grid of frequencies, for many gains and operating points at once.
@@ -37,9 +41,9 @@ def robustness(
         interpolated, and "NoiseGain"; peaks refined between the grid's frequencies. What is impossible is not checked.
     """
     w = np.asarray(omega, dtype=float)
-    plants = _plants(loop, w)
+    plants = _plant_responses(loop, w)
 
-    def read(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
+    def read_margins(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
         Kp, Ki, Kd, Tf = linear_gains(loop, p.T).full()[..., None]
         plant = plants(p, x, commands)
 
@@ -49,18 +53,20 @@ def robustness(
 
         L, C = responses(w)
         with np.errstate(all="ignore"):
-            found = {n: crossing(L) for n, crossing in _CROSSINGS.items() if n in only}
-            found |= {n: _refined(size, responses, w, size(L, C)) for n, size in _PEAKS.items() if n in only}
+            found = {n: crossing(L) for n, crossing in _MARGIN_FUNCTIONS.items() if n in only}
+            found |= {
+                n: _refine_peaks(size, responses, w, size(L, C)) for n, size in _PEAK_FUNCTIONS.items() if n in only
+            }
         if "NoiseGain" in only:
             found["NoiseGain"] = np.maximum(found["NoiseGain"], np.abs(Kp + Kd / Tf)[:, 0])
         if "MaxSensitivity" in only:  # at infinity the loop is open
             found["MaxSensitivity"] = np.maximum(found["MaxSensitivity"], 1.0)
         return found
 
-    return read
+    return read_margins
 
 
-def _refined(
+def _refine_peaks(
     size: Callable[[ComplexArray, ComplexArray], Array],
     responses: Callable[[Array], tuple[ComplexArray, ComplexArray]],
     omega: Array,
@@ -73,17 +79,20 @@ def _refined(
     k = np.argpartition(np.where(is_peak, -on_grid, 0.0), 1, axis=1)[:, :2]
     low, high = np.log(omega[np.maximum(k - 1, 0)]), np.log(omega[np.minimum(k + 1, last)])
     largest, rows = on_grid.max(axis=1), np.arange(m)
-    for _ in range(ZOOMS):
-        grids = low[..., None] + (high - low)[..., None] * np.linspace(0.0, 1.0, ZOOMED)
+    for _ in range(PEAK_REFINEMENTS):
+        grids = low[..., None] + (high - low)[..., None] * np.linspace(0.0, 1.0, PEAK_GRID_POINTS)
         sizes = size(*responses(np.exp(grids.reshape(m, -1)))).reshape(grids.shape)
         peak, at = sizes.max(axis=2).argmax(axis=1), sizes.argmax(axis=2)
         largest = np.fmax(largest, sizes.max(axis=(1, 2)))
         chosen, at = grids[rows, peak], at[rows, peak]
-        low, high = chosen[rows, np.maximum(at - 1, 0), None], chosen[rows, np.minimum(at + 1, ZOOMED - 1), None]
+        low, high = (
+            chosen[rows, np.maximum(at - 1, 0), None],
+            chosen[rows, np.minimum(at + 1, PEAK_GRID_POINTS - 1), None],
+        )
     return np.asarray(largest)
 
 
-def _plants(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], Callable[[Array], ComplexArray]]:
+def _plant_responses(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], Callable[[Array], ComplexArray]]:
     """Responses of the plant with sensor and hold at frequencies of shape (n,) or (m, n); `w` are typical ones."""
     plant = loop.plant
     x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
@@ -93,36 +102,36 @@ def _plants(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], Calla
     inward, outward = ca.diag(1 / scale), ca.diag(scale)
     A, B = (inward @ ca.jacobian(xdot, v) for v in (x, u[command]))
     C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
-    matrices = compiled(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
+    matrices = compile_function(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
     n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
     shapes, own = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
 
-    def linearised(p: Array, x: Array, commands: Array) -> Callable[[Array], ComplexArray]:
+    def linearise(p: Array, x: Array, commands: Array) -> Callable[[Array], ComplexArray]:
         us = np.zeros((len(p), u.numel()))
         us[:, command] = commands
         found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
         A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
-        plant, lag = _responses(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
-        return lambda w: np.asarray((plant(w) + D) * delayed(w, loop.dead_time) / (1 + 1j * w * lag))
+        plant, lag = _partial_fraction_response(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
+        return lambda w: np.asarray((plant(w) + D) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
 
-    return linearised
+    return linearise
 
 
 def _gain_margins(L: ComplexArray) -> Array:
     """Crossings of -180 deg are interpolated in phase and logarithm of gain."""
     phase, gain = np.angle(-L), np.log(np.abs(L))
-    at, crossing = _interpolated(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
-    return np.asarray(np.exp(_smallest(np.where(crossing, -at, inf))))
+    at, crossing = _interpolate_crossings(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
+    return np.asarray(np.exp(_smallest_in_rows(np.where(crossing, -at, inf))))
 
 
 def _phase_margins(L: ComplexArray) -> Array:
     """Crossings of gain one, likewise."""
     phase, gain = np.unwrap(np.angle(-L), axis=1), np.log(np.abs(L))
-    at, crossing = _interpolated(gain, phase)
-    return np.degrees(_smallest(np.where(crossing, (at + np.pi) % (2 * np.pi) - np.pi, inf)))
+    at, crossing = _interpolate_crossings(gain, phase)
+    return np.degrees(_smallest_in_rows(np.where(crossing, (at + np.pi) % (2 * np.pi) - np.pi, inf)))
 
 
-def _interpolated(values: Array, others: Array, allowed: Any = True) -> tuple[Array, NDArray[np.bool_]]:
+def _interpolate_crossings(values: Array, others: Array, allowed: Any = True) -> tuple[Array, NDArray[np.bool_]]:
     """The others where the values cross zero, linear between neighbours, and whether they do."""
     step = np.diff(values, axis=1)
     crossing = (values[:, :-1] * values[:, 1:] <= 0) & (step != 0) & allowed
@@ -130,20 +139,23 @@ def _interpolated(values: Array, others: Array, allowed: Any = True) -> tuple[Ar
     return others[:, :-1] + share * np.diff(others, axis=1), crossing
 
 
-def _smallest(rows: Array) -> Array:
+def _smallest_in_rows(rows: Array) -> Array:
     """The entry of each row that is smallest in size."""
     return np.asarray(rows[np.arange(len(rows)), np.argmin(np.abs(rows), axis=1)])
 
 
-_CROSSINGS: dict[str, Callable[[ComplexArray], Array]] = {"GainMargin": _gain_margins, "PhaseMargin": _phase_margins}
-_PEAKS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
+_MARGIN_FUNCTIONS: dict[str, Callable[[ComplexArray], Array]] = {
+    "GainMargin": _gain_margins,
+    "PhaseMargin": _phase_margins,
+}
+_PEAK_FUNCTIONS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
     "MaxSensitivity": lambda L, _: 1 / np.abs(1 + L),
     "MaxComplementarySensitivity": lambda L, _: np.abs(L / (1 + L)),
     "NoiseGain": lambda L, C: np.abs(C / (1 + L)),
 }
 
 
-def _responses(A: Array, B: Array, C: Array, typical: Array) -> Callable[[Array], ComplexArray]:
+def _partial_fraction_response(A: Array, B: Array, C: Array, typical: Array) -> Callable[[Array], ComplexArray]:
     """``C (jw I - A)^-1 B`` of m systems by partial fractions, shape (m, n); solved where those are inexact.
 
     At frequencies of shape (n,), the same for all, or (m, n).
@@ -152,19 +164,19 @@ def _responses(A: Array, B: Array, C: Array, typical: Array) -> Callable[[Array]
         poles, V = np.linalg.eig(A)
         parts = (C[:, None] @ V)[:, 0] * np.linalg.solve(V, B[..., None].astype(complex))[..., 0]
     except np.linalg.LinAlgError:
-        return lambda w: solved(A, B, C, w)
+        return lambda w: batch_frequency_response(A, B, C, w)
 
-    def summed(w: Array) -> ComplexArray:
+    def sum_fractions(w: Array) -> ComplexArray:
         return np.asarray((parts[:, None] / (1j * w[..., None] - poles[:, None])).sum(axis=-1))
 
     probe = typical[[0, len(typical) // 2, len(typical) - 1]]
     with np.errstate(all="ignore"):  # a response of zero, a closed valve's, is solved for
-        bad = ~(np.abs(summed(probe) / solved(A, B, C, probe) - 1) < 1e-6).all(axis=1)
+        bad = ~(np.abs(sum_fractions(probe) / batch_frequency_response(A, B, C, probe) - 1) < 1e-6).all(axis=1)
 
-    def found(w: Array) -> ComplexArray:
-        sums = summed(w)
+    def response(w: Array) -> ComplexArray:
+        sums = sum_fractions(w)
         if bad.any():
-            sums[bad] = solved(A[bad], B[bad], C[bad], np.broadcast_to(w, sums.shape)[bad])
+            sums[bad] = batch_frequency_response(A[bad], B[bad], C[bad], np.broadcast_to(w, sums.shape)[bad])
         return sums
 
-    return found
+    return response

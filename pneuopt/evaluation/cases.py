@@ -4,20 +4,18 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.scenarios import Factor, Scenarios, applied
-from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_known, require
+from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.space import Space
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class TuningCase:
     """One reference on one plant.
 
     Parameters
@@ -38,11 +36,11 @@ class Case:
         """How a table heads it: "0 to 0.2 [load.mass high]"."""
         return f"{self.reference.label} [{self.scenario}]" if self.scenario else self.reference.label
 
-    def filled(self, parameters: ParameterSet) -> ParameterSet:
+    def case_parameters(self, parameters: ParameterSet) -> ParameterSet:
         """The parameters of this case's plant, and gains."""
-        return applied(parameters, self.values)
+        return apply_scenario(parameters, self.values)
 
-    def rows(self, p: Array, order: Sequence[str]) -> Array:
+    def case_vectors(self, p: Array, order: Sequence[str]) -> Array:
         """The same on vectors of every parameter, shape (m, n_parameters), by copy."""
         out = p.copy()
         for n, value in self.values.items():
@@ -63,31 +61,31 @@ class Case:
         InputError, ConvergenceError
             As `ClosedLoop.initial`; the message names the scenario.
         """
-        own, step = self.filled(parameters), self.reference
+        own, step = self.case_parameters(parameters), self.reference
         try:
             return loop.initial(own, reference=step.initial, start=step.start)
         except ConvergenceError as error:
-            raise ConvergenceError(f"{self._lead}{error}", error.solution) from None
+            raise ConvergenceError(f"{self._message_prefix}{error}", error.solution) from None
         except HardwareError as error:
-            raise HardwareError(f"{self._lead}{error}", error.parameter, error.remedy) from None
+            raise HardwareError(f"{self._message_prefix}{error}", error.parameter, error.remedy) from None
         except InputError as error:
-            raise InputError(f"{self._lead}{error}") from None
+            raise InputError(f"{self._message_prefix}{error}") from None
 
-    def rest(self, loop: ClosedLoop, space: Space) -> Array | None:
+    def gain_independent_rest(self, loop: ClosedLoop, space: Space) -> Array | None:
         """The state before the step where it does not depend on the gains."""
-        other = space.draw(np.full(len(space.names), 0.7))
-        first, second = (self.initial(loop, space.filled(point)) for point in (space.start, other))
+        other = space.from_unit(np.full(len(space.names), 0.7))
+        first, second = (self.initial(loop, space.parameters_at(point)) for point in (space.start, other))
         scale = np.array([q.nominal for q in loop.states])
         return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
 
     @property
-    def _lead(self) -> str:
+    def _message_prefix(self) -> str:
         return f"scenario {self.scenario!r}: " if self.scenario else ""
 
 
 def cases(
     references: Sequence[Step], scenarios: Scenarios, parameters: ParameterSet, tuned: Collection[str] = ()
-) -> tuple[Case, ...]:
+) -> tuple[TuningCase, ...]:
     """Every reference on the nominal plant, then on each scenario's.
 
     Parameters
@@ -109,13 +107,15 @@ def cases(
     require(not twice, f"two references are {twice!r}, and tables tell them by that; leave one out")
     for name, values in scenarios.items():
         require(bool(name), "a scenario needs a name: {'heavy load': {'load.mass': 8.0}}")
-        _check(name, values, parameters, tuned)
-    nominal = [Case(r) for r in references]
-    return (*nominal, *(Case(r, name, values) for name, values in scenarios.items() for r in references))
+        _check_scenario(name, values, parameters, tuned)
+    nominal = [TuningCase(r) for r in references]
+    return (*nominal, *(TuningCase(r, name, values) for name, values in scenarios.items() for r in references))
 
 
-def _check(name: str, values: Mapping[str, float | Factor], parameters: ParameterSet, tuned: Collection[str]) -> None:
-    check_known("parameter", values, parameters, f"scenario {name!r}")
+def _check_scenario(
+    name: str, values: Mapping[str, float | Factor], parameters: ParameterSet, tuned: Collection[str]
+) -> None:
+    check_names("parameter", values, parameters, f"scenario {name!r}")
     for n, value in values.items():
         require(
             isinstance(value, Factor) or n not in tuned,

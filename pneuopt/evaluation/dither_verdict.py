@@ -22,9 +22,11 @@ from pneuopt.tuning.space import command_range
 if TYPE_CHECKING:
     import pandas as pd
 
-AMPLITUDE, OFFSET, FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
-NEXT_TO_NONE = 1e-9  # of the amplitude is none, but averages and end values are read over the same periods
-STICKS = 0.5  # of the static friction: a force below half of it frees nothing in company of a working pressure
+DITHER_AMPLITUDE, DITHER_OFFSET, DITHER_FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
+NEGLIGIBLE_AMPLITUDE = 1e-9  # of the amplitude is none, but averages and end values are read over the same periods
+MIN_LOOSENING_FORCE = (
+    0.5  # of the static friction: a force below half of it frees nothing in company of a working pressure
+)
 
 
 class Usefulness(Enum):
@@ -35,22 +37,22 @@ class Usefulness(Enum):
     HARMFUL = "harmful"
 
 
-class Judged(NamedTuple):
+class Criterion(NamedTuple):
     """A metric by which dithers are judged: what it is called, by how much it has to change, of what."""
 
-    words: str
-    least: float
+    label: str
+    min_change: float
     relative: bool
 
 
-CRITERIA: Mapping[str, Judged] = {  # the first that changes decides, where some improve and some do not
-    "LimitCycleAmplitude": Judged("limit cycle", 0.02, relative=False),  # of the step
-    "SettlingTime": Judged("settling time", 0.05, relative=True),
-    "SteadyStateError": Judged("error that stays", 0.5, relative=False),  # [%]
-    "IAE": Judged("integral of the error", 0.05, relative=True),
-    "Overshoot": Judged("overshoot", 1.0, relative=False),  # [%]
+CRITERIA: Mapping[str, Criterion] = {  # the first that changes decides, where some improve and some do not
+    "LimitCycleAmplitude": Criterion("limit cycle", 0.02, relative=False),  # of the step
+    "SettlingTime": Criterion("settling time", 0.05, relative=True),
+    "SteadyStateError": Criterion("error that stays", 0.5, relative=False),  # [%]
+    "IAE": Criterion("integral of the error", 0.05, relative=True),
+    "Overshoot": Criterion("overshoot", 1.0, relative=False),  # [%]
 }
-PRICE = {"Ripple": "ripple", "AirUse": "air", "ValveTravel": "valve travel", "PeakControl": "largest command"}
+PRICE_METRICS = {"Ripple": "ripple", "AirUse": "air", "ValveTravel": "valve travel", "PeakControl": "largest command"}
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class DitherEffect:
         [command's unit], [Hz]
     spool : float
         The spool's swing [half travels].
-    passed : float
+    valve_gain : float
         What the valve's lag leaves of it [1].
     force : float
         Amplitude of the force on a piston held fast at rest [N].
@@ -76,7 +78,7 @@ class DitherEffect:
     amplitude: float
     frequency: float
     spool: float = nan
-    passed: float = nan
+    valve_gain: float = nan
     force: float = nan
     speed: float = nan
     travel: float = nan
@@ -95,7 +97,7 @@ class DitherVerdict:
     table : DataFrame
         A row a metric of `evaluate`, columns "without" and "with": the worst over the references.
     effect : DitherEffect
-    rival : str
+    baseline : str
         What "without" is: the same gains, or a design of its own.
     unit : str
         The command's.
@@ -105,12 +107,12 @@ class DitherVerdict:
     reasons: tuple[str, ...]
     table: "pd.DataFrame"
     effect: DitherEffect
-    rival: str
+    baseline: str
     unit: str
 
     def __str__(self) -> str:
         dither = f"the dither of {self.effect.amplitude:.4g} {self.unit} at {self.effect.frequency:.4g} Hz"
-        head = f"{dither} is {self.usefulness.value}, against {self.rival}"
+        head = f"{dither} is {self.usefulness.value}, against {self.baseline}"
         return "\n".join([head, *(f"  {reason}" for reason in self.reasons)])
 
 
@@ -155,19 +157,27 @@ def judge_dither(
     steps = [references] if isinstance(references, Step) else list(references)
     full = loop.parameters | parameters
     require(loop.dither is not None, "there is no dither to judge: ClosedLoop(plant, pid, Dither())")
-    require(full.value(AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")
+    require(full.value(DITHER_AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")
     plain = full if without is None else full | without
-    plain = plain.with_bounds({AMPLITUDE: (0.0, plain[AMPLITUDE].upper)})
-    plain = plain.with_values({AMPLITUDE: NEXT_TO_NONE * full.value(AMPLITUDE), FREQUENCY: full.value(FREQUENCY)})
-    table = _compared(loop, steps, plain, full, band)
+    plain = plain.with_bounds({DITHER_AMPLITUDE: (0.0, plain[DITHER_AMPLITUDE].upper)})
+    plain = plain.with_values(
+        {
+            DITHER_AMPLITUDE: NEGLIGIBLE_AMPLITUDE * full.value(DITHER_AMPLITUDE),
+            DITHER_FREQUENCY: full.value(DITHER_FREQUENCY),
+        }
+    )
+    table = _compare_designs(loop, steps, plain, full, band)
     effect = dither_effect(loop, steps[0], full)
     sizes = [abs(s.size) for s in steps]
     own = float(table["with"]["Ripple"]) if isnan(effect.speed) else 2 * effect.speed
-    coarse = [f"worse: it swings {loop.feedback.name} by {_small(own, loop.feedback.unit)}, more than the step itself"]
+    size = _format_with_prefix(own, loop.feedback.unit)
+    coarse = [f"worse: it swings {loop.feedback.name} by {size}, more than the step itself"]
     coarse = coarse if own > min(sizes) else []
-    usefulness, found = _judged(table, max(sizes), loop, coarse)
+    usefulness, found = _weigh_changes(table, max(sizes), loop, coarse)
     rival = "the same gains without it" if without is None else "a design of its own without it"
-    return DitherVerdict(usefulness, (*found, *explained(loop, effect, full)), table, effect, rival, loop.command.unit)
+    return DitherVerdict(
+        usefulness, (*found, *explain_effect(loop, effect, full)), table, effect, rival, loop.command.unit
+    )
 
 
 def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> DitherEffect:
@@ -182,15 +192,15 @@ def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -
         With the dither's amplitude and frequency.
     """
     full = loop.parameters | parameters
-    found = DitherEffect(full.value(AMPLITUDE), full.value(FREQUENCY))
-    moving = _swing(loop, loop.plant, full, _rest(loop.plant, full, {"speed": reference.final}))
+    found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, {"speed": reference.final}))
     if "speed" in moving:
         speed = abs(moving["speed"])
         found = replace(found, speed=speed, travel=speed / (2 * pi * found.frequency))
     if not {"pressure_a", "pressure_b", "speed"} <= set(names(loop.plant.states)) or "valve.span" not in full:
         return found
-    rest = _rest(loop.plant, full, {"speed": reference.initial, **reference.start})
-    held = _swing(loop, _held_fast(loop.plant), full, rest)
+    rest = _try_rest(loop.plant, full, {"speed": reference.initial, **reference.start})
+    held = _state_harmonics(loop, _clamp_piston(loop.plant), full, rest)
     if rest is None or not held:
         return found
     command = found.amplitude / full.value("valve.span")
@@ -202,10 +212,10 @@ def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -
     block = linear.A[np.ix_(kept, kept)]
     block[0, 0] = 0.0  # without friction
     rate = float(np.abs(np.linalg.eigvals(block)).max())
-    return replace(found, spool=spool, passed=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
+    return replace(found, spool=spool, valve_gain=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
 
 
-def explained(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
+def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
     """Why a dither does what it does, against valve, dead zone and stiction; a sentence each.
 
     Parameters
@@ -215,27 +225,29 @@ def explained(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) 
     parameters : ParameterSet
     """
     p, e, told = (loop.parameters | parameters), effect, list[str]()
-    told += _clipped(loop, p)
-    if not isnan(e.passed):
+    told += _describe_clipping(loop, p)
+    if not isnan(e.valve_gain):
         dead = p.value("valve.dead_zone")
         lag = f" at {p.value('valve.bandwidth'):.3g} Hz bandwidth" if "valve.bandwidth" in p else ""
         zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
-        follows = f"the spool follows {100 * e.passed:.0f} % of it{lag}"
+        follows = f"the spool follows {100 * e.valve_gain:.0f} % of it{lag}"
         told.append(f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}")
     static = next((p.value(f"friction.{n}") for n in ("static", "coulomb") if f"friction.{n}" in p), nan)
     if not isnan(e.force):
         against = "" if isnan(static) else f" against a static friction of {static:.3g} N"
-        weak = ": it does not loosen it" if e.force < STICKS * static else ""
-        told.append(f"on a piston at rest it makes +-{_small(e.force, 'N')}{against}{weak}")
+        weak = ": it does not loosen it" if e.force < MIN_LOOSENING_FORCE * static else ""
+        told.append(f"on a piston at rest it makes +-{_format_with_prefix(e.force, 'N')}{against}{weak}")
     if not isnan(e.speed):
-        told.append(f"a moving one swings by +-{_small(e.speed, 'm/s')} and +-{_small(e.travel, 'm')}")
+        told.append(
+            f"a moving one swings by +-{_format_with_prefix(e.speed, 'm/s')} and +-{_format_with_prefix(e.travel, 'm')}"
+        )
     if not isnan(e.drive_frequency):
         ratio = e.frequency / e.drive_frequency
         told.append(f"its {e.frequency:.3g} Hz are {ratio:.2g} times the {e.drive_frequency:.3g} Hz of load on air")
     return tuple(told)
 
 
-def _compared(
+def _compare_designs(
     loop: ClosedLoop, steps: Sequence[Step], plain: ParameterSet, full: ParameterSet, band: float
 ) -> "pd.DataFrame":
     """The worst over the references; a settling time that is never is infinite."""
@@ -249,7 +261,7 @@ def _compared(
     return pd.DataFrame(columns)
 
 
-def _judged(
+def _weigh_changes(
     table: "pd.DataFrame", size: float, loop: ClosedLoop, told: list[str]
 ) -> tuple[Usefulness, tuple[str, ...]]:
     """The verdict, and what it stands on, from what is told already: against it."""
@@ -260,36 +272,38 @@ def _judged(
         if before == after or not (abs(after - before) > room or isfinite(before) != isfinite(after)):
             continue
         signs.append(1 if after < before else -1)
-        change = f"{words} {_value(metric, before, unit)} without, {_value(metric, after, unit)} with it"
+        change = (
+            f"{words} {_format_metric(metric, before, unit)} without, {_format_metric(metric, after, unit)} with it"
+        )
         told.append(f"{'better' if after < before else 'worse'}: {change}")
     if not signs:
         kept = ("SettlingTime", "SteadyStateError")
-        figures = [f"{CRITERIA[m].words} {_value(m, float(table['with'][m]), unit)}" for m in kept]
+        figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), unit)}" for m in kept]
         told.append(f"nothing changes: {', '.join(figures)}")
-    told.append("price: " + ", ".join(_priced(n, table, unit) for n in PRICE if n in table.index))
+    told.append("price: " + ", ".join(_price_clause(n, table, unit) for n in PRICE_METRICS if n in table.index))
     verdict = Usefulness.USELESS if not signs else Usefulness.USEFUL if signs[0] > 0 else Usefulness.HARMFUL
     return verdict, tuple(told)
 
 
-def _priced(metric: str, table: "pd.DataFrame", unit: str) -> str:
-    before, after = (_value(metric, float(table[c][metric]), unit) for c in ("without", "with"))
-    return f"{PRICE[metric]} {after} (without {before})"
+def _price_clause(metric: str, table: "pd.DataFrame", unit: str) -> str:
+    before, after = (_format_metric(metric, float(table[c][metric]), unit) for c in ("without", "with"))
+    return f"{PRICE_METRICS[metric]} {after} (without {before})"
 
 
-_UNITS = {"SettlingTime": "s", "IAE": "s", "SteadyStateError": "%", "Overshoot": "%", "AirUse": "l(ANR)"}
+_METRIC_UNITS = {"SettlingTime": "s", "IAE": "s", "SteadyStateError": "%", "Overshoot": "%", "AirUse": "l(ANR)"}
 
 
-def _value(metric: str, value: float, unit: str) -> str:
+def _format_metric(metric: str, value: float, unit: str) -> str:
     if metric == "SettlingTime" and value == inf:
         return "never"
     if metric == "LimitCycleAmplitude" and value == 0:
         return "none"
     if metric in ("Ripple", "LimitCycleAmplitude"):
-        return _small(value, unit)
-    return f"{value:.3g} {_UNITS.get(metric, '')}".rstrip()
+        return _format_with_prefix(value, unit)
+    return f"{value:.3g} {_METRIC_UNITS.get(metric, '')}".rstrip()
 
 
-def _small(value: float, unit: str) -> str:
+def _format_with_prefix(value: float, unit: str) -> str:
     """With a prefix that leaves no row of zeros.
 
     Examples
@@ -303,10 +317,10 @@ def _small(value: float, unit: str) -> str:
     return f"{value * factor:.2g} {prefix}{unit}"
 
 
-def _clipped(loop: ClosedLoop, p: ParameterSet) -> list[str]:
+def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
     """Where offset and amplitude alone run into the command's limits, or the valve's."""
     low, high, whose = command_range(p)
-    least, most = (p.value(OFFSET) + side * p.value(AMPLITUDE) for side in (-1, 1))
+    least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
     if low <= least and most <= high:
         return []
     unit = loop.command.unit
@@ -316,17 +330,17 @@ def _clipped(loop: ClosedLoop, p: ParameterSet) -> list[str]:
     ]
 
 
-def _rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Rest | None:
+def _try_rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Rest | None:
     """Where the plant stands or moves so; None where it cannot."""
-    if plant.rest_finder is None:
+    if plant.rest_hook is None:
         return None
     try:
-        return plant.rest_finder(p, known)
+        return plant.rest_hook(p, known)
     except (InputError, ConvergenceError):
         return None
 
 
-def _swing(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Rest | None) -> dict[str, complex]:
+def _state_harmonics(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Rest | None) -> dict[str, complex]:
     """The first harmonics about a rest; empty where none is found."""
     assert loop.dither is not None
     at = None if rest is None else {**rest.states, **rest.inputs}
@@ -336,7 +350,7 @@ def _swing(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Rest | None) 
         return {}
 
 
-def _held_fast(plant: System) -> System:
+def _clamp_piston(plant: System) -> System:
     """The plant with its piston clamped: what moves it has no rate."""
     t, x, u, p = (ca.SX.sym(n, plant.ode.size1_in(k)) for k, n in enumerate("txup"))
     xdot, y = plant.ode(t, x, u, p)

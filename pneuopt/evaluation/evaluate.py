@@ -7,30 +7,30 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.control.disturbance import disturbed
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import Array
-from pneuopt.evaluation.air import consumed
-from pneuopt.evaluation.cases import Case, cases
-from pneuopt.evaluation.limit_cycle import LEAST, SETTLED, find_limit_cycle
+from pneuopt.evaluation.air import response_air_consumption
+from pneuopt.evaluation.cases import TuningCase, cases
+from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
 from pneuopt.evaluation.margins import margins, noise_gain
 from pneuopt.evaluation.means import period_mean
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.rig import Rig, record
-from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.space import cut, inputs, measure, readings, spacing
+from pneuopt.tuning.space import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
 
 if TYPE_CHECKING:
     import pandas as pd
 
-HUNTING = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
-FINE = 4  # points of the record a reading of the search's
+LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
+POINTS_PER_READING = 4  # points of the record a reading of the search's
 
 
 def evaluate(
@@ -38,7 +38,7 @@ def evaluate(
     references: Step | Sequence[Step],
     parameters: ParameterSet,
     *,
-    scenarios: Scenarios = NOMINAL,
+    scenarios: Scenarios = NO_SCENARIOS,
     band: float = 0.02,
     envelope: Envelope = (),
 ) -> "pd.DataFrame":
@@ -102,10 +102,10 @@ def evaluate(
     import pandas as pd
 
     steps = [references] if isinstance(references, Step) else list(references)
-    loop = _disturbed(loop, steps)
-    full = _inner(loop).parameters | parameters
+    loop = _with_disturbances(loop, steps)
+    full = _require_closed_loop(loop).parameters | parameters
     every = cases(steps, scenarios, full)
-    return pd.DataFrame({case.label: _certified(loop, case, full, band, envelope) for case in every})
+    return pd.DataFrame({case.label: _evaluate_case(loop, case, full, band, envelope) for case in every})
 
 
 def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
@@ -122,32 +122,34 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     Trajectory
         Of a loop states and outputs, simulated tightly, on a grid finer than the search's; of a rig the truth.
     """
-    loop = _disturbed(loop, [reference])
-    inner = _inner(loop)
-    run = inputs(inner, reference, spacing(inner, reference, parameters))
+    loop = _with_disturbances(loop, [reference])
+    inner = _require_closed_loop(loop)
+    run = loop_inputs(inner, reference, sample_spacing(inner, reference, parameters))
     start = inner.initial(parameters, reference=reference.initial, start=reference.start)
     if isinstance(loop, Rig):
         return record(loop, run, parameters, initial=start).truth
-    fine = np.linspace(run.t[0], run.t[-1], FINE * readings(inner, reference) * (len(run) - 1) + 1)
+    fine = np.linspace(
+        run.t[0], run.t[-1], POINTS_PER_READING * readings_a_sample(inner, reference) * (len(run) - 1) + 1
+    )
     return simulate(inner, run, parameters, initial=start, t_out=fine)
 
 
-def _certified(
-    loop: ClosedLoop | Rig, case: Case, parameters: ParameterSet, band: float, envelope: Envelope
+def _evaluate_case(
+    loop: ClosedLoop | Rig, case: TuningCase, parameters: ParameterSet, band: float, envelope: Envelope
 ) -> dict[str, float]:
-    inner, parameters = _inner(loop), case.filled(parameters)
+    inner, parameters = _require_closed_loop(loop), case.case_parameters(parameters)
     response = respond(loop, case.reference, parameters)
     metrics = measure(inner, parameters, case.reference, response, band, envelope)
-    metrics |= hunting(inner, parameters, case.reference, response)
-    metrics |= consumed(inner, parameters, response, case.reference.at)
+    metrics |= limit_cycle_metrics(inner, parameters, case.reference, response)
+    metrics |= response_air_consumption(inner, parameters, response, case.reference.at)
     if isinstance(loop, Rig):
         return metrics
-    x, command = point_of_operation(inner, parameters, response)
+    x, command = final_operating_point(inner, parameters, response)
     metrics |= friction_slope(inner, parameters, x, command)
-    return metrics | _margins(inner, parameters, x, command, case.reference)
+    return metrics | _margin_metrics(inner, parameters, x, command, case.reference)
 
 
-def point_of_operation(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory) -> tuple[Array, float]:
+def final_operating_point(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory) -> tuple[Array, float]:
     """The plant's state, shape (n_plant_states,), and the command in which a response ends.
 
     Under dither they are means over its last period: at an instant they depend on the dither's phase.
@@ -161,7 +163,9 @@ def point_of_operation(loop: ClosedLoop, parameters: ParameterSet, response: Tra
     return ends[:-1], float(ends[-1])
 
 
-def hunting(loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory) -> dict[str, float]:
+def limit_cycle_metrics(
+    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
+) -> dict[str, float]:
     """The limit cycle in what follows the transient, for which the step's first 40 % are taken; amplitude 0: none.
 
     Returns
@@ -170,11 +174,11 @@ def hunting(loop: ClosedLoop, parameters: ParameterSet, reference: Step, respons
         LimitCycleAmplitude [measured unit], LimitCycleFrequency [Hz] and StickShare, the share of time at a standstill.
     """
     signal, period = response[loop.feedback.name], loop.dither_period(parameters)
-    start = reference.at + SETTLED * (response.t[-1] - reference.at)
-    least = LEAST * abs(reference.whole)
-    found = find_limit_cycle(response.t, signal, start=start, dither_period=period, least=least)
+    start = reference.at + TRANSIENT_SHARE * (response.t[-1] - reference.at)
+    least = MIN_RELATIVE_AMPLITUDE * abs(reference.nominal_size)
+    found = find_limit_cycle(response.t, signal, start=start, dither_period=period, min_amplitude=least)
     values = (found.amplitude, found.frequency, found.stick_share) if found else (0.0, nan, 0.0)
-    return dict(zip(HUNTING, values, strict=True))
+    return dict(zip(LIMIT_CYCLE_METRICS, values, strict=True))
 
 
 def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> dict[str, float]:
@@ -193,10 +197,12 @@ def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command
     return {"FrictionSlope": float(-full.value("load.mass") * (A[v, v] - followed))}
 
 
-def _margins(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step) -> dict[str, float]:
-    open_loop = cut(loop, parameters, x, command, reference)
+def _margin_metrics(
+    loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step
+) -> dict[str, float]:
+    open_loop = linearise_open_loop(loop, parameters, x, command, reference)
     robust = margins(open_loop)
-    Kp, Ki, Kd, Tf = linear_gains(loop, loop.numbers(parameters)).full().ravel().tolist()
+    Kp, Ki, Kd, Tf = linear_gains(loop, loop.parameter_vector(parameters)).full().ravel().tolist()
     found = {
         "MaxSensitivity": robust.max_sensitivity,
         "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
@@ -207,12 +213,12 @@ def _margins(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: floa
     return found if robust.stable else {n: nan if n.endswith("Margin") else inf for n in found}
 
 
-def _disturbed(loop: ClosedLoop | Rig, references: Sequence[Step]) -> ClosedLoop | Rig:
-    inner = disturbed(_inner(loop), references)
+def _with_disturbances(loop: ClosedLoop | Rig, references: Sequence[Step]) -> ClosedLoop | Rig:
+    inner = add_disturbances(_require_closed_loop(loop), references)
     return replace(loop, model=inner) if isinstance(loop, Rig) else inner
 
 
-def _inner(loop: ClosedLoop | Rig) -> ClosedLoop:
+def _require_closed_loop(loop: ClosedLoop | Rig) -> ClosedLoop:
     inner = loop.model if isinstance(loop, Rig) else loop
     if not isinstance(inner, ClosedLoop):
         raise ModelError("this rig is a plant alone, which follows no reference; give it a ClosedLoop")

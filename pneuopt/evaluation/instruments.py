@@ -32,7 +32,7 @@ class Sensor:
             require(0 <= value < inf, f"Sensor: {name} must not be negative, got {value:g}; 0 is none")
 
     @property
-    def spread(self) -> float:
+    def standard_deviation(self) -> float:
         """Standard deviation of noise and rounding together, the rounding taken as uniform [unit of the channel].
 
         Examples
@@ -69,7 +69,7 @@ class Actuator:
             value = getattr(self, name)
             require(0 <= value < inf, f"Actuator: {name} must not be negative, got {value:g}; 0 is none")
 
-    def follow(self, command: float, before: float) -> float:
+    def apply_hysteresis(self, command: float, before: float) -> float:
         """The play operator: where the spool goes from `before` [unit of the command].
 
         Examples
@@ -81,6 +81,6 @@ class Actuator:
         half = self.hysteresis / 2
         return min(max(before, command - half), command + half)
 
-    def passed(self, value: float) -> float:
+    def apply_dead_zone(self, value: float) -> float:
         """What is left beyond the dead zone [unit of the command]."""
         return value - min(max(value, -self.dead_zone), self.dead_zone)

@@ -9,22 +9,25 @@ from itertools import pairwise
 from math import log
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pneuopt.evaluation.means import period_mean
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
-Array = NDArray[np.float64]
-SETTLED = 0.4  # share of a record that is left out for the transient, unless a start is given
-CYCLES = 3  # at least, in what is looked at
-REPEATS = 0.5  # least autocorrelation a period later: noise as strong as the cycle is allowed
-IRREGULAR = 0.35  # most relative spread of the periods; filtered noise has more
-SMOOTHER = 8  # parts of the period over which noise is averaged before zeros are looked for
-SWITCH = 0.3  # hysteresis of the crossings, in standard deviations
-KEEPS, DIES = log(0.98), log(0.8)  # growth per period: surely below the first, or just below the second, it dies out
-LEAST = 0.01  # of the record's range: a smaller amplitude is none
-STILL = 0.02  # of the largest size in sight: a speed below it is a standstill
-PHASES = 64
+TRANSIENT_SHARE = 0.4  # share of a record that is left out for the transient, unless a start is given
+MIN_CYCLES = 3  # at least, in what is looked at
+MIN_AUTOCORRELATION = 0.5  # least autocorrelation a period later: noise as strong as the cycle is allowed
+MAX_PERIOD_SPREAD = 0.35  # most relative spread of the periods; filtered noise has more
+WINDOWS_PER_PERIOD = 8  # parts of the period over which noise is averaged before zeros are looked for
+CROSSING_HYSTERESIS = 0.3  # hysteresis of the crossings, in standard deviations
+MIN_SUSTAINED_GROWTH, MAX_DECAY_GROWTH = (
+    log(0.98),
+    log(0.8),
+)  # growth per period: surely below the first, or just below the second, it dies out
+MIN_RELATIVE_AMPLITUDE = 0.01  # of the record's range: a smaller amplitude is none
+STANDSTILL_FRACTION = 0.02  # of the largest size in sight: a speed below it is a standstill
+PHASES_PER_CYCLE = 64
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class LimitCycle:
     stick_share: float
     cycles: int
 
-    def told(self, unit: str) -> str:
+    def describe(self, unit: str) -> str:
         """In words.
 
         Examples
@@ -66,8 +69,8 @@ def find_limit_cycle(
     *,
     start: float | None = None,
     dither_period: float | None = None,
-    least: float | None = None,
-    still: float | None = None,
+    min_amplitude: float | None = None,
+    standstill_speed: float | None = None,
 ) -> LimitCycle | None:
     """Look for hunting in a signal under a constant reference.
 
@@ -111,29 +114,29 @@ def find_limit_cycle(
         len(grid) > 2 and bool(np.all(np.diff(grid) > 0)), "time must increase strictly, over at least three samples"
     )
     require(bool(np.all(np.isfinite(values))), "the signal holds NaN; cut the record, or fill it")
-    begin = grid[0] + SETTLED * (grid[-1] - grid[0]) if start is None else start
+    begin = grid[0] + TRANSIENT_SHARE * (grid[-1] - grid[0]) if start is None else start
     require(begin < grid[-1], f"start = {begin:g} s lies behind the record's end, {grid[-1]:g} s")
-    at, swing = _swing(grid, values, begin, dither_period)
-    smallest = LEAST * np.ptp(values) if least is None else least
-    lag = _lag(swing) if np.ptp(swing) >= 2 * smallest > 0 else 0
+    at, swing = _detrend_signal(grid, values, begin, dither_period)
+    smallest = MIN_RELATIVE_AMPLITUDE * np.ptp(values) if min_amplitude is None else min_amplitude
+    lag = _period_in_samples(swing) if np.ptp(swing) >= 2 * smallest > 0 else 0
     if lag == 0:
         return None
-    swing = _levelled(swing, lag)
-    smooth = np.convolve(swing, np.ones(1 + lag // SMOOTHER) / (1 + lag // SMOOTHER), "same")
-    crossings = _crossings(at, smooth)
-    if len(crossings) <= CYCLES or np.std(np.diff(crossings)) > IRREGULAR * np.mean(np.diff(crossings)):
+    swing = _remove_trend(swing, lag)
+    smooth = np.convolve(swing, np.ones(1 + lag // WINDOWS_PER_PERIOD) / (1 + lag // WINDOWS_PER_PERIOD), "same")
+    crossings = _rising_crossings(at, smooth)
+    if len(crossings) <= MIN_CYCLES or np.std(np.diff(crossings)) > MAX_PERIOD_SPREAD * np.mean(np.diff(crossings)):
         return None
-    phases = np.array([np.linspace(a, b, PHASES) for a, b in pairwise(crossings)])
+    phases = np.array([np.linspace(a, b, PHASES_PER_CYCLE) for a, b in pairwise(crossings)])
     amplitude = float(np.ptp(np.interp(phases, at, swing).mean(axis=0)) / 2)
-    if amplitude < smallest or _dies_out(np.ptp(np.interp(phases, at, smooth), axis=1)):
+    if amplitude < smallest or _is_decaying(np.ptp(np.interp(phases, at, smooth), axis=1)):
         return None
     size = np.abs(values[grid >= begin])
-    share = float(np.mean(size <= (STILL * size.max() if still is None else still)))
+    share = float(np.mean(size <= (STANDSTILL_FRACTION * size.max() if standstill_speed is None else standstill_speed)))
     count = len(crossings) - 1
     return LimitCycle(amplitude, float(count / (crossings[-1] - crossings[0])), share, count)
 
 
-def _swing(t: Array, y: Array, begin: float, period: float | None) -> tuple[Array, Array]:
+def _detrend_signal(t: Array, y: Array, begin: float, period: float | None) -> tuple[Array, Array]:
     """On an even grid from `begin` on: without the dither, without a straight line."""
     edge = 0.0 if period is None else period / 2
     first, last = max(begin, t[0] + edge), t[-1] - edge
@@ -143,27 +146,27 @@ def _swing(t: Array, y: Array, begin: float, period: float | None) -> tuple[Arra
     return at, level - np.polyval(np.polyfit(at - at[0], level, 1), at - at[0])
 
 
-def _lag(swing: Array) -> int:
+def _period_in_samples(swing: Array) -> int:
     """Samples after which it comes back, by the autocorrelation's peak within a third of the record; 0: it does not."""
     n = len(swing)
     power = np.abs(np.fft.rfft(swing, 2 * n)) ** 2
-    r = np.fft.irfft(power)[: n // CYCLES] * n / (n - np.arange(n // CYCLES))
+    r = np.fft.irfft(power)[: n // MIN_CYCLES] * n / (n - np.arange(n // MIN_CYCLES))
     below = np.flatnonzero(r < 0)
-    if not len(below) or r[below[0] :].max() < REPEATS * r[0]:
+    if not len(below) or r[below[0] :].max() < MIN_AUTOCORRELATION * r[0]:
         return 0
     return int(below[0] + np.argmax(r[below[0] :]))
 
 
-def _levelled(swing: Array, lag: int) -> Array:
+def _remove_trend(swing: Array, lag: int) -> Array:
     """Without the straight line through its means over whole periods, which a part of a period does not bend."""
     whole = np.convolve(swing, np.ones(lag) / lag, "valid")
     line = np.polyfit(np.arange(len(whole)) + (lag - 1) / 2, whole, 1)
     return np.asarray(swing - np.polyval(line, np.arange(len(swing))))
 
 
-def _crossings(t: Array, swing: Array) -> Array:
-    """When it begins to rise through zero, if it goes on to rise as far as `SWITCH` says, having been as far below."""
-    level = SWITCH * np.std(swing)
+def _rising_crossings(t: Array, swing: Array) -> Array:
+    """Rising zero crossings whose swing passes `CROSSING_HYSTERESIS` standard deviations on both sides."""
+    level = CROSSING_HYSTERESIS * np.std(swing)
     side = np.where(swing > level, 1, np.where(swing < -level, -1, 0))
     far = np.flatnonzero(side)
     up = np.flatnonzero(np.diff(side[far]) > 0)
@@ -174,11 +177,11 @@ def _crossings(t: Array, swing: Array) -> Array:
     return np.array(found)
 
 
-def _dies_out(sizes: Array) -> bool:
+def _is_decaying(sizes: Array) -> bool:
     """Whether the cycles shrink: the logarithm's slope, with its standard error."""
     k = np.arange(len(sizes)) - (len(sizes) - 1) / 2
     logs = np.log(np.maximum(sizes, 1e-300))
     slope = float(k @ logs / (k @ k))
     left = logs - logs.mean() - slope * k
     error = float(np.sqrt(left @ left / max(1, len(sizes) - 2) / (k @ k)))
-    return slope < DIES or slope + 2 * error < KEEPS
+    return slope < MAX_DECAY_GROWTH or slope + 2 * error < MIN_SUSTAINED_GROWTH

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
-from pneuopt.control.linear_loop import delayed, linear_gains
+from pneuopt.control.linear_loop import linear_gains, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.system import Array, Linearisation
+from pneuopt.dynamics.system import Linearisation
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -89,16 +90,16 @@ def margins(open_loop: Linearisation) -> Margins:
 
     omega = frequency_grid(open_loop)
     L = frequency_response(open_loop, omega)
-    gain = _crossings(lambda w: float(np.log(abs(response(w)))), omega, np.log(np.abs(L)))
-    real = _crossings(lambda w: response(w).imag, omega, L.imag)
+    gain = _crossing_frequencies(lambda w: float(np.log(abs(response(w)))), omega, np.log(np.abs(L)))
+    real = _crossing_frequencies(lambda w: response(w).imag, omega, L.imag)
     phases = [((float(np.angle(response(w), deg=True)) % 360) - 180, w) for w in gain]
     gains = [(1 / abs(z), w) for w in real if (z := response(w)).real < 0]
     gain_margin, phase_crossover = min(gains, key=lambda g: abs(np.log(g[0])), default=(inf, nan))
     phase_margin, gain_crossover = min(phases, key=lambda m: abs(m[0]), default=(inf, nan))
     D = float(open_loop.D[0, 0])
-    Ms, at = _peak(lambda w: 1 / (1 + frequency_response(open_loop, w)), omega, 1 / (1 + D))
-    Mt, _ = _peak(lambda w: 1 - 1 / (1 + frequency_response(open_loop, w)), omega, D / (1 + D))
-    return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, _stable(open_loop))
+    Ms, at = _response_peak(lambda w: 1 / (1 + frequency_response(open_loop, w)), omega, 1 / (1 + D))
+    Mt, _ = _response_peak(lambda w: 1 - 1 / (1 + frequency_response(open_loop, w)), omega, D / (1 + D))
+    return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, _is_stable(open_loop))
 
 
 def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float]) -> float:
@@ -129,11 +130,11 @@ def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float
     """
     Kp, _, Kd, Tf = gains
 
-    def control(w: Array) -> ComplexArray:
+    def control_response(w: Array) -> ComplexArray:
         a, b = controller_parts(gains, w)
         return np.asarray((a + 1j * b) / (1 + frequency_response(open_loop, w)))
 
-    return _peak(control, frequency_grid(open_loop), Kp + Kd / Tf)[0]
+    return _response_peak(control_response, frequency_grid(open_loop), Kp + Kd / Tf)[0]
 
 
 def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:
@@ -159,7 +160,10 @@ def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> Comple
     require(single, f"one input and one output expected, got D of shape {linearisation.D.shape}", ModelError)
     w = np.asarray(omega, dtype=float)
     require(bool(np.all(w > 0)), "frequencies must be positive [rad/s]")
-    return np.asarray(solved(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0] + linearisation.D[0, 0])
+    return np.asarray(
+        batch_frequency_response(linearisation.A[None], linearisation.B.T, linearisation.C, w)[0]
+        + linearisation.D[0, 0]
+    )
 
 
 def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
@@ -167,7 +171,7 @@ def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
 
     Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
     """
-    roots = np.concatenate([eigvals(open_loop.A), _closed_poles(open_loop), _zeros(open_loop)])
+    roots = np.concatenate([eigvals(open_loop.A), _loop_poles(open_loop), _zeros(open_loop)])
     size = [s for s in np.abs(roots) if s > 1e-10 * np.max(np.abs(roots))]
     low, high = min(size, default=1.0), max(size, default=1.0)
     decades = np.log10(high / low) + 6
@@ -207,7 +211,7 @@ def sensitivity_terms(
     free = [n for n in parameters.free_names if n in loop.plant.parameters]
     require(not free, f"{', '.join(free)}: free, but the sensitivity takes the plant as fixed; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
-    P = frequency_response(loop.linear_plant(parameters, x), w) * delayed(w, loop.dead_time)
+    P = frequency_response(loop.linear_plant(parameters, x), w) * pade_delay_response(w, loop.dead_time)
     p = ca.SX.sym("p", len(loop.parameters))
     Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())
@@ -216,7 +220,7 @@ def sensitivity_terms(
     return ca.Function("sensitivity_terms", [p], [terms], ["p"], ["terms"])
 
 
-def solved(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
+def batch_frequency_response(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
     """``C (jw I - A)^-1 B`` of m systems, shape (m, n), at frequencies of shape (n,), the same for all, or (m, n)."""
     resolvent = 1j * w[..., None, None] * np.eye(A.shape[-1]) - A[:, None]
     x = np.linalg.solve(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
@@ -230,28 +234,28 @@ def controller_parts(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
     return Kp + Kd * Tf * w**2 * lag, Kd * w * lag - Ki / w
 
 
-def _crossings(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:
+def _crossing_frequencies(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:
     """Roots between the grid's sign changes."""
     brackets = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
     exact = [float(w) for w in omega[values == 0]]
     return sorted(exact + [float(brentq(function, omega[k], omega[k + 1], xtol=1e-14 * omega[k])) for k in brackets])
 
 
-def _peak(response: Callable[[Array], ComplexArray], omega: Array, limit: float) -> tuple[float, float]:
+def _response_peak(response: Callable[[Array], ComplexArray], omega: Array, limit: float) -> tuple[float, float]:
     """The largest size of a response and its frequency, refined from the grid; `limit` is its value at infinity."""
 
-    def size(log_w: float) -> float:
+    def negative_magnitude(log_w: float) -> float:
         return -float(abs(response(np.array([np.exp(log_w)]))[0]))
 
     on_grid = np.abs(response(omega))
     k = int(np.argmax(on_grid))
     ends = np.log(omega[[max(k - 1, 0), min(k + 1, len(omega) - 1)]])
-    best = minimize_scalar(size, bounds=tuple(ends), method="bounded", options={"xatol": 1e-12})
+    best = minimize_scalar(negative_magnitude, bounds=tuple(ends), method="bounded", options={"xatol": 1e-12})
     largest, at = max((-float(best.fun), float(np.exp(best.x))), (float(on_grid[k]), float(omega[k])))
     return (largest, at) if largest > abs(limit) else (abs(limit), inf)
 
 
-def _closed_poles(open_loop: Linearisation) -> ComplexArray:
+def _loop_poles(open_loop: Linearisation) -> ComplexArray:
     feedback = open_loop.B @ open_loop.C / (1 + open_loop.D[0, 0])
     return np.asarray(eigvals(open_loop.A - feedback), dtype=complex)
 
@@ -264,7 +268,7 @@ def _zeros(open_loop: Linearisation) -> ComplexArray:
     return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
 
 
-def _stable(open_loop: Linearisation) -> bool:
+def _is_stable(open_loop: Linearisation) -> bool:
     """Allows for modes at the origin that the loop does not see (a position in a speed loop, an unused integral)."""
-    poles = _closed_poles(open_loop)
+    poles = _loop_poles(open_loop)
     return bool(np.max(poles.real, initial=-1.0) <= 1e-7 * np.max(np.abs(poles), initial=1.0))

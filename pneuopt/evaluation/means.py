@@ -1,11 +1,11 @@
 """Means of sampled signals over a dither's period, linear between samples: along the record, and at its end."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-PERIODS_AT_END = 5
-TAIL = 0.05  # of a record without dither, that counts as its end
+from pneuopt.quantities.arrays import Array
+
+FINAL_PERIODS = 5
+TAIL_SHARE = 0.05  # of a record without dither, that counts as its end
 
 
 def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
@@ -42,7 +42,9 @@ def end_mean(t: Array, y: Array, period: float | None) -> Array:
 
 def tail(t: Array, y: Array, period: float | None) -> tuple[Array, Array]:
     """The end of a record: its last periods, five or as many as there are, without dither its last 5 %."""
-    duration = TAIL * (t[-1] - t[0]) if period is None else period * min(PERIODS_AT_END, int((t[-1] - t[0]) / period))
+    duration = (
+        TAIL_SHARE * (t[-1] - t[0]) if period is None else period * min(FINAL_PERIODS, int((t[-1] - t[0]) / period))
+    )
     begin = t[-1] - duration
     k = min(max(int(np.searchsorted(t, begin, side="right")) - 1, 0), len(t) - 2)
     first = y[:, [k]] + (begin - t[k]) / (t[k + 1] - t[k]) * (y[:, [k + 1]] - y[:, [k]])

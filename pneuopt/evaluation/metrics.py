@@ -8,19 +8,18 @@ from math import nan
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.evaluation.means import TAIL, end_mean, period_mean, tail
+from pneuopt.evaluation.means import TAIL_SHARE, end_mean, period_mean, tail
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
-Array = NDArray[np.float64]
-
-PERIODS_INSIDE = 2  # of the dither, at least, of a response that has settled
-INTEGRALS = ("IAE", "ISE", "ITAE")
+MIN_SETTLED_PERIODS = 2  # of the dither, at least, of a response that has settled
+INTEGRAL_METRICS = ("IAE", "ISE", "ITAE")
 
 Envelope = Sequence[tuple[float, float, float]]
 """Instants after the step [s], each with the lower and upper bound from then on, as fractions of the step."""
 
 
-class About(Enum):
+class BandCentre(Enum):
     """What the settling band lies around."""
 
     FINAL = "the final value, as python-control; the band is a fraction of the change"
@@ -35,7 +34,7 @@ def step_metrics(
     *,
     start: float = 0.0,
     band: float = 0.02,
-    about: About = About.FINAL,
+    band_centre: BandCentre = BandCentre.FINAL,
     dither_period: float | None = None,
     control: ArrayLike | None = None,
     sample_time: float | None = None,
@@ -133,7 +132,7 @@ def step_metrics(
         initial,
         start=start,
         band=band,
-        about=about,
+        band_centre=band_centre,
         dither_period=dither_period,
         control=commands if commands is None else commands[None],
         sample_time=sample_time,
@@ -152,7 +151,7 @@ def batch_metrics(
     *,
     start: float = 0.0,
     band: float = 0.02,
-    about: About = About.FINAL,
+    band_centre: BandCentre = BandCentre.FINAL,
     dither_period: float | None = None,
     control: Array | None = None,
     sample_time: float | None = None,
@@ -179,55 +178,55 @@ def batch_metrics(
     dict of str to ndarray, shape (m,)
     """
     require(scale is not None or reference_final != initial, f"no step: the reference stays at {initial:g}")
-    raw, size = _record(t, y, start, band), reference_final - initial if scale is None else scale
+    raw, size = _cut_record(t, y, start, band), reference_final - initial if scale is None else scale
     if averaged is None and dither_period is not None:
-        averaged = _averaged(raw, initial, dither_period)
-    smooth = raw if averaged is None else _Record(raw.t[: averaged.shape[1]], averaged)
+        averaged = _period_averages(raw, initial, dither_period)
+    smooth = raw if averaged is None else _StepRecord(raw.t[: averaged.shape[1]], averaged)
     steady = end_mean(raw.t, raw.y, dither_period) if final is None else np.full(len(raw.y), final)
     centre, width = steady, band * np.abs(steady - initial)
-    if about is About.REFERENCE:
+    if band_centre is BandCentre.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
-    latest = raw.t[-1] - max(TAIL * raw.t[-1], PERIODS_INSIDE * (dither_period or 0.0))
+    latest = raw.t[-1] - max(TAIL_SHARE * raw.t[-1], MIN_SETTLED_PERIODS * (dither_period or 0.0))
     return {
-        **_rise(smooth, initial, steady, only),
-        "SettlingTime": _settling(smooth, centre, width, latest),
-        **(_extremes(smooth, steady, reference_final, initial, only) if scale is None else {}),
-        **({} if scale is None else _deviations(smooth, reference_final, scale)),
+        **_rise_metrics(smooth, initial, steady, only),
+        "SettlingTime": _settling_times(smooth, centre, width, latest),
+        **(_overshoot_metrics(smooth, steady, reference_final, initial, only) if scale is None else {}),
+        **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
         "SteadyStateError": 100 * np.abs(reference_final - steady) / abs(size),
-        **({"Ripple": np.ptp(tail(raw.t, raw.y, dither_period)[1], axis=1)} if _asked(only, "Ripple") else {}),
-        **_integrals(smooth, reference_final, size, only),
-        **_enveloped(smooth, initial if scale is None else reference_final - size, size, envelope),
-        **_effort(t, control, start, sample_time, len(raw.y), only),
+        **({"Ripple": np.ptp(tail(raw.t, raw.y, dither_period)[1], axis=1)} if _wants(only, "Ripple") else {}),
+        **_error_integrals(smooth, reference_final, size, only),
+        **_envelope_metric(smooth, initial if scale is None else reference_final - size, size, envelope),
+        **_control_effort(t, control, start, sample_time, len(raw.y), only),
     }
 
 
 @dataclass(frozen=True)
-class _Record:
+class _StepRecord:
     """Samples from the step on, a row a response; t is counted from the step."""
 
     t: Array
     y: Array
 
 
-def _record(t: Array, y: Array, start: float, band: float) -> _Record:
+def _cut_record(t: Array, y: Array, start: float, band: float) -> _StepRecord:
     require(bool(np.all(np.diff(t) > 0)), "time must increase strictly")
     require(bool(np.all(np.isfinite(y))), "the response holds NaN or infinite values; a simulation that fails has none")
     require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
-    first = _since(t, start)
+    first = _first_index_since(t, start)
     require(len(t) - first >= 3, f"fewer than three samples after the step at {start:g} s")
-    return _Record(t[first:] - start, y[:, first:])
+    return _StepRecord(t[first:] - start, y[:, first:])
 
 
-def _asked(only: Collection[str] | None, *metrics: str) -> bool:
+def _wants(only: Collection[str] | None, *metrics: str) -> bool:
     return only is None or any(n in only for n in metrics)
 
 
-def _since(t: Array, start: float) -> int:
+def _first_index_since(t: Array, start: float) -> int:
     return int(np.searchsorted(t, start - 1e-12 * max(1.0, abs(start))))
 
 
-def _averaged(record: _Record, initial: float, period: float) -> Array:
+def _period_averages(record: _StepRecord, initial: float, period: float) -> Array:
     last = record.t[-1] - period / 2
     require(
         period > 0 and last > record.t[0] + period,
@@ -236,16 +235,16 @@ def _averaged(record: _Record, initial: float, period: float) -> Array:
     return period_mean(record.t, record.y, initial, period, record.t[record.t <= last])
 
 
-def _rise(record: _Record, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:
+def _rise_metrics(record: _StepRecord, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:
     """Time from 10 to 90 %, and the range from there on; NaN where 90 % is never reached."""
-    if not _asked(only, "RiseTime", "SettlingMin", "SettlingMax"):
+    if not _wants(only, "RiseTime", "SettlingMin", "SettlingMax"):
         return {}
     change = steady - initial
     with np.errstate(all="ignore"):
         z = (record.y - initial) / np.where(change == 0, nan, change)[:, None]
     reached = (z >= 0.9).any(axis=1)
     after = np.arange(len(record.t)) >= np.argmax(z >= 0.9, axis=1)[:, None]
-    rise = _first(record.t, z, 0.9) - _first(record.t, z, 0.1)
+    rise = _first_crossing_times(record.t, z, 0.9) - _first_crossing_times(record.t, z, 0.1)
     lowest, highest = np.where(after, record.y, np.inf).min(axis=1), np.where(after, record.y, -np.inf).max(axis=1)
     return {
         "RiseTime": np.where(reached, rise, nan),
@@ -254,23 +253,23 @@ def _rise(record: _Record, initial: float, steady: Array, only: Collection[str] 
     }
 
 
-def _first(t: Array, z: Array, level: float) -> Array:
+def _first_crossing_times(t: Array, z: Array, level: float) -> Array:
     """When each row first reaches the level, if it does."""
     k = np.argmax(z >= level, axis=1)
     before = np.maximum(k - 1, 0)
-    low, high = _at(z, before), _at(z, k)
+    low, high = _pick_samples(z, before), _pick_samples(z, k)
     with np.errstate(all="ignore"):
         between = t[before] + (t[k] - t[before]) * (level - low) / (high - low)
     return np.asarray(np.where(k == 0, t[0], between))
 
 
-def _settling(record: _Record, centre: Array, width: Array, latest: float) -> Array:
+def _settling_times(record: _StepRecord, centre: Array, width: Array, latest: float) -> Array:
     """The last crossing of the band, linear between samples; NaN for one after `latest`."""
     t, y = record.t, record.y
     outside = np.abs(y - centre[:, None]) > width[:, None]
     k = len(t) - 1 - np.argmax(outside[:, ::-1], axis=1)
     after = np.minimum(k + 1, len(t) - 1)
-    last, following = _at(y, k), _at(y, after)
+    last, following = _pick_samples(y, k), _pick_samples(y, after)
     edge = centre + width * np.sign(last - centre)
     with np.errstate(all="ignore"):
         settled = t[k] + (t[after] - t[k]) * (edge - last) / (following - last)
@@ -278,20 +277,20 @@ def _settling(record: _Record, centre: Array, width: Array, latest: float) -> Ar
     return np.where(outside.any(axis=1), settled, 0.0)
 
 
-def _at(rows: Array, k: NDArray[np.intp]) -> Array:
+def _pick_samples(rows: Array, k: NDArray[np.intp]) -> Array:
     """One sample of each row."""
     return np.asarray(rows[np.arange(len(rows)), k], dtype=float)
 
 
-def _extremes(
-    record: _Record, steady: Array, reference: float, initial: float, only: Collection[str] | None
+def _overshoot_metrics(
+    record: _StepRecord, steady: Array, reference: float, initial: float, only: Collection[str] | None
 ) -> dict[str, Array]:
     size, change = reference - initial, steady - initial
-    if not _asked(only, "OvershootFinal", "Undershoot", "Peak", "PeakTime"):
+    if not _wants(only, "OvershootFinal", "Undershoot", "Peak", "PeakTime"):
         peak = record.y.max(axis=1) if size > 0 else record.y.min(axis=1)
         return {"Overshoot": 100 * np.maximum(0.0, (peak - reference) / size)}
     k = np.argmax(record.y * np.sign(size), axis=1)
-    peak = _at(record.y, k)
+    peak = _pick_samples(record.y, k)
     with np.errstate(all="ignore"):
         beyond = np.where(change * size > 0, 100 * np.maximum(0.0, (peak - steady) / change), nan)
     return {
@@ -303,37 +302,39 @@ def _extremes(
     }
 
 
-def _deviations(record: _Record, reference: float, size: float) -> dict[str, Array]:
+def _deviation_metrics(record: _StepRecord, reference: float, size: float) -> dict[str, Array]:
     """What a response that should not move shows in place of rise and overshoot."""
     k = np.argmax(np.abs(record.y - reference), axis=1)
-    peak, none = _at(record.y, k), np.zeros(len(record.y))
+    peak, none = _pick_samples(record.y, k), np.zeros(len(record.y))
     beyond = 100 * np.abs(peak - reference) / abs(size)
     found = {"Overshoot": beyond, "OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
     return found | {"RiseTime": none, "Undershoot": none}
 
 
-def _integrals(record: _Record, reference: float, size: float, only: Collection[str] | None) -> dict[str, Array]:
+def _error_integrals(
+    record: _StepRecord, reference: float, size: float, only: Collection[str] | None
+) -> dict[str, Array]:
     """By the trapezoidal rule; its weights at the samples make the integrals products."""
-    if not _asked(only, *INTEGRALS):
+    if not _wants(only, *INTEGRAL_METRICS):
         return {}
     h, error = np.diff(record.t), np.abs(record.y - reference) / abs(size)
     weights = 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
     return {"IAE": error @ weights, "ISE": error**2 @ weights, "ITAE": error @ (weights * record.t)}
 
 
-def _enveloped(record: _Record, initial: float, size: float, envelope: Envelope) -> dict[str, Array]:
+def _envelope_metric(record: _StepRecord, initial: float, size: float, envelope: Envelope) -> dict[str, Array]:
     if not envelope:
         return {}
     used, y = np.zeros(len(record.y)), (record.y - initial) / size
     ends = [*(begin for begin, _, _ in envelope[1:]), np.inf]
     for (begin, lower, upper), end in zip(envelope, ends, strict=True):
         if begin < record.t[-1]:
-            part = _between(record.t, y, begin, min(end, record.t[-1]))
+            part = _samples_between(record.t, y, begin, min(end, record.t[-1]))
             used = np.maximum(used, np.max(np.abs(part - (lower + upper) / 2), axis=1) / ((upper - lower) / 2))
     return {"StepEnvelope": used}
 
 
-def _between(t: Array, y: Array, begin: float, end: float) -> Array:
+def _samples_between(t: Array, y: Array, begin: float, end: float) -> Array:
     """Samples in a span, and the values at its ends, linear between samples."""
     at = np.array([begin, end])
     k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
@@ -341,20 +342,20 @@ def _between(t: Array, y: Array, begin: float, end: float) -> Array:
     return np.concatenate([ends, y[:, (t > begin) & (t < end)]], axis=1)
 
 
-def _effort(
+def _control_effort(
     t: Array, control: Array | None, start: float, sample_time: float | None, rows: int, only: Collection[str] | None
 ) -> dict[str, Array]:
     if control is None:
         return {"PeakControl": np.full(rows, nan), "ControlRate": np.full(rows, nan)}
     require(control.shape[-1:] == t.shape, f"t and control differ in shape: {t.shape} and {control.shape[-1:]}")
-    first = _since(t, start)
+    first = _first_index_since(t, start)
     found = {"PeakControl": np.asarray(np.max(np.abs(control[:, first:]), axis=1))}
-    if _asked(only, "ControlRate"):
-        found["ControlRate"] = _rate(t[first:], control[:, first:], sample_time)
+    if _wants(only, "ControlRate"):
+        found["ControlRate"] = _control_rates(t[first:], control[:, first:], sample_time)
     return found
 
 
-def _rate(t: Array, u: Array, sample_time: float | None) -> Array:
+def _control_rates(t: Array, u: Array, sample_time: float | None) -> Array:
     """A held command jumps within a sample of a finer grid: its rate is the jump over the controller's sample."""
     if sample_time is None:
         return np.asarray(np.max(np.abs(np.diff(u, axis=1)) / np.diff(t), axis=1))

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pneuopt.quantities.errors import require
 
 Value = TypeVar("Value", float, NDArray[np.float64])
-PERCENT = ("Overshoot", "SteadyStateError")
-Bounds = tuple[tuple[float, float, float], ...]
+PERCENT_METRICS = ("Overshoot", "SteadyStateError")
+EnvelopeBounds = tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class StepEnvelope:
     >>> tube = StepEnvelope(((0.0, -0.1, 1.1), (0.5, 0.95, 1.05)))
     """
 
-    bounds: Bounds
+    bounds: EnvelopeBounds
     max: float | None = 1.0
 
     def __post_init__(self) -> None:
@@ -322,71 +322,75 @@ Requirement = (
     | AirUse
     | Robustness
 )
-ROBUSTNESS = (MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin, NoiseGain)
-AT_LEAST = (GainMargin, PhaseMargin)
-KINDS: tuple[type[Requirement], ...] = get_args(Requirement)
+ROBUSTNESS_REQUIREMENTS = (MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin, NoiseGain)
+MINIMUM_REQUIREMENTS = (GainMargin, PhaseMargin)
+REQUIREMENT_KINDS: tuple[type[Requirement], ...] = get_args(Requirement)
 
 
-def most(requirement: Requirement) -> float:
-    """The largest value allowed, of those that `read` gives: a margin's is the reciprocal of its `min`; inf without."""
-    if isinstance(requirement, AT_LEAST):
+def upper_limit(requirement: Requirement) -> float:
+    """The largest allowed value of `requirement_values`: a margin's is the reciprocal of its `min`; inf without."""
+    if isinstance(requirement, MINIMUM_REQUIREMENTS):
         return inf if requirement.min is None else 1 / requirement.min
     return inf if requirement.max is None else requirement.max
 
 
-def told(requirement: Requirement, value: float) -> tuple[str, str]:
-    """A value as `read` gives it, and what is allowed, as the user writes them: ("1.8", "at least 2").
+def describe_value(requirement: Requirement, value: float) -> tuple[str, str]:
+    """A value as `requirement_values` gives it, and what is allowed, as the user writes them: ("1.8", "at least 2").
 
     Examples
     --------
     >>> told(GainMargin(min=2.0), 1 / 1.8), told(Overshoot(max=0.05), 0.06)
     (('1.8', 'at least 2'), ('0.06', 'allowed 0.05'))
     """
-    limit = f"at least {requirement.min:.6g}" if isinstance(requirement, AT_LEAST) else f"allowed {requirement.max:.6g}"
-    return f"{shown(requirement, value):.6g}", limit
+    limit = (
+        f"at least {requirement.min:.6g}"
+        if isinstance(requirement, MINIMUM_REQUIREMENTS)
+        else f"allowed {requirement.max:.6g}"
+    )
+    return f"{user_value(requirement, value):.6g}", limit
 
 
-def shown(requirement: Requirement, value: float) -> float:
-    """A value as `read` gives it, as the user writes it: a margin itself."""
-    if isinstance(requirement, AT_LEAST):
+def user_value(requirement: Requirement, value: float) -> float:
+    """A value as `requirement_values` gives it, as the user writes it: a margin itself."""
+    if isinstance(requirement, MINIMUM_REQUIREMENTS):
         return 1 / value if value else inf
     return value
 
 
-def bound(requirement: Requirement) -> float | None:
+def user_limit(requirement: Requirement) -> float | None:
     """The limit as the user writes it, `max` or `min`."""
-    return requirement.min if isinstance(requirement, AT_LEAST) else requirement.max
+    return requirement.min if isinstance(requirement, MINIMUM_REQUIREMENTS) else requirement.max
 
 
-def bounded(requirement: Requirement, limit: float | None) -> Requirement:
+def with_user_limit(requirement: Requirement, limit: float | None) -> Requirement:
     """The same with another limit, as the user writes it, `max` or `min`, by copy."""
-    key: dict[str, Any] = {"min" if isinstance(requirement, AT_LEAST) else "max": limit}
+    key: dict[str, Any] = {"min" if isinstance(requirement, MINIMUM_REQUIREMENTS) else "max": limit}
     return replace(requirement, **key)
 
 
-def name(requirement: Requirement) -> str:
+def metric_name(requirement: Requirement) -> str:
     """The metric that a requirement reads, a column of `evaluate`."""
     return type(requirement).__name__
 
 
-def read(metrics: Mapping[str, Value]) -> dict[str, Value]:
+def requirement_values(metrics: Mapping[str, Value]) -> dict[str, Value]:
     """The requirements' values from metrics, numbers or arrays, all of which shall be small.
 
     Fractions where metrics are in percent; a margin's reciprocal, of a gain margin below one the margin itself.
     """
-    return {k.__name__: _value(k, metrics[k.__name__]) for k in KINDS if k.__name__ in metrics}
+    return {k.__name__: _requirement_value(k, metrics[k.__name__]) for k in REQUIREMENT_KINDS if k.__name__ in metrics}
 
 
-def _value(kind: type, metric: Value) -> Value:
+def _requirement_value(kind: type, metric: Value) -> Value:
     with np.errstate(divide="ignore"):
         if kind is GainMargin:
             return np.exp(-np.abs(np.log(metric)))  # type: ignore[no-any-return]
         if kind is PhaseMargin:
             return np.divide(1.0, np.abs(metric))  # type: ignore[no-any-return]
-    return metric / (100 if kind.__name__ in PERCENT else 1)
+    return metric / (100 if kind.__name__ in PERCENT_METRICS else 1)
 
 
 def _check_limit(requirement: Requirement, least: float) -> None:
     limit = getattr(requirement, "max", None)
     wrong = limit is not None and not least < limit < inf
-    require(not wrong, f"{name(requirement)}: max must be above {least:g} and finite, got {limit}")
+    require(not wrong, f"{metric_name(requirement)}: max must be above {least:g} and finite, got {limit}")

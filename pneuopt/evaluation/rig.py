@@ -11,22 +11,21 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder
-from pneuopt.dynamics.compiled.rollout import compiled
-from pneuopt.dynamics.simulate import contacts, first_state, held_inputs, new_run, warn_of
-from pneuopt.dynamics.smooth import Run
-from pneuopt.dynamics.stick_slip import Event, StickSlip
-from pneuopt.dynamics.system import Symbols, System, define, names, stacked, vector
+from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.simulate import contacts, initial_state, input_rows, new_integration, warn_contacts
+from pneuopt.dynamics.smooth import Integration
+from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
+from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack
 from pneuopt.evaluation.instruments import Actuator, Sensor
 from pneuopt.logs.experiments import CHANNELS, Experiment
-from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Rig:
     actuated: str | None = None
 
     def __post_init__(self) -> None:
-        check_known("output", self.sensors, names(self.plant.outputs), "Rig: sensors")
+        check_names("output", self.sensors, names(self.plant.outputs), "Rig: sensors")
         _ = self.command
         if isinstance(self.model, ClosedLoop):
             _check_loop(self.model)
@@ -82,7 +81,7 @@ class Rig:
         inputs = {q.name: q for q in self.plant.inputs}
         name = self.actuated or (next(iter(inputs)) if len(inputs) == 1 else "")
         require(bool(name), f"the plant has the inputs {', '.join(inputs) or 'none'}; choose actuated=", ModelError)
-        check_known("input", [name], inputs, "Rig: actuated")
+        check_names("input", [name], inputs, "Rig: actuated")
         return inputs[name]
 
     @property
@@ -99,14 +98,14 @@ class Rig:
         return tuple(n for n in names(self.plant.outputs) if n in self.sensors)
 
     @cached_property
-    def sensed(self) -> System:
+    def sensor_system(self) -> System:
         """The plant with an output "sensor.*" a sensor, and a state of that name where it lags."""
         plant = self.plant
         shown = {f"sensor.{q.name}": q for q in plant.outputs if q.name in self.channels}
         lags = {n: self.sensors[q.name].lag for n, q in shown.items()}
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
-            xdot, y = plant.ode(t, ca.vertcat(*(x[n] for n in names(plant.states))), stacked(u), stacked(p))
+            xdot, y = plant.ode(t, ca.vertcat(*(x[n] for n in names(plant.states))), stack(u), stack(p))
             rates = {n: xdot[k] for k, n in enumerate(names(plant.states))}
             outputs = {n: y[k] for k, n in enumerate(names(plant.outputs))}
             true = {n: outputs[q.name] for n, q in shown.items()}
@@ -195,32 +194,38 @@ def record(
     >>> run.experiment.trajectory["position"].round(9).tolist(), [event.t for event in run.events]
     ([0.0, 0.0, 0.023, 0.066], [0.1])
     """
-    fed = _at_samples(rig.model, inputs)
-    x, p = first_state(rig.model, parameters, initial), vector(rig.plant.parameters, parameters)
-    source = _Controller(rig, rig.model, parameters, fed, x) if isinstance(rig.model, ClosedLoop) else _Player(rig, fed)
-    run = new_run(rig.sensed, p, fed.t, rtol, 1e-2 * rtol)
-    readings, control = _drive(rig, run, source, fed, x[: len(rig.plant.states)], p, np.random.default_rng(seed))
-    logged = {n: fed[n] for n in names(rig.plant.inputs) if n != rig.command.name} | source.columns()
+    log_inputs = _resample_inputs(rig.model, inputs)
+    x, p = initial_state(rig.model, parameters, initial), parameter_vector(rig.plant.parameters, parameters)
+    source = (
+        _SampledController(rig, rig.model, parameters, log_inputs, x)
+        if isinstance(rig.model, ClosedLoop)
+        else _CommandPlayer(rig, log_inputs)
+    )
+    run = new_integration(rig.sensor_system, p, log_inputs.t, rtol, 1e-2 * rtol)
+    readings, control = _run_samples(
+        rig, run, source, log_inputs, x[: len(rig.plant.states)], p, np.random.default_rng(seed)
+    )
+    logged = {n: log_inputs[n] for n in names(rig.plant.inputs) if n != rig.command.name} | source.columns()
     logged |= dict(zip(rig.channels, readings.T, strict=True))
     truth = run.trajectory().with_columns({"control": control})
-    warn_of(contacts(truth, rig.plant, parameters))
-    spread = {n: s.spread for n, s in rig.sensors.items() if s.spread > 0}
+    warn_contacts(contacts(truth, rig.plant, parameters))
+    spread = {n: s.standard_deviation for n, s in rig.sensors.items() if s.standard_deviation > 0}
     return Recording(
-        Experiment(Trajectory(fed.t, logged), spread, name=name),
+        Experiment(Trajectory(log_inputs.t, logged), spread, name=name),
         truth.select(n for n in truth.names if not n.startswith("sensor.")),
-        run.events if isinstance(run, StickSlip) else (),
+        run.events if isinstance(run, StickSlipIntegration) else (),
         parameters,
     )
 
 
-class _Player:
+class _CommandPlayer:
     """Commands that are given beforehand."""
 
-    def __init__(self, rig: Rig, fed: Trajectory) -> None:
-        self._name, self._commands = rig.command.name, fed[rig.command.name]
-        self.before = float(self._commands[0])
+    def __init__(self, rig: Rig, log_inputs: Trajectory) -> None:
+        self._name, self._commands = rig.command.name, log_inputs[rig.command.name]
+        self.initial_command = float(self._commands[0])
 
-    def act(self, k: int, readings: Mapping[str, float]) -> float:  # noqa: ARG002 - as `_Controller`
+    def act(self, k: int, readings: Mapping[str, float]) -> float:  # noqa: ARG002 - as `_SampledController`
         """The command at sample k."""
         return float(self._commands[k])
 
@@ -229,29 +234,31 @@ class _Player:
         return {self._name: self._commands}
 
 
-class _Controller:
+class _SampledController:
     """The loop's own controller, acting on a plant whose one state is what was read."""
 
-    def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, fed: Trajectory, x: Array) -> None:
+    def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, log_inputs: Trajectory, x: Array) -> None:
         loop.check(parameters)
         seen = loop.feedback
-        echo = define([seen], [loop.command], [seen], loop.plant.parameters, lambda _t, y, _u, _p: (_at_rest(y), y))
+        echo = define([seen], [loop.command], [seen], loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y))
         echoing = replace(loop, plant=echo, sensor=None)
-        self._update, self._p = compiled(echoing.update), echoing.numbers(parameters)
+        self._update, self._p = compile_function(echoing.update), echoing.parameter_vector(parameters)
         plant, own = x[: len(rig.plant.states)], x[1 - len(echoing.states) :]
-        self._rig, self._loop, self._fed, self._x = rig, loop, fed, own
+        self._rig, self._loop, self._fed, self._x = rig, loop, log_inputs, own
         self._command = names(echoing.states).index("pid.command")
-        self.before = float(own[self._command - 1])
+        self.initial_command = float(own[self._command - 1])
         still = np.zeros(len(rig.plant.inputs))
-        self._first = _outputs(rig, fed.t[0], plant, still, vector(rig.plant.parameters, parameters))[seen.name]
-        self._seen, self._commands = list[float](), list[float]()
+        self._first_reading = _plant_outputs(
+            rig, log_inputs.t[0], plant, still, parameter_vector(rig.plant.parameters, parameters)
+        )[seen.name]
+        self._feedback_values, self._commands = list[float](), list[float]()
         self._position: float | None = None
 
     def act(self, k: int, readings: Mapping[str, float]) -> float:
         """The command at sample k."""
-        self._seen.append(self._feedback(readings))
+        self._feedback_values.append(self._feedback(readings))
         now, reference = self._fed.t[k], self._fed["reference"][k]
-        after = self._update(now, np.append(self._seen[-1], self._x), [reference], self._p)[0]
+        after = self._update(now, np.append(self._feedback_values[-1], self._x), [reference], self._p)[0]
         self._x = after[1:]
         self._commands.append(float(after[self._command]))
         return self._commands[-1]
@@ -260,7 +267,11 @@ class _Controller:
         """What it logs."""
         name = self._loop.feedback.name
         reference = f"{name}_reference" if f"{name}_reference" in CHANNELS else "reference"
-        return {reference: self._fed["reference"], self._loop.command.name: self._commands, "feedback": self._seen}
+        return {
+            reference: self._fed["reference"],
+            self._loop.command.name: self._commands,
+            "feedback": self._feedback_values,
+        }
 
     def _feedback(self, readings: Mapping[str, float]) -> float:
         """What the controller takes for its measured signal."""
@@ -270,53 +281,53 @@ class _Controller:
         counts = Sensor(resolution=self._rig.encoder.resolution)
         before, self._position = self._position, counts.reading(readings[str(source)], 0.0)
         if before is None:
-            return self._first
+            return self._first_reading
         h = self._loop.pid.sample_time or 0.0
         raw = (self._position - before) / h
-        return self._seen[-1] + h / (h + self._rig.encoder.filter) * (raw - self._seen[-1])
+        return self._feedback_values[-1] + h / (h + self._rig.encoder.filter) * (raw - self._feedback_values[-1])
 
 
-def _drive(
+def _run_samples(
     rig: Rig,
-    run: Run,
-    source: _Player | _Controller,
-    fed: Trajectory,
+    run: Integration,
+    source: _CommandPlayer | _SampledController,
+    log_inputs: Trajectory,
     x: Array,
     p: Array,
     random: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Run from sample to sample; the readings, a row a sample, and what gets through the actuator."""
     inputs, column = names(rig.plant.inputs), names(rig.plant.inputs).index(rig.command.name)
-    u = np.column_stack([fed[n] if n != rig.command.name else np.zeros(len(fed)) for n in inputs])
-    spool, sensors = source.before, [rig.sensors[n] for n in rig.channels]
-    noise, readings = random.standard_normal((len(fed), len(sensors))), np.zeros((len(fed), len(sensors)))
-    u[0, column] = rig.actuator.passed(spool)
-    run.restart(fed.t[0], _settled(rig, fed.t[0], x, u[0], p), u[0])
-    for k, t in enumerate(fed.t):
+    u = np.column_stack([log_inputs[n] if n != rig.command.name else np.zeros(len(log_inputs)) for n in inputs])
+    spool, sensors = source.initial_command, [rig.sensors[n] for n in rig.channels]
+    noise, readings = random.standard_normal((len(log_inputs), len(sensors))), np.zeros((len(log_inputs), len(sensors)))
+    u[0, column] = rig.actuator.apply_dead_zone(spool)
+    run.restart(log_inputs.t[0], _append_sensor_states(rig, log_inputs.t[0], x, u[0], p), u[0])
+    for k, t in enumerate(log_inputs.t):
         x, shown = run.advance(t), run.outputs()[len(rig.plant.outputs) :]
         readings[k] = [s.reading(y, z) for s, y, z in zip(sensors, shown, noise[k], strict=True)]
         command = source.act(k, dict(zip(rig.channels, readings[k], strict=True)))
-        spool = rig.actuator.follow(command, spool)
-        u[k, column] = rig.actuator.passed(spool)
+        spool = rig.actuator.apply_hysteresis(command, spool)
+        u[k, column] = rig.actuator.apply_dead_zone(spool)
         run.restart(t, x, u[k])
         run.record()
     return readings, u[:, column]
 
 
-def _settled(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
+def _append_sensor_states(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
     """The plant's state, and the sensors' at rest with it."""
-    y = _outputs(rig, t, x, u, p)
+    y = _plant_outputs(rig, t, x, u, p)
     return np.append(x, [y[n] for n in rig.channels if rig.sensors[n].lag > 0])
 
 
-def _outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
+def _plant_outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
     """The plant's, by name."""
     return dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel().tolist(), strict=True))
 
 
-def _at_samples(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:
+def _resample_inputs(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:
     """The inputs of the model at the instants of the log."""
-    rows, t, slack = held_inputs(model.inputs, inputs), inputs.t, 1e-9
+    rows, t, slack = input_rows(model.inputs, inputs), inputs.t, 1e-9
     if isinstance(model, ClosedLoop):
         h = model.pid.sample_time or 0.0
         slack = max(1e-6 * h, 4 * float(np.spacing(np.abs(t).max())))
@@ -325,7 +336,7 @@ def _at_samples(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:
     return Trajectory(t, dict(zip(names(model.inputs), rows.T, strict=True)))
 
 
-def _at_rest(x: Symbols) -> Symbols:
+def _zero_rates(x: Symbols) -> Symbols:
     return {n: ca.SX(0) for n in x}
 
 

@@ -12,21 +12,20 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.quantities.errors import InputError, check_known, require
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-Names = str | tuple[str, ...]
+AxisNames = str | tuple[str, ...]
 Spread = float | tuple[float, float]
-Spreads = Mapping[str, Spread] | Mapping[Names, Spread]
-Cases = dict[str, dict[str, float]]
-MOST_CORNERS = 4096
-MOST_DRAWS = 1000  # for each sample that has to lie within the bounds
+Spreads = Mapping[str, Spread] | Mapping[AxisNames, Spread]
+ScenarioValues = dict[str, dict[str, float]]
+MAX_CORNERS = 4096
+MAX_DRAWS_PER_SAMPLE = 1000  # for each sample that has to lie within the bounds
 
 
 @dataclass(frozen=True)
@@ -46,10 +45,10 @@ class Factor:
 
 
 Scenarios = Mapping[str, Mapping[str, float | Factor]]
-NOMINAL: Scenarios = MappingProxyType({})  # no scenario: the nominal plant alone
+NO_SCENARIOS: Scenarios = MappingProxyType({})  # no scenario: the nominal plant alone
 
 
-def corners(parameters: ParameterSet, spreads: Spreads) -> Cases:
+def corners(parameters: ParameterSet, spreads: Spreads) -> ScenarioValues:
     """Every combination of least and greatest: 2^n plants for n axes.
 
     Parameters
@@ -76,19 +75,19 @@ def corners(parameters: ParameterSet, spreads: Spreads) -> Cases:
     >>> corners(rig, {"load.mass": 0.2, "friction.*": (30.0, 60.0)})["load.mass low, friction.* high"]
     {'load.mass': 4.0, 'friction.coulomb': 60.0}
     """
-    ends = _axes(parameters, spreads)
+    ends = _axis_ends(parameters, spreads)
     count = 2 ** len(ends)
-    require(count <= MOST_CORNERS, f"{len(ends)} axes have {count} corners, more than {MOST_CORNERS}; draw samples")
+    require(count <= MAX_CORNERS, f"{len(ends)} axes have {count} corners, more than {MAX_CORNERS}; draw samples")
     sides = {axis: [(f"{axis} low", low), (f"{axis} high", high)] for axis, (low, high) in ends.items()}
     return {
-        ", ".join(label for label, _ in corner): _joined(values for _, values in corner)
+        ", ".join(label for label, _ in corner): _merge_values(values for _, values in corner)
         for corner in itertools.product(*sides.values())
     }
 
 
 def tolerances(
     parameters: ParameterSet,
-    shares: Mapping[str, float] | Mapping[Names, float],
+    shares: Mapping[str, float] | Mapping[AxisNames, float],
     count: int | None = None,
     *,
     seed: int = 0,
@@ -127,7 +126,7 @@ def tolerances(
     return {name: {n: Factor(v) for n, v in values.items()} for name, values in factors.items()}
 
 
-def applied(parameters: ParameterSet, values: Mapping[str, float | Factor]) -> ParameterSet:
+def apply_scenario(parameters: ParameterSet, values: Mapping[str, float | Factor]) -> ParameterSet:
     """The parameters of one scenario; a factor may leave the bounds, which are a candidate's own.
 
     Parameters
@@ -141,7 +140,7 @@ def applied(parameters: ParameterSet, values: Mapping[str, float | Factor]) -> P
     return parameters.with_bounds(room).with_values(spread | plain)
 
 
-def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int = 0) -> Cases:
+def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int = 0) -> ScenarioValues:
     """Plants drawn uniformly from the box whose corners `corners` gives; errors as there.
 
     Parameters
@@ -158,18 +157,18 @@ def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int
         "sample 1" and so on.
     """
     require(count >= 1, f"count must be at least 1, got {count}")
-    ends, rng = _axes(parameters, spreads), np.random.default_rng(seed)
+    ends, rng = _axis_ends(parameters, spreads), np.random.default_rng(seed)
     out = {}
     for number in range(1, count + 1):
         shares = rng.random(len(ends)).tolist()
-        out[f"sample {number}"] = _joined(
+        out[f"sample {number}"] = _merge_values(
             {n: low[n] + share * (high[n] - low[n]) for n in low}
             for share, (low, high) in zip(shares, ends.values(), strict=True)
         )
     return out
 
 
-def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, seed: int = 0) -> Cases:
+def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, seed: int = 0) -> ScenarioValues:
     """Plants drawn from a fit's covariance: what the logs leave open, correlations included.
 
     Parameters
@@ -193,7 +192,7 @@ def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, s
     """
     require(count >= 1, f"count must be at least 1, got {count}")
     names = [str(n) for n in covariance.index]
-    check_known("parameter", names, parameters, "covariance")
+    check_names("parameter", names, parameters, "covariance")
     matrix = covariance.to_numpy(dtype=float)
     unknown = [n for n, row in zip(names, matrix, strict=True) if not np.isfinite(row).all()]
     told = f"{' and '.join(unknown)} have no covariance: the fit did not determine them; give corners instead"
@@ -208,10 +207,10 @@ def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, s
         z = mean + factor @ rng.standard_normal(len(names))
         return np.asarray(np.where(log, np.exp(np.where(log, z, 0.0)), z))
 
-    return {f"draw {k}": _within(parameters, names, draw) for k in range(1, count + 1)}
+    return {f"draw {k}": _draw_within_bounds(parameters, names, draw) for k in range(1, count + 1)}
 
 
-def _axes(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
+def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
     """Each axis's parameters at its low and at its high end."""
     require(len(spreads) > 0, "no spread: give at least one parameter and how far it spreads")
     out: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
@@ -219,11 +218,11 @@ def _axes(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[st
     for key, spread in spreads.items():
         patterns = (key,) if isinstance(key, str) else key
         axis = " + ".join(patterns)
-        names = parameters.matching(*patterns)
+        names = parameters.match_names(*patterns)
         for name in names:
             require(name not in taken, f"{name} is on two axes, {taken.get(name)!r} and {axis!r}; leave it on one")
             taken[name] = axis
-        ends = [_ends(parameters, name, spread) for name in names]
+        ends = [_spread_ends(parameters, name, spread) for name in names]
         out[axis] = (
             {n: e[0] for n, e in zip(names, ends, strict=True)},
             {n: e[1] for n, e in zip(names, ends, strict=True)},
@@ -231,7 +230,7 @@ def _axes(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[st
     return out
 
 
-def _ends(parameters: ParameterSet, name: str, spread: Spread) -> tuple[float, float]:
+def _spread_ends(parameters: ParameterSet, name: str, spread: Spread) -> tuple[float, float]:
     p = parameters[name]
     if isinstance(spread, tuple):
         low, high = spread
@@ -244,7 +243,7 @@ def _ends(parameters: ParameterSet, name: str, spread: Spread) -> tuple[float, f
     return low, high
 
 
-def _joined(parts: Iterator[dict[str, float]]) -> dict[str, float]:
+def _merge_values(parts: Iterator[dict[str, float]]) -> dict[str, float]:
     return {name: value for part in parts for name, value in part.items()}
 
 
@@ -254,10 +253,10 @@ def _square_root(matrix: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _within(parameters: ParameterSet, names: list[str], draw: Callable[[], Array]) -> dict[str, float]:
-    for _ in range(MOST_DRAWS):
+def _draw_within_bounds(parameters: ParameterSet, names: list[str], draw: Callable[[], Array]) -> dict[str, float]:
+    for _ in range(MAX_DRAWS_PER_SAMPLE):
         values = dict(zip(names, draw().tolist(), strict=True))
         if all(parameters[n].lower <= v <= parameters[n].upper for n, v in values.items()):
             return values
-    told = f"of {MOST_DRAWS} draws none lies within the bounds of {', '.join(names)}; widen them, or give corners"
-    raise InputError(told)
+    message = f"of {MAX_DRAWS_PER_SAMPLE} draws none lies within the bounds of {', '.join(names)}"
+    raise InputError(f"{message}; widen them, or give corners")

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from math import inf
 
 from pneuopt.evaluation.requirements import (
-    AT_LEAST,
-    KINDS,
-    Bounds,
+    MINIMUM_REQUIREMENTS,
+    REQUIREMENT_KINDS,
+    EnvelopeBounds,
     MaxComplementarySensitivity,
     MaxSensitivity,
     Overshoot,
@@ -16,8 +16,8 @@ from pneuopt.evaluation.requirements import (
     SettlingTime,
     SteadyStateError,
     StepEnvelope,
-    most,
-    name,
+    metric_name,
+    upper_limit,
 )
 from pneuopt.quantities.errors import require
 
@@ -43,18 +43,18 @@ class Specification:
     band: float
 
     @property
-    def envelope(self) -> Bounds:
+    def envelope(self) -> EnvelopeBounds:
         """The bounds of its `StepEnvelope`; none without."""
         return next((q.bounds for q in (*self.weights, *self.limits) if isinstance(q, StepEnvelope)), ())
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The names of what it limits or minimises."""
-        return tuple(dict.fromkeys(name(q) for q in (*self.weights, *self.limits)))
+        return tuple(dict.fromkeys(metric_name(q) for q in (*self.weights, *self.limits)))
 
     def limit(self, kind: Kind) -> float:
         """The largest value allowed for this kind of requirement, as `most`; inf where there is none."""
-        return next((most(q) for q in self.limits if isinstance(q, kind)), inf)
+        return next((upper_limit(q) for q in self.limits if isinstance(q, kind)), inf)
 
     def weight(self, kind: Kind) -> float:
         """The weight of this kind of requirement in the objective; 0 where it is no term."""
@@ -64,14 +64,14 @@ class Specification:
         """Whether this kind of requirement is a term or a limit."""
         return self.weight(kind) > 0 or self.limit(kind) < inf
 
-    def tightened(self, margin: float, peaks: float) -> "Specification":
+    def tighten(self, margin: float, peaks: float) -> "Specification":
         """Band and values allowed smaller by `margin`, a share; peak control and sensitivities by the share `peaks`.
 
         An optimum lies on its limits: found on tightened ones, it keeps those asked for when simulated and printed.
         """
         room: dict[type, float] = {SettlingTime: 0.0}
         room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
-        limits = tuple(allowing(q, most(q) * (1 - room.get(type(q), margin))) for q in self.limits)
+        limits = tuple(with_upper_limit(q, upper_limit(q) * (1 - room.get(type(q), margin))) for q in self.limits)
         return replace(self, limits=limits, band=self.band * (1 - margin))
 
     def without(self, kind: Kind) -> "Specification":
@@ -84,11 +84,11 @@ class Specification:
 
     def objective(self, values: Mapping[str, float]) -> float:
         """The weighted sum, of values by kind as `read` gives them."""
-        return sum(weight * values[name(q)] for q, weight in self.weights.items())
+        return sum(weight * values[metric_name(q)] for q, weight in self.weights.items())
 
-    def violated(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
+    def violations(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
         """The limits that `values` do not keep, NaN among them; `slack` is relative."""
-        return tuple(q for q in self.limits if not values[name(q)] <= most(q) * (1 + slack))
+        return tuple(q for q in self.limits if not values[metric_name(q)] <= upper_limit(q) * (1 + slack))
 
 
 def specify(
@@ -117,29 +117,31 @@ def specify(
     weights = dict(minimise) if isinstance(minimise, Mapping) else {minimise: 1.0}
     require(len(weights) > 0, "minimise is empty: name at least one requirement, SettlingTime() say")
     for q in (*weights, *subject_to):
-        known = ", ".join(k.__name__ for k in KINDS)
+        known = ", ".join(k.__name__ for k in REQUIREMENT_KINDS)
         require(isinstance(q, Requirement), f"{q!r} is no requirement; write {known}, as in Overshoot(max=0.05)")
     for q, weight in weights.items():
-        require(0 < weight < inf, f"the weight of {name(q)} must be positive, got {weight:g}")
+        require(0 < weight < inf, f"the weight of {metric_name(q)} must be positive, got {weight:g}")
     for q in subject_to:
-        bound = "min" if isinstance(q, AT_LEAST) else "max"
-        require(most(q) < inf, f"{name(q)} in subject_to has no limit; write {name(q)}({bound}=...)")
-    terms = [name(q) for q in weights]
+        bound = "min" if isinstance(q, MINIMUM_REQUIREMENTS) else "max"
+        require(
+            upper_limit(q) < inf, f"{metric_name(q)} in subject_to has no limit; write {metric_name(q)}({bound}=...)"
+        )
+    terms = [metric_name(q) for q in weights]
     require(len(set(terms)) == len(terms), f"minimise names a kind of requirement twice: {', '.join(terms)}")
     bands = {q.band for q in (*weights, *subject_to) if isinstance(q, SettlingTime)}
     require(len(bands) <= 1, f"settling bands differ: {sorted(bands)}; one band holds for the whole tuning")
     tubes = {q.bounds for q in (*weights, *subject_to) if isinstance(q, StepEnvelope)}
     require(len(tubes) <= 1, "two StepEnvelopes differ; join them to one")
     for tube in tubes:
-        _check_tube(tube, (*weights, *subject_to), next(iter(bands), 0.02))
+        _check_envelope(tube, (*weights, *subject_to), next(iter(bands), 0.02))
     limits: dict[str, Requirement] = {}
     for q in (*weights, *subject_to):
-        if most(q) < (most(limits[name(q)]) if name(q) in limits else inf):
-            limits[name(q)] = q
+        if upper_limit(q) < (upper_limit(limits[metric_name(q)]) if metric_name(q) in limits else inf):
+            limits[metric_name(q)] = q
     return Specification(weights, tuple(limits.values()), next(iter(bands), 0.02))
 
 
-def _check_tube(tube: Bounds, requirements: Sequence[Requirement], band: float) -> None:
+def _check_envelope(tube: EnvelopeBounds, requirements: Sequence[Requirement], band: float) -> None:
     """Refuse an envelope in which no response can be that does what else is asked for."""
     start, (last, low, up) = tube[0], tube[-1]
     begins = start[0] > 0 or start[1] <= 0 <= start[2]
@@ -147,7 +149,7 @@ def _check_tube(tube: Bounds, requirements: Sequence[Requirement], band: float) 
     require(begins, f"{told}; let them include 0 there, or begin later")
     for q in requirements:
         near = band if isinstance(q, SettlingTime) else q.max if isinstance(q, SteadyStateError) else None
-        asked = f"{name(q)} asks for 1 to within {near}"
+        asked = f"{metric_name(q)} asks for 1 to within {near}"
         told = f"StepEnvelope: from {last:g} s on the bounds are {low:g} to {up:g}, {asked}"
         require(near is None or (low <= 1 + near and up >= 1 - near), f"{told}; move the bounds, or leave one out")
         if isinstance(q, Overshoot) and q.max is not None:
@@ -156,8 +158,8 @@ def _check_tube(tube: Bounds, requirements: Sequence[Requirement], band: float) 
             require(lower <= 1 + q.max, f"{told}; lower the bound, or raise Overshoot's max")
 
 
-def allowing(requirement: Requirement, value: float) -> Requirement:
+def with_upper_limit(requirement: Requirement, value: float) -> Requirement:
     """The same with another largest value, by copy."""
-    if isinstance(requirement, AT_LEAST):
+    if isinstance(requirement, MINIMUM_REQUIREMENTS):
         return replace(requirement, min=1 / value)
     return replace(requirement, max=value)

@@ -1,4 +1,4 @@
-"""`Window`: the mean over a dither period of signals whose integral is known, on a uniform grid.
+"""`DitherPeriodMean`: the mean over a dither period of signals whose integral is known, on a uniform grid.
 
 With the integral as a state of the simulation the mean is as exact as that: ten samples a period do, where a
 trapezoidal rule on the signal's own samples takes twenty.
@@ -7,13 +7,12 @@ trapezoidal rule on the signal's own samples takes twenty.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pneuopt.quantities.arrays import Array
 
 
 @dataclass(frozen=True)
-class Window:
+class DitherPeriodMean:
     """A centred mean over `period`, of integrals that are cubic between samples.
 
     Parameters
@@ -28,13 +27,13 @@ class Window:
     spacing: float
 
     @property
-    def whole(self) -> int:
+    def half_period_samples(self) -> int:
         """Whole samples in half a period."""
         return int(self.period / 2 / self.spacing + 1e-9)
 
-    def reach(self, n: int) -> int:
+    def mean_count(self, n: int) -> int:
         """How many of n samples, from the first on, have a mean."""
-        return max(0, n - self.whole - 1)
+        return max(0, n - self.half_period_samples - 1)
 
     def means(self, signal: Array, integral: Array, initial: float, stride: int = 1) -> Array:
         """Means at every `stride`-th sample that has one.
@@ -55,7 +54,7 @@ class Window:
         >>> Window(0.5, 0.1).means(3 * t**2, t**3, 0.0)[0, 5].round(9).item()  # (0.75^3 - 0.25^3)/0.5
         0.8125
         """
-        m, h, n = self.whole, self.spacing, signal.shape[1]
+        m, h, n = self.half_period_samples, self.spacing, signal.shape[1]
         s = self.period / 2 / h - m
         before = np.arange(-m - 1, 0) * (h * initial)
         Y = np.concatenate([np.broadcast_to(before, (len(signal), m + 1)), integral - integral[:, :1]], axis=1)
@@ -63,9 +62,9 @@ class Window:
         near, far = (1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s)
         slope_near, slope_far = h * s * (1 - s) ** 2, h * s * s * (s - 1)
 
-        def at(rows: Array, ahead: int) -> Array:
-            return rows[:, m + 1 + ahead : m + 1 + ahead + self.reach(n) : stride]
+        def shift(rows: Array, ahead: int) -> Array:
+            return rows[:, m + 1 + ahead : m + 1 + ahead + self.mean_count(n) : stride]
 
-        total = near * (at(Y, m) - at(Y, -m)) + far * (at(Y, m + 1) - at(Y, -m - 1))
-        total += slope_near * (at(y, m) + at(y, -m)) + slope_far * (at(y, m + 1) + at(y, -m - 1))
+        total = near * (shift(Y, m) - shift(Y, -m)) + far * (shift(Y, m + 1) - shift(Y, -m - 1))
+        total += slope_near * (shift(y, m) + shift(y, -m)) + slope_far * (shift(y, m + 1) + shift(y, -m - 1))
         return np.asarray(total / self.period)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import tomlkit
 
 from pneuopt.dynamics.system import System
-from pneuopt.files.toml import Places, inline_table, read_parameter, read_toml, toml_table, write_parameter
+from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.logs.experiments import CHANNELS
 from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
@@ -28,35 +28,35 @@ from pneuopt.models.pneumatic.gas import (
     conductance_of_nominal_flow,
 )
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
-from pneuopt.quantities.errors import HardwareError, InputError, UnitError, UnknownNameError, check_known, require
-from pneuopt.quantities.output import plain, write_text
+from pneuopt.quantities.errors import HardwareError, InputError, UnitError, UnknownNameError, check_names, require
+from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import read_value
-from pneuopt.shooting.solution import Code, Status
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pneuopt.identification.identifiability import Verdict
 
-Sections = Mapping[str, Mapping[str, Any]]
+DriveSections = Mapping[str, Mapping[str, Any]]
 
-FRICTION: Mapping[str, Callable[[], FrictionModel]] = {
+FRICTION_MODELS: Mapping[str, Callable[[], FrictionModel]] = {
     "viscous": Viscous,
     "coulomb": Coulomb,
     "stribeck": Stribeck,
     "lugre": LuGre,
 }
-LAWS: Mapping[str, Callable[[], FlowLaw]] = {"iso6358": Iso6358, "isentropic": IsentropicNozzle}
-SPOOLS = {spool.name.lower(): spool for spool in Spool}
-PLANTS = ("first_order", "second_order", "integrator")
-CHAMBERS = ("pressure_a", "pressure_b")
-NOMINAL, CONDUCTANCE, RATIO = "nominal_flow", "valve.conductance", "valve.critical_ratio"
-RESULTS = ("estimates", "status", "verdict", "provenance")
+FLOW_LAWS: Mapping[str, Callable[[], FlowLaw]] = {"iso6358": Iso6358, "isentropic": IsentropicNozzle}
+SPOOL_MODELS = {spool.name.lower(): spool for spool in Spool}
+LINEAR_PLANTS = ("first_order", "second_order", "integrator")
+CHAMBER_PRESSURES = ("pressure_a", "pressure_b")
+NOMINAL_FLOW_KEY, CONDUCTANCE_NAME, CRITICAL_RATIO_NAME = "nominal_flow", "valve.conductance", "valve.critical_ratio"
+FIT_SECTIONS = ("estimates", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
 # What a section says about the drive's structure; every other key of it is a parameter.
-_STRUCTURE: Sections = {
+_DRIVE_STRUCTURE: DriveSections = {
     "drive": {"kind": "text"},
     "cylinder": {"stops": "true or false"},
     "valve": {"law": "text", "spool": "text", "smoothing": "a table", "nominal_flow": "text or a table"},
@@ -69,8 +69,8 @@ _STRUCTURE: Sections = {
     "plant": {"model": "text", "input": "text", "output": "text", "pade_order": "a whole number"},
     "rig": {"chamber": "true or false"},
 }
-_WIDTHS = {"corner": "1", "zero": "1", "pressure": "Pa"}
-_TYPES: Mapping[str, tuple[type, ...]] = {
+_SMOOTHING_UNITS = {"corner": "1", "zero": "1", "pressure": "Pa"}
+_STRUCTURE_TYPES: Mapping[str, tuple[type, ...]] = {
     "text": (str,),
     "true or false": (bool,),
     "true, false or a list": (bool, list),
@@ -88,7 +88,7 @@ class Drive(Protocol):
         ...
 
 
-class Fitted(Protocol):
+class WritableFit(Protocol):
     """What `write_fit` needs of a result."""
 
     @property
@@ -138,13 +138,13 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
         UnitError, UnknownNameError or other; the message names file, section and key.
     """
     document = read_toml(path)
-    places = Places(path, document.as_string())
-    sections = {name: section for name, section in document.unwrap().items() if name not in RESULTS}
+    places = FileLocations(path, document.as_string())
+    sections = {name: section for name, section in document.unwrap().items() if name not in FIT_SECTIONS}
     for name, section in sections.items():
-        check_known("section", [name], _STRUCTURE, places.at(name))
-        require(isinstance(section, dict), f"{places.at(name)}: {name} must be a section, [{name}]")
-    drive = _build(sections, places)
-    return drive, _filled(drive.system(), sections, places)
+        check_names("section", [name], _DRIVE_STRUCTURE, places.location(name))
+        require(isinstance(section, dict), f"{places.location(name)}: {name} must be a section, [{name}]")
+    drive = _build_drive(sections, places)
+    return drive, _read_parameters(drive.system(), sections, places)
 
 
 def read_status(path: str | Path) -> Status | None:
@@ -168,11 +168,11 @@ def read_status(path: str | Path) -> Status | None:
         return None
     codes = [code.value for code in Code]
     require(isinstance(said, dict), f"{path}: status must be a section, [status]")
-    check_known("status", [str(said.get("code"))], codes, f"{path}: [status] code")
+    check_names("status", [str(said.get("code"))], codes, f"{path}: [status] code")
     return Status(Code(said["code"]), str(said.get("message", "")))
 
 
-def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
+def write_fit(path: str | Path, source: str | Path, result: WritableFit) -> None:
     """Write a drive's file with the values found: the user's text and comments, [estimates], [status], [verdict], ...
 
     A parameter that the logs do not tell keeps its given value and text (see `IdentificationResult`).
@@ -192,7 +192,7 @@ def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
         If one of the files cannot be read or written.
     """
     document, (drive, given) = read_toml(source), read_drive(source)
-    if any(n in given and result.parameters[n] != given[n] for n in (CONDUCTANCE, RATIO)):
+    if any(n in given and result.parameters[n] != given[n] for n in (CONDUCTANCE_NAME, CRITICAL_RATIO_NAME)):
         given = _without_nominal_flow(document, drive, given)
     for name, found in result.parameters.items():
         if name in given and found != given[name]:
@@ -201,78 +201,80 @@ def write_fit(path: str | Path, source: str | Path, result: Fitted) -> None:
     document["estimates"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
-        document["verdict"] = toml_table(result.verdict.worded())
-    document["provenance"] = toml_table(plain(result.provenance))
+        document["verdict"] = toml_table(result.verdict.to_dict())
+    document["provenance"] = toml_table(plain_value(result.provenance))
     write_text(path, tomlkit.dumps(document))
 
 
 def _without_nominal_flow(document: tomlkit.TOMLDocument, drive: Drive, given: ParameterSet) -> ParameterSet:
     """Once the conductance or the critical ratio is estimated, a nominal flow no longer says both; drop it."""
     valve: Any = document.get("valve", {})
-    if NOMINAL not in valve:
+    if NOMINAL_FLOW_KEY not in valve:
         return given
-    valve.remove(NOMINAL)
-    return given | drive.system().parameters.select([CONDUCTANCE])
+    valve.remove(NOMINAL_FLOW_KEY)
+    return given | drive.system().parameters.select([CONDUCTANCE_NAME])
 
 
-def _build(sections: Sections, places: Places) -> Drive:
-    for name, known in _STRUCTURE.items():
+def _build_drive(sections: DriveSections, places: FileLocations) -> Drive:
+    for name, known in _DRIVE_STRUCTURE.items():
         for key in known.keys() & sections.get(name, {}).keys():
-            right = type(sections[name][key]) in _TYPES[known[key]]
-            require(right, f"{places.at(name, key)}: [{name}] {key} must be {known[key]}, got {sections[name][key]!r}")
-    kind = _choice(sections, "drive", "kind", _KINDS, places)
-    return _KINDS[kind](sections, places)
+            right = type(sections[name][key]) in _STRUCTURE_TYPES[known[key]]
+            require(
+                right, f"{places.location(name, key)}: [{name}] {key} must be {known[key]}, got {sections[name][key]!r}"
+            )
+    kind = _read_choice(sections, "drive", "kind", _DRIVE_KINDS, places)
+    return _DRIVE_KINDS[kind](sections, places)
 
 
-def _pneumatic(sections: Sections, places: Places) -> Drive:
-    law = LAWS[_choice(sections, "valve", "law", LAWS, places, "iso6358")]()
-    spool = SPOOLS[_choice(sections, "valve", "spool", SPOOLS, places, "second_order")]
+def _pneumatic_drive(sections: DriveSections, places: FileLocations) -> Drive:
+    law = FLOW_LAWS[_read_choice(sections, "valve", "law", FLOW_LAWS, places, "iso6358")]()
+    spool = SPOOL_MODELS[_read_choice(sections, "valve", "spool", SPOOL_MODELS, places, "second_order")]
     valve = ProportionalValve(law, spool, _smoothing(sections, places))
-    cylinder = Cylinder(**_said(sections, "cylinder"))
+    cylinder = Cylinder(**_structure_options(sections, "cylinder"))
     return PneumaticDrive(valve, _friction(sections, places), _load(sections), _chamber(sections, places), cylinder)
 
 
-def _smoothing(sections: Sections, places: Places) -> Smoothing:
+def _smoothing(sections: DriveSections, places: FileLocations) -> Smoothing:
     """How the orifice's law is rounded: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
     said, where = (
         sections.get("valve", {}).get("smoothing", {}),
-        f"{places.at('valve', 'smoothing')}: [valve] smoothing",
+        f"{places.location('valve', 'smoothing')}: [valve] smoothing",
     )
-    check_known("key", said, _WIDTHS, where)
-    widths = {n: read_value(v, _WIDTHS[n], where=f"{where}: {n}") for n, v in said.items()}
+    check_names("key", said, _SMOOTHING_UNITS, where)
+    widths = {n: read_value(v, _SMOOTHING_UNITS[n], where=f"{where}: {n}") for n, v in said.items()}
     for name, width in widths.items():
         require(width > 0, f"{where}: {name} must be positive, got {said[name]}; smaller is sharper and stiffer")
     return Smoothing(**widths)
 
 
-def _chamber(sections: Sections, places: Places) -> ChamberModel:
-    said = _said(sections, "chamber")
-    if _choice(sections, "chamber", "model", ("polytropic", "thermal"), places, "polytropic") == "polytropic":
+def _chamber(sections: DriveSections, places: FileLocations) -> ChamberModel:
+    said = _structure_options(sections, "chamber")
+    if _read_choice(sections, "chamber", "model", ("polytropic", "thermal"), places, "polytropic") == "polytropic":
         return Polytropic(said.get("mixed", False))
     require(
         "mixed" not in said,
-        f"{places.at('chamber', 'mixed')}: [chamber] mixed: a thermal chamber has no exponents; leave it out",
+        f"{places.location('chamber', 'mixed')}: [chamber] mixed: a thermal chamber has no exponents; leave it out",
     )
     return Thermal()
 
 
-def _force(sections: Sections, places: Places) -> Drive:
+def _force_drive(sections: DriveSections, places: FileLocations) -> Drive:
     return ForceDrive(_friction(sections, places), _load(sections))
 
 
-def _load(sections: Sections) -> Load:
-    return Load(**_said(sections, "load"))
+def _load(sections: DriveSections) -> Load:
+    return Load(**_structure_options(sections, "load"))
 
 
-def _motion(sections: Sections, places: Places) -> Drive:
+def _motion_drive(sections: DriveSections, places: FileLocations) -> Drive:
     return MotionDrive(_friction(sections, places), chamber=sections.get("rig", {}).get("chamber", True))
 
 
-def _linear(sections: Sections, places: Places) -> Drive:
+def _linear_plant(sections: DriveSections, places: FileLocations) -> Drive:
     plant = sections.get("plant", {})
-    model = _choice(sections, "plant", "model", PLANTS, places)
+    model = _read_choice(sections, "plant", "model", LINEAR_PLANTS, places)
     signals = [plant.get("input", "valve_voltage"), plant.get("output", "speed")]
-    check_known("channel", signals, CHANNELS, f"{places.at('plant')}: [plant]")
+    check_names("channel", signals, CHANNELS, f"{places.location('plant')}: [plant]")
     known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
     u, y = (known.get(name, Quantity(name, CHANNELS[name])) for name in signals)
     # Order 3 follows a delay up to 4.6 rad of phase and adds three states; 0 leaves the dead time out.
@@ -282,94 +284,106 @@ def _linear(sections: Sections, places: Places) -> Drive:
     return (FirstOrder if model == "first_order" else Integrator)(order, u, y)
 
 
-_KINDS: Mapping[str, Callable[[Sections, Places], Drive]] = {
-    "pneumatic": _pneumatic,
-    "force": _force,
-    "motion": _motion,
-    "linear": _linear,
+_DRIVE_KINDS: Mapping[str, Callable[[DriveSections, FileLocations], Drive]] = {
+    "pneumatic": _pneumatic_drive,
+    "force": _force_drive,
+    "motion": _motion_drive,
+    "linear": _linear_plant,
 }
 
 
-def _said(sections: Sections, name: str) -> dict[str, Any]:
+def _structure_options(sections: DriveSections, name: str) -> dict[str, Any]:
     """What a section says of the structure."""
-    return {key: value for key, value in sections.get(name, {}).items() if key in _STRUCTURE[name]}
+    return {key: value for key, value in sections.get(name, {}).items() if key in _DRIVE_STRUCTURE[name]}
 
 
-def _friction(sections: Sections, places: Places) -> FrictionModel:
+def _friction(sections: DriveSections, places: FileLocations) -> FrictionModel:
     said = sections.get("friction", {})
-    model = FRICTION[_choice(sections, "friction", "model", FRICTION, places)]()
+    model = FRICTION_MODELS[_read_choice(sections, "friction", "model", FRICTION_MODELS, places)]()
     if said.get("asymmetric", False):
         model = Asymmetric(model)
     dependent = said.get("pressure_dependent", False)
     if not dependent:
         return model
-    chambers = CHAMBERS if dependent is True else tuple(dependent)
-    check_known(
-        "chamber", chambers, CHAMBERS, f"{places.at('friction', 'pressure_dependent')}: [friction] pressure_dependent"
+    chambers = CHAMBER_PRESSURES if dependent is True else tuple(dependent)
+    check_names(
+        "chamber",
+        chambers,
+        CHAMBER_PRESSURES,
+        f"{places.location('friction', 'pressure_dependent')}: [friction] pressure_dependent",
     )
     return PressureDependent(model, chambers)
 
 
-def _choice(
-    sections: Sections,
+def _read_choice(
+    sections: DriveSections,
     section: str,
     key: str,
     known: Sequence[str] | Mapping[str, Any],
-    places: Places,
+    places: FileLocations,
     usual: str | None = None,
 ) -> str:
     value = sections.get(section, {}).get(key, usual)
     if value is None:
         raise InputError(
-            f'{places.at(section)}: [{section}] says no {key}; write {key} = "...", one of: {", ".join(known)}'
+            f'{places.location(section)}: [{section}] says no {key}; write {key} = "...", one of: {", ".join(known)}'
         )
-    check_known(key, [value], known, f"{places.at(section, key)}: [{section}]")
+    check_names(key, [value], known, f"{places.location(section, key)}: [{section}]")
     return str(value)
 
 
-def _filled(system: System, sections: Sections, places: Places) -> ParameterSet:
+def _read_parameters(system: System, sections: DriveSections, places: FileLocations) -> ParameterSet:
     defaults, edits = system.parameters, dict[str, Parameter]()
     known = {name.partition(".")[0] for name in defaults} | {"drive"}
     known |= {name for name in ("friction", "plant") if any(n.startswith(f"{name}.") for n in defaults)}
     for section, entries in sections.items():
         if section not in known:
-            where = f"{places.at(section)}: kind {sections['drive']['kind']!r}"
+            where = f"{places.location(section)}: kind {sections['drive']['kind']!r}"
             raise UnknownNameError("section", section, known, where)
-        structure = _STRUCTURE.get(section, {})
+        structure = _DRIVE_STRUCTURE.get(section, {})
         keys = [name.partition(".")[2] for name in defaults if name.startswith(f"{section}.")]
         for key in entries:
-            check_known("key", [key], [*structure, *keys], f"{places.at(section, key)}: [{section}]")
+            check_names("key", [key], [*structure, *keys], f"{places.location(section, key)}: [{section}]")
     entries = {f"{s}.{k}": v for s, said in sections.items() for k, v in said.items() if f"{s}.{k}" in defaults}
     _check_hardware(system, entries, places)
-    entries |= _nominal(sections, entries, defaults, places)
+    entries |= _nominal_conductance(sections, entries, defaults, places)
     for name, entry in entries.items():
-        edits[name] = read_parameter(entry, defaults[name], _place(name, places))
+        edits[name] = read_parameter(entry, defaults[name], _parameter_place(name, places))
     return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
 
 
-def _check_hardware(system: System, entries: Mapping[str, Any], places: Places) -> None:
+def _check_hardware(system: System, entries: Mapping[str, Any], places: FileLocations) -> None:
     """Refuse impossible values first, for the model's bounds do not say what would be possible."""
     said = {n: entry.get("value") if isinstance(entry, dict) else entry for n, entry in entries.items()}
     units = {n: system.parameters[n].unit for n in said}
-    given = {n: read_value(v, units[n], where=_place(n, places)) for n, v in said.items() if v is not None}
+    given = {n: read_value(v, units[n], where=_parameter_place(n, places)) for n, v in said.items() if v is not None}
     try:
         system.check(system.parameters | ParameterSet({n: Parameter(v, units[n]) for n, v in given.items()}))
     except HardwareError as error:
         if error.parameter not in given:
             raise InputError(f"{places}: {error} (the model's own value; the file says none)") from None
-        written = f"{_place(error.parameter, places)} = {tomlkit.item(said[error.parameter]).as_string()}"
+        written = f"{_parameter_place(error.parameter, places)} = {tomlkit.item(said[error.parameter]).as_string()}"
         raise InputError(f"{written} is impossible; {error.remedy}") from None
 
 
-def _nominal(sections: Sections, entries: Mapping[str, Any], defaults: ParameterSet, places: Places) -> dict[str, Any]:
+def _nominal_conductance(
+    sections: DriveSections, entries: Mapping[str, Any], defaults: ParameterSet, places: FileLocations
+) -> dict[str, Any]:
     """The conductance that [valve] nominal_flow means: 6 to 5 bar(g), in l/min(ANR), at the critical ratio given."""
-    said, where = sections.get("valve", {}).get(NOMINAL), f"{places.at('valve', NOMINAL)}: [valve] {NOMINAL}"
+    said, where = (
+        sections.get("valve", {}).get(NOMINAL_FLOW_KEY),
+        f"{places.location('valve', NOMINAL_FLOW_KEY)}: [valve] {NOMINAL_FLOW_KEY}",
+    )
     if said is None:
         return {}
-    require(CONDUCTANCE not in entries, f"{where} and conductance say the same; leave one of them out")
+    require(CONDUCTANCE_NAME not in entries, f"{where} and conductance say the same; leave one of them out")
     b = CRITICAL_RATIO
-    if RATIO in defaults:
-        b = read_parameter(entries.get(RATIO, defaults.value(RATIO)), defaults[RATIO], _place(RATIO, places)).value
+    if CRITICAL_RATIO_NAME in defaults:
+        b = read_parameter(
+            entries.get(CRITICAL_RATIO_NAME, defaults.value(CRITICAL_RATIO_NAME)),
+            defaults[CRITICAL_RATIO_NAME],
+            _parameter_place(CRITICAL_RATIO_NAME, places),
+        ).value
 
     def conductance(text: Any) -> str:
         is_anr = isinstance(text, str) and text.strip().endswith("(ANR)")
@@ -377,14 +391,14 @@ def _nominal(sections: Sections, entries: Mapping[str, Any], defaults: Parameter
         require(is_anr, f"{where}: {text!r}: {remedy}", UnitError)
         flow = read_value(text.strip().removesuffix("(ANR)"), "m^3/s", where=where)
         require(flow > 0, f"{where}: a flow is positive, got {text!r}")
-        return f"{conductance_of_nominal_flow(flow, b)!r} {defaults[CONDUCTANCE].unit}"
+        return f"{conductance_of_nominal_flow(flow, b)!r} {defaults[CONDUCTANCE_NAME].unit}"
 
     fields = said if isinstance(said, dict) else {"value": said}
     flows = ("value", "lower", "upper")
-    return {CONDUCTANCE: {f: conductance(v) if f in flows else v for f, v in fields.items()}}
+    return {CONDUCTANCE_NAME: {f: conductance(v) if f in flows else v for f, v in fields.items()}}
 
 
-def _place(name: str, places: Places) -> str:
+def _parameter_place(name: str, places: FileLocations) -> str:
     """Of a parameter: file, line, section and key."""
     section, _, key = name.partition(".")
-    return f"{places.at(section, key)}: [{section}] {key}"
+    return f"{places.location(section, key)}: [{section}] {key}"

@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.evaluation.requirements import KINDS, Requirement
+from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, Requirement
 from pneuopt.quantities.errors import UnitError, require
 from pneuopt.quantities.units import read_value
 
-KEYS: Mapping[str, type[Requirement]] = {
-    re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in KINDS
+REQUIREMENTS_BY_KEY: Mapping[str, type[Requirement]] = {
+    re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in REQUIREMENT_KINDS
 }
 """By its key each kind of requirement."""
 
@@ -30,7 +30,7 @@ def bound_units(loop: ClosedLoop) -> dict[str, str]:
     command, measured = loop.command.unit, loop.feedback.unit.partition("(")[0]
     times = dict.fromkeys(("settling_time", "rise_time", "iae", "ise"), "s")
     return (
-        dict.fromkeys(KEYS, "1")
+        dict.fromkeys(REQUIREMENTS_BY_KEY, "1")
         | times
         | {
             "itae": "s^2",

@@ -10,20 +10,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.files.requirements import read_bound
 from pneuopt.files.toml import read_toml
-from pneuopt.quantities.errors import InputError, check_known, require
+from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import read_value, scale_of, unit_of
+from pneuopt.quantities.units import read_unit, read_value, si_conversion
 
-_KEYS = {
+_SECTION_KEYS = {
     "study": ("drive", "tuning"),
     "metrics": ("band", "show"),
     "pareto": ("between", "points", "lower", "upper"),
 }
-_RANGE = ("from", "to", "steps")
-_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
-_SHOWN = ("SettlingTime", "Overshoot")
-_PAIR = 'between = ["settling_time", "peak_control"]'
-_POINTS = 9  # of a front, where the file says none
+_RANGE_KEYS = ("from", "to", "steps")
+_AXIS_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
+_DEFAULT_METRICS = ("SettlingTime", "Overshoot")
+_BETWEEN_EXAMPLE = 'between = ["settling_time", "peak_control"]'
+_DEFAULT_POINTS = 9  # of a front, where the file says none
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Axis:
     factor: float
     offset: float
 
-    def shown(self, values: ArrayLike) -> NDArray[np.float64]:
+    def in_axis_unit(self, values: ArrayLike) -> NDArray[np.float64]:
         """SI values as numbers in the unit in which the axis is written."""
         return (np.asarray(values, dtype=float) - self.offset) / self.factor
 
@@ -114,21 +114,21 @@ def read_study(path: str | Path) -> Study:
     InputError
         UnitError, UnknownNameError or other; the message names file, section and key.
     """
-    path, said = Path(path), read_toml(path).unwrap()
-    check_known("section", said, (*_KEYS, "axes"), str(path))
-    for name in said:
-        require(isinstance(said[name], dict), f"{path}: {name} must be a section, [{name}]")
-    for name, keys in _KEYS.items():
-        check_known("key", said.get(name, {}), keys, f"{path}: [{name}]")
-    axes, metrics = _axes(said.get("axes", {})), said.get("metrics", {})
+    path, table = Path(path), read_toml(path).unwrap()
+    check_names("section", table, (*_SECTION_KEYS, "axes"), str(path))
+    for name in table:
+        require(isinstance(table[name], dict), f"{path}: {name} must be a section, [{name}]")
+    for name, keys in _SECTION_KEYS.items():
+        check_names("key", table.get(name, {}), keys, f"{path}: [{name}]")
+    axes, metrics = _flatten_axes(table.get("axes", {})), table.get("metrics", {})
     for name in ("axes", "metrics"):
-        alone = name not in said or "pareto" not in said
+        alone = name not in table or "pareto" not in table
         require(alone, f"{path}: [{name}] belongs to a grid, [pareto] to a front; leave one of them out")
-    require(bool(axes) or "pareto" in said, f'{path}: no axis; add [axes] with "load.mass" = {_EXAMPLE}')
+    require(bool(axes) or "pareto" in table, f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
     band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
     require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
-    drive, tuning = (_file(said.get("study", {}), key, path) for key in _KEYS["study"])
-    return Study(path, drive, tuning, axes, band, _shown(metrics, path), said.get("pareto"))
+    drive, tuning = (_file_path(table.get("study", {}), key, path) for key in _SECTION_KEYS["study"])
+    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), table.get("pareto"))
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[Axis, ...]:
@@ -148,9 +148,10 @@ def read_axes(study: Study, parameters: ParameterSet) -> tuple[Axis, ...]:
     InputError
         If a parameter is unknown, or a value cannot be read.
     """
-    check_known("parameter", study.axes, parameters, f"{study.path}: [axes]")
+    check_names("parameter", study.axes, parameters, f"{study.path}: [axes]")
     return tuple(
-        _axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}") for name, entry in study.axes.items()
+        _read_axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}")
+        for name, entry in study.axes.items()
     )
 
 
@@ -173,65 +174,68 @@ def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
     InputError
         If a requirement is unknown or there twice, or a value cannot be read.
     """
-    said, where = study.pareto or {}, f"{study.path}: [pareto]"
-    pair, points = said.get("between"), said.get("points", _POINTS)
+    table, where = study.pareto or {}, f"{study.path}: [pareto]"
+    pair, points = table.get("between"), table.get("points", _DEFAULT_POINTS)
     two = isinstance(pair, list) and len(pair) == 2 and all(isinstance(key, str) for key in pair)
-    require(two, f"{where} between must name two requirements, {_PAIR}" + ("" if pair is None else f", got {pair}"))
+    require(
+        two,
+        f"{where} between must name two requirements, {_BETWEEN_EXAMPLE}" + ("" if pair is None else f", got {pair}"),
+    )
     first, second = (str(key) for key in pair or ())
-    check_known("requirement", (first, second), units, f"{where} between")
-    require(first != second, f"{where} between names {first} twice; a front needs two requirements, {_PAIR}")
+    check_names("requirement", (first, second), units, f"{where} between")
+    require(first != second, f"{where} between names {first} twice; a front needs two requirements, {_BETWEEN_EXAMPLE}")
     counts = isinstance(points, int) and not isinstance(points, bool) and points >= 2
     require(counts, f"{where} points is the number of designs, at least 2, got {points!r}")
-    given = [key for key in ("lower", "upper") if key in said]
-    ends = {key: read_bound(second, said[key], units[second], f"{where} {key}") for key in given}
+    given = [key for key in ("lower", "upper") if key in table]
+    ends = {key: read_bound(second, table[key], units[second], f"{where} {key}") for key in given}
     for key, value in ends.items():
-        require(value > 0, f"{where} {key}: {second} must be positive, got {said[key]!r}")
+        require(value > 0, f"{where} {key}: {second} must be positive, got {table[key]!r}")
     ordered = len(ends) < 2 or ends["lower"] < ends["upper"]
-    require(ordered, f"{where} lower, {said.get('lower')}, is not below upper, {said.get('upper')}")
+    require(ordered, f"{where} lower, {table.get('lower')}, is not below upper, {table.get('upper')}")
     return Pareto((first, second), points, ends.get("lower"), ends.get("upper"))
 
 
-def _axes(said: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten_axes(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """By full name; without quotes, TOML reads `load.mass` as a table within a table."""
     found: dict[str, Any] = {}
-    for key, entry in said.items():
-        nested = isinstance(entry, dict) and not set(_RANGE) & entry.keys()
-        found |= _axes(entry, f"{prefix}{key}.") if nested else {f"{prefix}{key}": entry}
+    for key, entry in table.items():
+        nested = isinstance(entry, dict) and not set(_RANGE_KEYS) & entry.keys()
+        found |= _flatten_axes(entry, f"{prefix}{key}.") if nested else {f"{prefix}{key}": entry}
     return found
 
 
-def _axis(name: str, entry: Any, unit: str, where: str) -> Axis:
+def _read_axis(name: str, entry: Any, unit: str, where: str) -> Axis:
     good = isinstance(entry, list | dict) and len(entry) > 0
-    require(good, f"{where}: write a list or a range, {_EXAMPLE}")
+    require(good, f"{where}: write a list or a range, {_AXIS_EXAMPLE}")
     if isinstance(entry, list):
         first, values = entry[0], [read_value(e, unit, where=where) for e in entry]
     else:
-        first, values = entry.get("from"), _range(entry, unit, where)
-    written = unit_of(first, unit)
-    factor, offset = scale_of(written, unit, where=where)
+        first, values = entry.get("from"), _read_range(entry, unit, where)
+    written = read_unit(first, unit)
+    factor, offset = si_conversion(written, unit, where=where)
     return Axis(name, tuple(values), written, factor, offset)
 
 
-def _range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
-    check_known("key", entry, _RANGE, where)
-    for key in _RANGE:
-        require(key in entry, f"{where} says no {key}; write {_EXAMPLE}")
+def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
+    check_names("key", entry, _RANGE_KEYS, where)
+    for key in _RANGE_KEYS:
+        require(key in entry, f"{where} says no {key}; write {_AXIS_EXAMPLE}")
     steps = entry["steps"]
     counts = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 2
     require(counts, f"{where} steps is the number of values, at least 2, got {steps!r}")
-    first, last = (read_value(entry[key], unit, where=f"{where} {key}") for key in _RANGE[:2])
+    first, last = (read_value(entry[key], unit, where=f"{where} {key}") for key in _RANGE_KEYS[:2])
     return [float(v) for v in np.linspace(first, last, steps)]
 
 
-def _shown(metrics: Mapping[str, Any], path: Path) -> tuple[str, ...]:
-    show = metrics.get("show", list(_SHOWN))
+def _metric_names(metrics: Mapping[str, Any], path: Path) -> tuple[str, ...]:
+    show = metrics.get("show", list(_DEFAULT_METRICS))
     good = isinstance(show, list) and len(show) > 0 and all(isinstance(name, str) for name in show)
     require(good, f'{path}: [metrics] show must be a list of names, ["SettlingTime", "Overshoot"], got {show!r}')
     return tuple(dict.fromkeys(show))
 
 
-def _file(said: Mapping[str, Any], key: str, path: Path) -> Path:
-    if key not in said:
+def _file_path(table: Mapping[str, Any], key: str, path: Path) -> Path:
+    if key not in table:
         raise InputError(f'{path}: [study] says no {key}; write {key} = "{key}.toml"')
-    require(isinstance(said[key], str), f"{path}: [study] {key} must be a file's name, got {said[key]!r}")
-    return path.parent / str(said[key])
+    require(isinstance(table[key], str), f"{path}: [study] {key} must be a file's name, got {table[key]!r}")
+    return path.parent / str(table[key])

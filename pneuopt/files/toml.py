@@ -13,15 +13,15 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
-from pneuopt.quantities.errors import InputError, check_known, require
-from pneuopt.quantities.output import plain
+from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.output import plain_value
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.units import read_value, write_value
 
-_FLAGS = ("free", "log", "per_log")
-_HEAD = re.compile(r"\s*\[+([^\[\]]+)\]")
-_KEY = re.compile(r"\s*([\w\"'. -]+?)\s*=")
-_FIELDS = ("value", "lower", "upper", *_FLAGS, "source")
+_PARAMETER_FLAGS = ("free", "log", "per_log")
+_SECTION_HEAD = re.compile(r"\s*\[+([^\[\]]+)\]")
+_KEY_LINE = re.compile(r"\s*([\w\"'. -]+?)\s*=")
+_PARAMETER_FIELDS = ("value", "lower", "upper", *_PARAMETER_FLAGS, "source")
 
 
 def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
@@ -51,7 +51,7 @@ def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
 
 
 @dataclass(frozen=True)
-class Places:
+class FileLocations:
     """Where things stand in a TOML file, for messages; printed, it is the file's name.
 
     Parameters
@@ -67,7 +67,7 @@ class Places:
     def __str__(self) -> str:
         return str(self.path)
 
-    def at(self, section: str, key: str = "") -> str:
+    def location(self, section: str, key: str = "") -> str:
         r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it says no such.
 
         Examples
@@ -78,12 +78,12 @@ class Places:
         head: tuple[str, ...] = ()
         wanted = (section, key) if key else (section,)
         for number, line in enumerate(self.text.splitlines(), 1):
-            entry, table = _KEY.match(line), _HEAD.match(line)
-            head = _bare(table[1]) if table else head
-            said = head + _bare(entry[1]) if entry and not table else head
+            entry, table = _KEY_LINE.match(line), _SECTION_HEAD.match(line)
+            head = _key_parts(table[1]) if table else head
+            said = head + _key_parts(entry[1]) if entry and not table else head
             if said[: len(wanted)] == wanted:
                 return f"{self.path}:{number}"
-        return str(self.path) if not key else self.at(section)
+        return str(self.path) if not key else self.location(section)
 
 
 def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
@@ -107,11 +107,13 @@ def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
         If a value cannot be read, a key is unknown, or the value lies outside its bounds.
     """
     fields = entry if isinstance(entry, dict) else {"value": entry}
-    check_known("key", fields, _FIELDS, where)
-    numbers: dict[str, Any] = {f: read_value(fields[f], default.unit, where=where) for f in _FIELDS[:3] if f in fields}
-    for flag in _FLAGS:
+    check_names("key", fields, _PARAMETER_FIELDS, where)
+    numbers: dict[str, Any] = {
+        f: read_value(fields[f], default.unit, where=where) for f in _PARAMETER_FIELDS[:3] if f in fields
+    }
+    for flag in _PARAMETER_FLAGS:
         require(isinstance(fields.get(flag, False), bool), f"{where}: {flag} must be true or false")
-    others = {f: fields[f] for f in (*_FLAGS, "source") if f in fields}
+    others = {f: fields[f] for f in (*_PARAMETER_FLAGS, "source") if f in fields}
     if "value" in fields:
         others.setdefault("source", "")
     try:
@@ -135,15 +137,17 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
     if section not in document:
         document[section] = tomlkit.table()
     entries: Any = document[section]
-    fields: dict[str, Any] = {f: _written(getattr(found, f), found) for f in _FIELDS[:3] if _differ(f, found, given)}
-    fields |= {f: getattr(found, f) for f in (*_FLAGS, "source") if _differ(f, found, given)}
+    fields: dict[str, Any] = {
+        f: _format_value(getattr(found, f), found) for f in _PARAMETER_FIELDS[:3] if _field_differs(f, found, given)
+    }
+    fields |= {f: getattr(found, f) for f in (*_PARAMETER_FLAGS, "source") if _field_differs(f, found, given)}
     entry = entries.get(key)
     if isinstance(entry, InlineTable | Table):
         entry.update(fields)
     elif fields.keys() == {"value"}:
         entries[key] = fields["value"]
     else:
-        entries[key] = inline_table({"value": entry or _written(found.value, found)} | fields)
+        entries[key] = inline_table({"value": entry or _format_value(found.value, found)} | fields)
 
 
 def toml_table(entries: Mapping[str, Any]) -> Table:
@@ -156,20 +160,20 @@ def toml_table(entries: Mapping[str, Any]) -> Table:
 def inline_table(entries: Mapping[Any, Any]) -> InlineTable:
     """A table in one line, of plain values."""
     table = tomlkit.inline_table()
-    table.update(plain(entries))
+    table.update(plain_value(entries))
     return table
 
 
-def _bare(dotted: str) -> tuple[str, ...]:
+def _key_parts(dotted: str) -> tuple[str, ...]:
     """The parts of a dotted key, unquoted."""
     return tuple(part.strip().strip("\"'") for part in dotted.split("."))
 
 
-def _differ(field: str, found: Parameter, given: Parameter) -> bool:
+def _field_differs(field: str, found: Parameter, given: Parameter) -> bool:
     return bool(getattr(found, field) != getattr(given, field))
 
 
-def _written(value: float, parameter: Parameter) -> str:
+def _format_value(value: float, parameter: Parameter) -> str:
     """Nine digits, or all of them where rounding would cross a bound."""
     text = write_value(value, parameter.unit, 9)
     inside = parameter.lower <= read_value(text, parameter.unit) <= parameter.upper

@@ -11,29 +11,29 @@ import tomlkit
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.requirements import AT_LEAST, Bounds, Requirement
-from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.requirements import MINIMUM_REQUIREMENTS, EnvelopeBounds, Requirement
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import specify
-from pneuopt.files.loop import SECTIONS, TUNABLE, checked, read_loop, value_of
-from pneuopt.files.requirements import KEYS, bound_units, read_bound
-from pneuopt.files.scenarios import read_fresh, read_scenarios
+from pneuopt.files.loop import LOOP_SECTIONS, TUNABLE_SECTIONS, construct_at, read_fixed_value, read_loop_sections
+from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
+from pneuopt.files.scenarios import read_scenarios, read_validation_scenarios
 from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.quantities.errors import check_known, require
-from pneuopt.quantities.output import plain, write_text
+from pneuopt.quantities.errors import check_names, require
+from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Status
 from pneuopt.quantities.units import read_value
-from pneuopt.shooting.solution import Status
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Sections = Mapping[str, Any]
+TuningSections = Mapping[str, Any]
 
-RESULTS = ("certified", "status", "provenance")
+TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
-_SECTIONS = (*SECTIONS, "reference", "minimise", "limits", "scenarios")
-_OWN: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
+_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios")
+_EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Tuning:
     subject_to : tuple of Requirement
     scenarios : callable
         Of the nominal parameters: the plants and tolerances beside them.
-    fresh : callable
+    validation_scenarios : callable
         Likewise: others from the same boxes, to validate a design on.
     """
 
@@ -60,11 +60,11 @@ class Tuning:
     parameters: ParameterSet
     minimise: Mapping[Requirement, float]
     subject_to: tuple[Requirement, ...]
-    scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NOMINAL
-    fresh: Callable[[ParameterSet], Scenarios] = lambda _: NOMINAL
+    scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
+    validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
 
 
-class Tuned(Protocol):
+class WritableTuning(Protocol):
     """What `write_tuned` needs of a result."""
 
     @property
@@ -106,20 +106,22 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     InputError
         UnitError, UnknownNameError, ModelError or other; the message names file, section and key.
     """
-    said = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in RESULTS}
-    check_known("section", said, _SECTIONS, str(path))
-    for name in (n for n in _SECTIONS if n != "reference"):
-        require(isinstance(said.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
-    require("pid" in said, f"{path}: no controller; add a section [pid]")
-    loop, parameters = read_loop(said, plant, path)
-    minimise, subject_to = _minimise(said, path), _limits(said, loop, path)
+    table = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in TUNED_SECTIONS}
+    check_names("section", table, _TUNING_SECTIONS, str(path))
+    for name in (n for n in _TUNING_SECTIONS if n != "reference"):
+        require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
+    require("pid" in table, f"{path}: no controller; add a section [pid]")
+    loop, parameters = read_loop_sections(table, plant, path)
+    minimise, subject_to = _read_objective(table, path), _read_requirements(table, loop, path)
     if minimise:
-        checked(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
-    drawn = [partial(read, said.get("scenarios", {}), str(path)) for read in (read_scenarios, read_fresh)]
-    return Tuning(loop, _references(said, loop, path), parameters, minimise, subject_to, *drawn)
+        construct_at(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
+    drawn = [
+        partial(read, table.get("scenarios", {}), str(path)) for read in (read_scenarios, read_validation_scenarios)
+    ]
+    return Tuning(loop, _references(table, loop, path), parameters, minimise, subject_to, *drawn)
 
 
-def write_tuned(path: str | Path, source: str | Path, result: Tuned) -> None:
+def write_tuned(path: str | Path, source: str | Path, result: WritableTuning) -> None:
     """Write a tuning's file with the gains found: the user's text and comments, [certified], [status], [provenance].
 
     Parameters
@@ -137,22 +139,22 @@ def write_tuned(path: str | Path, source: str | Path, result: Tuned) -> None:
         If one of the files cannot be read or written.
     """
     document = read_toml(source)
-    for name in RESULTS:
+    for name in TUNED_SECTIONS:
         document.pop(name, None)
     status = {"code": result.status.code.value, "message": result.status.message}
     if result.status.converged:
-        _fill(document, result.parameters, source)
+        _write_gains(document, result.parameters, source)
         rows = result.certified.to_dict(orient="dict")
         document["certified"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
     else:
         status["gains"] = f"as in {Path(source).name}: not tuned"
     document["status"] = toml_table(status)
-    document["provenance"] = toml_table(plain(result.provenance))
+    document["provenance"] = toml_table(plain_value(result.provenance))
     write_text(path, tomlkit.dumps(document))
 
 
-def _references(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
-    entries = said.get("reference", [])
+def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
+    entries = table.get("reference", [])
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
     require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
@@ -166,70 +168,70 @@ def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
     unit, outputs = loop.feedback.unit, {q.name: q.unit for q in loop.plant.outputs}
     difference = unit.partition("(")[0]
     units = {"step": difference, "initial": unit, "at": "s", "horizon": "s", "scale": difference}
-    check_known("key", entry, (*units, "start", "disturbance"), where)
+    check_names("key", entry, (*units, "start", "disturbance"), where)
     start = entry.get("start", {})
     require(isinstance(start, dict), f'{where} start: write start = {{ position = "250 mm" }}')
-    check_known("output", start, outputs, f"{where} start")
+    check_names("output", start, outputs, f"{where} start")
     for key in ("horizon",) if "disturbance" in entry else ("step", "horizon"):
         require(key in entry, f"{where} says no {key}")
-    read = {("size" if k == "step" else k): value_of(entry, k, units[k], where) for k in units if k in entry}
+    read = {("size" if k == "step" else k): read_fixed_value(entry, k, units[k], where) for k in units if k in entry}
     pushed = _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")
-    begun = {n: value_of(start, n, outputs[n], f"{where} start") for n in start}
+    begun = {n: read_fixed_value(start, n, outputs[n], f"{where} start") for n in start}
     known: dict[str, Any] = {"size": 0.0, **read, "start": begun, "disturbance": pushed}
-    return checked(lambda: Step(**known), where)
+    return construct_at(lambda: Step(**known), where)
 
 
-def _disturbance(said: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
+def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
     """By how much parameters and inputs of the plant change."""
-    require(isinstance(said, dict), f'{where}: write disturbance = {{ "load.force" = "50 N" }}')
-    flat = {f"{n}.{m}": v for n, e in said.items() if isinstance(e, dict) for m, v in e.items()}
-    flat |= {n: v for n, v in said.items() if not isinstance(v, dict)}
+    require(isinstance(table, dict), f'{where}: write disturbance = {{ "load.force" = "50 N" }}')
+    flat = {f"{n}.{m}": v for n, e in table.items() if isinstance(e, dict) for m, v in e.items()}
+    flat |= {n: v for n, v in table.items() if not isinstance(v, dict)}
     units = {q.name: q.unit for q in loop.plant.inputs} | {n: p.unit for n, p in loop.plant.parameters.items()}
-    check_known("parameter or input of the plant", flat, units, where)
-    return {n: value_of(flat, n, units[n].partition("(")[0], where) for n in flat}
+    check_names("parameter or input of the plant", flat, units, where)
+    return {n: read_fixed_value(flat, n, units[n].partition("(")[0], where) for n in flat}
 
 
-def _minimise(said: Sections, path: str | Path) -> dict[Requirement, float]:
+def _read_objective(table: TuningSections, path: str | Path) -> dict[Requirement, float]:
     where = f"{path}: [minimise]"
-    check_known("requirement", said.get("minimise", {}), KEYS, where)
+    check_names("requirement", table.get("minimise", {}), REQUIREMENTS_BY_KEY, where)
     weights = {}
-    for key, entry in said.get("minimise", {}).items():
+    for key, entry in table.get("minimise", {}).items():
         spot = f"{where} {key}"
         require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
-        check_known("key", entry, ("weight", *_own(key)), spot)
-        weight = value_of(entry, "weight", "1", spot) if "weight" in entry else 1.0
+        check_names("key", entry, ("weight", *_extra_keys(key)), spot)
+        weight = read_fixed_value(entry, "weight", "1", spot) if "weight" in entry else 1.0
         require(0 < weight < float("inf"), f"{spot}: weight must be positive, got {weight:g}")
-        weights[_requirement(key, entry, {"max": None} if key == "step_envelope" else {}, spot)] = weight
+        weights[_make_requirement(key, entry, {"max": None} if key == "step_envelope" else {}, spot)] = weight
     return weights
 
 
-def _limits(said: Sections, loop: ClosedLoop, path: str | Path) -> tuple[Requirement, ...]:
+def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Requirement, ...]:
     where = f"{path}: [limits]"
-    check_known("requirement", said.get("limits", {}), KEYS, where)
+    check_names("requirement", table.get("limits", {}), REQUIREMENTS_BY_KEY, where)
     units, found = bound_units(loop), []
-    for key, given in said.get("limits", {}).items():
+    for key, given in table.get("limits", {}).items():
         spot = f"{where} {key}"
-        bound = "min" if issubclass(KEYS[key], AT_LEAST) else "max"
+        bound = "min" if issubclass(REQUIREMENTS_BY_KEY[key], MINIMUM_REQUIREMENTS) else "max"
         entry = given if isinstance(given, dict) else {bound: given}
-        check_known("key", entry, (bound, *_own(key)), spot)
+        check_names("key", entry, (bound, *_extra_keys(key)), spot)
         require(bound in entry or key == "step_envelope", f"{spot} says no {bound}")
         at = f"{spot} {bound}" if entry is given else spot
         limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
-        found.append(_requirement(key, entry, limit, spot))
+        found.append(_make_requirement(key, entry, limit, spot))
     return tuple(found)
 
 
-def _requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], where: str) -> Requirement:
+def _make_requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], where: str) -> Requirement:
     own: dict[str, Any] = dict(limit)
     if key == "step_envelope":
-        own["bounds"] = _bounds(entry.get("bounds"), f"{where} bounds")
+        own["bounds"] = _read_envelope(entry.get("bounds"), f"{where} bounds")
     elif "band" in entry:
-        own["band"] = value_of(entry, "band", "1", where)
-    return checked(lambda: KEYS[key](**own), where)
+        own["band"] = read_fixed_value(entry, "band", "1", where)
+    return construct_at(lambda: REQUIREMENTS_BY_KEY[key](**own), where)
 
 
-def _bounds(said: Any, where: str) -> Bounds:
-    rows = said if isinstance(said, list) else []
+def _read_envelope(table: Any, where: str) -> EnvelopeBounds:
+    rows = table if isinstance(table, list) else []
     proper = len(rows) > 0 and all(isinstance(row, list) and len(row) == 3 for row in rows)
     require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
     return tuple(
@@ -238,12 +240,12 @@ def _bounds(said: Any, where: str) -> Bounds:
     )
 
 
-def _own(key: str) -> tuple[str, ...]:
-    return (_OWN[key],) if key in _OWN else ()
+def _extra_keys(key: str) -> tuple[str, ...]:
+    return (_EXTRA_KEYS[key],) if key in _EXTRA_KEYS else ()
 
 
-def _fill(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
-    for section in TUNABLE:
+def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
+    for section in TUNABLE_SECTIONS:
         for key, entry in document.unwrap().get(section, {}).items():
             if isinstance(entry, dict) and entry.get("free", False):
                 found = tuned[f"{section}.{key}"]

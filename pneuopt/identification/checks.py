@@ -8,25 +8,30 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.dynamics.hooks import Log
-from pneuopt.dynamics.system import DIRECTION, System, names
+from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.statistics import noise_level
 from pneuopt.logs.doctor import Finding, examine
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_known, require
+from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 
-REFERENCES = ("speed_reference", "position_reference")  # a loop's set-points may stay in a log; no plant reads them
-Model = System | LoggedLoop
-LONGEST_PAUSE = 50  # usual steps without a sample; the inputs in between are unknown
+SETPOINT_CHANNELS = (
+    "speed_reference",
+    "position_reference",
+)  # a loop's set-points may stay in a log; no plant reads them
+EstimationModel = System | LoggedLoop
+MAX_PAUSE_STEPS = 50  # usual steps without a sample; the inputs in between are unknown
 
 
-def check_logs(system: Model, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
+def check_logs(
+    system: EstimationModel, experiments: Sequence[Experiment], parameters: ParameterSet
+) -> list[Experiment]:
     """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
     require(len(experiments) > 0, "no experiments: give at least one log", LogError)
-    check_known("parameter", parameters, system.parameters)
+    check_names("parameter", parameters, system.parameters)
     system.check(parameters)
-    known = {*names(system.inputs), *names(system.outputs), *REFERENCES}
+    known = {*names(system.inputs), *names(system.outputs), *SETPOINT_CHANNELS}
     taken: set[str] = set()
     out = []
     for number, experiment in enumerate(experiments, 1):
@@ -38,7 +43,7 @@ def check_logs(system: Model, experiments: Sequence[Experiment], parameters: Par
         _check_channels(system, experiment, name, known)
         _check_conditions(system, experiment, parameters, name)
         out.append(replace(experiment, name=name))
-    return _with_noise(system, out)
+    return _fill_noise(system, out)
 
 
 def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> None:
@@ -63,7 +68,9 @@ def check_content(experiments: Sequence[Experiment]) -> None:
         require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}", LogError)
 
 
-def doubts(system: Model, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
+def emit_log_warnings(
+    system: EstimationModel, experiments: Sequence[Experiment], parameters: ParameterSet
+) -> tuple[str, ...]:
     """What the model tells against logs that `check_logs` has passed, as a gauge pressure read as absolute.
 
     Each sentence is warned of, too. A loop's logs hold no command, without which its plant tells nothing.
@@ -72,38 +79,38 @@ def doubts(system: Model, experiments: Sequence[Experiment], parameters: Paramet
         return ()
     every = system.parameters | parameters
     known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
-    found = system.doubts({e.name: Log(e.trajectory, known[e.name]) for e in experiments})
+    found = system.log_warnings({e.name: Log(e.trajectory, known[e.name]) for e in experiments})
     for sentence in found:
         warnings.warn(sentence, PhysicsWarning, stacklevel=3)
     return tuple(found)
 
 
-def check_smooth(system: Model) -> None:
+def check_smooth(system: EstimationModel) -> None:
     """Refuse Karnopp's friction where derivatives are taken: without its events a search sees no dry friction."""
     message = (
         "the plant has Karnopp's friction (friction.direction), which only a simulation switches; search on the smooth "
         "model, Coulomb() or Stribeck(), and prove the result on this one with simulate, evaluate or record"
     )
-    require(DIRECTION not in system.parameters, message, ModelError)
+    require(FRICTION_DIRECTION not in system.parameters, message, ModelError)
 
 
-def _check_conditions(system: Model, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
+def _check_conditions(system: EstimationModel, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
     """The hardware as it is in this log."""
-    check_known("parameter", experiment.conditions, system.parameters, f"{name}: condition")
+    check_names("parameter", experiment.conditions, system.parameters, f"{name}: condition")
     try:
         system.check((system.parameters | parameters).with_values(experiment.conditions))
     except InputError as error:
         raise InputError(f"{name}: condition {error}") from None
 
 
-def _check_channels(system: Model, experiment: Experiment, name: str, known: set[str]) -> None:
+def _check_channels(system: EstimationModel, experiment: Experiment, name: str, known: set[str]) -> None:
     trajectory = experiment.trajectory
     require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
     steps = np.diff(trajectory.t)
     widest, usual = int(np.argmax(steps)), float(np.median(steps))
     pause = f"{name}: nothing is logged for {steps[widest]:g} s from t = {trajectory.t[widest]:g} s"
     remedy = f"the usual step is {usual:g} s; cut the log in two there"
-    require(steps[widest] <= LONGEST_PAUSE * usual, f"{pause}; {remedy}", LogError)
+    require(steps[widest] <= MAX_PAUSE_STEPS * usual, f"{pause}; {remedy}", LogError)
     for q in system.inputs:
         needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
         require(q.name in trajectory, needed + ", ".join(trajectory.names), LogError)
@@ -114,21 +121,21 @@ def _check_channels(system: Model, experiment: Experiment, name: str, known: set
         )
     for channel in trajectory:
         remedy = "leave it out (Experiment.select, or the sidecar's [columns])"
-        reads = ", ".join(sorted(known.difference(REFERENCES)))
+        reads = ", ".join(sorted(known.difference(SETPOINT_CHANNELS)))
         message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
         require(channel in known, message, LogError)
     outputs = ", ".join(names(system.outputs))
-    require(bool(measured_outputs(system, experiment)), f"{name}: none of the outputs is logged: {outputs}", LogError)
-    for channel in measured_outputs(system, experiment):
+    require(bool(outputs_in_log(system, experiment)), f"{name}: none of the outputs is logged: {outputs}", LogError)
+    for channel in outputs_in_log(system, experiment):
         empty = f"{name}: channel {channel!r} holds no sample; leave it out"
         require(bool(np.isfinite(trajectory[channel]).any()), empty, LogError)
 
 
-def _with_noise(system: Model, experiments: Sequence[Experiment]) -> list[Experiment]:
+def _fill_noise(system: EstimationModel, experiments: Sequence[Experiment]) -> list[Experiment]:
     """Where a log declares no noise: the median over all logs of what the channel shows, for sensors are shared."""
     found: dict[str, dict[str, float]] = {}
     for experiment in experiments:
-        for channel in measured_outputs(system, experiment):
+        for channel in outputs_in_log(system, experiment):
             if channel not in experiment.noise:
                 found.setdefault(channel, {})[experiment.name] = noise_level(
                     experiment.trajectory[channel], experiment.trajectory.t
@@ -146,7 +153,7 @@ def _with_noise(system: Model, experiments: Sequence[Experiment]) -> list[Experi
     ]
 
 
-def measured_outputs(system: Model, experiment: Experiment) -> tuple[str, ...]:
+def outputs_in_log(system: EstimationModel, experiment: Experiment) -> tuple[str, ...]:
     """The system's outputs that a log holds, unless they are its inputs, too."""
     inputs = names(system.inputs)
     return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)

@@ -11,7 +11,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.identify import IdentificationResult, identify
-from pneuopt.identification.problem import as_logged
+from pneuopt.identification.problem import as_estimation_model
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -20,8 +20,10 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     import pandas as pd
 
-APART = 4.0  # standard deviations between a log's own estimate and the others' from which they are not one drive's
-DIFFERENT = 0.02  # relative difference likewise, for tiny intervals do not hold the bias of a model
+DISAGREEMENT_DEVIATIONS = (
+    4.0  # standard deviations between a log's own estimate and the others' from which they are not one drive's
+)
+MIN_RELATIVE_DIFFERENCE = 0.02  # relative difference likewise, for tiny intervals do not hold the bias of a model
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,26 +81,28 @@ def compare_logs(
         If there is one log only, or logs, system and parameters do not fit together.
     """
     require(len(experiments) > 1, f"{len(experiments)} log is not to be compared; give at least two", LogError)
-    logs = check_logs(as_logged(system), experiments, parameters)
+    logs = check_logs(as_estimation_model(system), experiments, parameters)
     fits = {}
     for log in logs:
         own = parameters.fixed(*(n for n in log.conditions if n in parameters))
         if own.free_names:
             fits[log.name] = identify(system, [log], own, method=method, throw=False)
     shared = [n for n in parameters.free_names if not parameters[n].per_log]
-    table = _tabulated(shared, fits, parameters)
-    apart = _apart(table)
-    return LogComparison(table, not len(apart), _reason(table, apart, len(fits)), fits)
+    table = _comparison_table(shared, fits, parameters)
+    apart = _disagreements(table)
+    return LogComparison(table, not len(apart), _comparison_reason(table, apart, len(fits)), fits)
 
 
-def _tabulated(shared: Sequence[str], fits: Mapping[str, IdentificationResult], known: ParameterSet) -> "pd.DataFrame":
+def _comparison_table(
+    shared: Sequence[str], fits: Mapping[str, IdentificationResult], known: ParameterSet
+) -> "pd.DataFrame":
     import pandas as pd
 
     rows = []
     for name in shared:
         own = {log: _estimate(fit, name) for log, fit in fits.items()}
         for log, (value, stderr) in own.items():
-            others, spread = _mean([e for n, e in own.items() if n != log])
+            others, spread = _inverse_variance_mean([e for n, e in own.items() if n != log])
             deviation = (value - others) / math.hypot(stderr, spread)
             figures = {"value": value, "stderr": stderr, "others": others, "deviation": deviation}
             rows.append({"parameter": name, "log": log, **figures, "unit": known[name].unit})
@@ -113,24 +117,24 @@ def _estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
     return (value, stderr) if math.isfinite(stderr) else (math.nan, math.nan)
 
 
-def _mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def _inverse_variance_mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """Weighted mean of those that tell, and its deviation."""
-    told = np.array([e for e in estimates if math.isfinite(e[1])]).reshape(-1, 2)
-    if not len(told):
+    finite = np.array([e for e in estimates if math.isfinite(e[1])]).reshape(-1, 2)
+    if not len(finite):
         return math.nan, math.nan
-    weight = 1 / np.maximum(told[:, 1], 1e-300) ** 2
-    return float(np.average(told[:, 0], weights=weight)), float(1 / math.sqrt(weight.sum()))
+    weight = 1 / np.maximum(finite[:, 1], 1e-300) ** 2
+    return float(np.average(finite[:, 0], weights=weight)), float(1 / math.sqrt(weight.sum()))
 
 
-def _apart(table: "pd.DataFrame") -> "pd.DataFrame":
+def _disagreements(table: "pd.DataFrame") -> "pd.DataFrame":
     """The rows that disagree, the worst first."""
-    far = (table["deviation"].abs() > APART) & (
-        (table["value"] - table["others"]).abs() > DIFFERENT * table["others"].abs()
+    far = (table["deviation"].abs() > DISAGREEMENT_DEVIATIONS) & (
+        (table["value"] - table["others"]).abs() > MIN_RELATIVE_DIFFERENCE * table["others"].abs()
     )
     return table[far].sort_values("deviation", key=abs, ascending=False)
 
 
-def _reason(table: "pd.DataFrame", apart: "pd.DataFrame", logs: int) -> str:
+def _comparison_reason(table: "pd.DataFrame", apart: "pd.DataFrame", logs: int) -> str:
     compared = list(dict.fromkeys(str(n) for n, _ in table.index[np.isfinite(table["deviation"])]))
     if not compared:
         return "nothing could be compared: no parameter is told by two logs alone; fit fewer, or log longer runs"
@@ -139,10 +143,10 @@ def _reason(table: "pd.DataFrame", apart: "pd.DataFrame", logs: int) -> str:
     name, log = apart.index[0]
     row = apart.iloc[0]
     others = "the other log" if logs == 2 else "the other logs"
-    told = (
+    message = (
         f"{name} is {row['value']:.4g} +- {row['stderr']:.2g} {row['unit']} in {log} alone, and {row['others']:.4g} in "
     )
     more = [str(n) for n in dict.fromkeys(n for n, _ in apart.index) if n != name]
     tail = f"; apart are {', '.join(more)}, too" if more else ""
     ask = "are they of one drive, and their conditions right?"
-    return f"{told}{others}, {abs(row['deviation']):.0f} standard deviations apart{tail}: {ask}"
+    return f"{message}{others}, {abs(row['deviation']):.0f} standard deviations apart{tail}: {ask}"

@@ -13,12 +13,25 @@ from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System, names
-from pneuopt.identification.checks import check_content, check_free, check_logs, check_smooth, doubts, measured_outputs
+from pneuopt.identification.checks import (
+    check_content,
+    check_free,
+    check_logs,
+    check_smooth,
+    emit_log_warnings,
+    outputs_in_log,
+)
 from pneuopt.identification.identifiability import Verdict
-from pneuopt.identification.losses import Loss, Refit, fitted, white_squares
-from pneuopt.identification.multistart import attempts
-from pneuopt.identification.problem import Model, Problem, as_logged, conditioned, free_run
-from pneuopt.identification.review import scrutinised
+from pneuopt.identification.losses import Loss, Refit, fit_robustly, white_chi_square
+from pneuopt.identification.multistart import multistart
+from pneuopt.identification.problem import (
+    EstimationModel,
+    EstimationProblem,
+    apply_conditions,
+    as_estimation_model,
+    free_run,
+)
+from pneuopt.identification.review import review_fit
 from pneuopt.identification.statistics import (
     agreement,
     confidence_interval,
@@ -27,21 +40,23 @@ from pneuopt.identification.statistics import (
     ljung_box,
 )
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.convergence import NOISE_LEVEL
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
-from pneuopt.shooting.solution import Code, Status
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-BORROWED = 0.1  # of a variance: what rests on a prior by more than that, the logs do not tell
-NOTHING = "the logs tell none of the free parameters by itself; fix some, or log runs that tell them apart"
-AT_NOISE = 1.05  # squared residuals a sample, in noise variances, up to which no other start is tried (NUMERICS 3.6)
+MAX_PRIOR_VARIANCE_SHARE = 0.1  # of a variance: what rests on a prior by more than that, the logs do not tell
+NOTHING_IDENTIFIABLE = "the logs tell none of the free parameters by itself; fix some, or log runs that tell them apart"
+ACCEPTED_CHI_SQUARE_RATIO = (
+    1.05  # squared residuals a sample, in noise variances, up to which no other start is tried (NUMERICS 3.6)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,17 +138,17 @@ def identify(
     ConvergenceError
         If no candidate start converged; the error's `solution` is the result, marked.
     """
-    method, model = method or LeastSquares(), as_logged(system)
+    method, model = method or LeastSquares(), as_estimation_model(system)
     check_smooth(model)
     if estimate_noise:
         experiments = [replace(e, noise={}) for e in experiments]
     experiments = check_logs(model, experiments, parameters)
     check_free(experiments, parameters)
     check_content(experiments)
-    doubted = doubts(model, experiments, parameters)
-    problem = Problem(model, tuple(experiments), model.parameters | parameters, method)
-    found, label = _best(problem, loss, estimate_noise=estimate_noise)
-    result = scrutinised(found.problem, *_result(found, label, loss))
+    doubted = emit_log_warnings(model, experiments, parameters)
+    problem = EstimationProblem(model, tuple(experiments), model.parameters | parameters, method)
+    found, label = _best_fit(problem, loss, estimate_noise=estimate_noise)
+    result = review_fit(found.problem, *_result(found, label, loss))
     if doubted:
         result = replace(result, status=replace(result.status, message="; ".join((result.status.message, *doubted))))
     if throw and not result.status.converged:
@@ -162,13 +177,14 @@ def validate(
     """
     import pandas as pd
 
-    model = as_logged(system)
+    model = as_estimation_model(system)
     fixed = model.parameters | parameters.fixed(*parameters.free_names)
     rows = []
     for experiment in check_logs(model, experiments, fixed):
-        run = _predicted(model, experiment, fixed)
+        run = _predict_log(model, experiment, fixed)
         rows += [
-            row | _leftover(model, experiment, run, str(row["channel"])) for row in _agreements(model, experiment, run)
+            row | _residual_diagnosis(model, experiment, run, str(row["channel"]))
+            for row in _agreement_rows(model, experiment, run)
         ]
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
@@ -187,17 +203,17 @@ def predict(system: System | ClosedLoop, experiment: Experiment, parameters: Par
     Trajectory
         States and outputs on the log's grid.
     """
-    model = as_logged(system)
+    model = as_estimation_model(system)
     fixed = model.parameters | parameters.fixed(*parameters.free_names)
-    return _predicted(model, check_logs(model, [experiment], fixed)[0], fixed)
+    return _predict_log(model, check_logs(model, [experiment], fixed)[0], fixed)
 
 
-def _predicted(system: Model, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
-    inputs, known = experiment.trajectory, conditioned(fixed, experiment)
+def _predict_log(system: EstimationModel, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
+    inputs, known = experiment.trajectory, apply_conditions(fixed, experiment)
     if not system.states:
         return free_run(system, inputs, known, {})
     method = LeastSquares()  # over the whole log in one segment, stiction would trap the start in a local optimum
-    problem = Problem(system, (experiment,), fixed, method)
+    problem = EstimationProblem(system, (experiment,), fixed, method)
     start = problem.candidates()[0]
     initial = solve_least_squares(problem.transcription(start), method).solution.trajectories[0]
     state = {s.name: float(initial[s.name][0]) for s in system.states}
@@ -215,18 +231,20 @@ def _result(found: Refit, label: str, loss: Loss | None) -> tuple[Identification
     starts = len(problem.experiments) * len(problem.system.states)
     squares = fit.chi_square if fit.jumps is None else 2 * solution.stats["cost"]
     variance = squares / max(1, fit.count - len(free) - starts)
-    correlated = max(_correlated(problem.system, problem.experiments, runs), _correlated_jumps(fit.jumps))
-    covariance = None if fit.covariance is None else fit.covariance * variance * correlated * found.spread
+    correlated = max(
+        _residual_correlation_time(problem.system, problem.experiments, runs), _jump_correlation_time(fit.jumps)
+    )
+    covariance = None if fit.covariance is None else fit.covariance * variance * correlated * found.variance_inflation
     leaning = np.zeros(len(free), dtype=bool)
-    if covariance is not None and fit.borrowed is not None:
-        covariance = covariance + fit.borrowed
-        leaning = np.diag(fit.borrowed) > BORROWED * np.diag(covariance)
+    if covariance is not None and fit.prior_covariance is not None:
+        covariance = covariance + fit.prior_covariance
+        leaning = np.diag(fit.prior_covariance) > MAX_PRIOR_VARIANCE_SHARE * np.diag(covariance)
     untold = tuple(n for n, leans in zip(free, leaning, strict=True) if leans or n in problem.held)
-    status = Status(Code.NOT_CONVERGED, NOTHING) if free and set(untold) == set(free) else solution.status
+    status = Status(Code.NOT_CONVERGED, NOTHING_IDENTIFIABLE) if free and set(untold) == set(free) else solution.status
     result = IdentificationResult(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, status),
-        _square(free, covariance),
+        _covariance_frame(free, covariance),
         _fit_table(problem.system, problem.experiments, runs),
         runs,
         status,
@@ -240,7 +258,7 @@ def _result(found: Refit, label: str, loss: Loss | None) -> tuple[Identification
     return result, untold
 
 
-def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple[Refit, str]:
+def _best_fit(problem: EstimationProblem, loss: Loss | None, *, estimate_noise: bool) -> tuple[Refit, str]:
     """The first candidate that converges at the noise's level; else the least cost, once two have found it, or of all.
 
     A wrong basin can converge, too; its residuals then exceed the noise.
@@ -248,9 +266,9 @@ def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple
     fits: list[tuple[Refit, str]] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
     try:
-        for candidate in attempts(problem, lambda: _misses(fits[0][0].fit)):
-            found = fitted(problem, candidate, loss, estimate_noise=estimate_noise)
-            if _is_at_noise(found) and not found.problem.held:
+        for candidate in multistart(problem, lambda: _has_state_noise(fits[0][0].fit)):
+            found = fit_robustly(problem, candidate, loss, estimate_noise=estimate_noise)
+            if _explains_to_noise(found) and not found.problem.held:
                 return found, candidate.label
             fits.append((found, candidate.label))
             fits.sort(key=lambda each: _rank(each[0].fit, tightest))
@@ -273,7 +291,7 @@ def _best(problem: Problem, loss: Loss | None, *, estimate_noise: bool) -> tuple
     return replace(found, fit=replace(found.fit, solution=solution)), label
 
 
-def _is_at_noise(found: Refit) -> bool:
+def _explains_to_noise(found: Refit) -> bool:
     """Whether nothing better is to be found; a wrong basin of soft bristles has left 1.1 noise variances a sample.
 
     Where the log states too little noise, the white part of the residuals is what is left of it.
@@ -281,10 +299,13 @@ def _is_at_noise(found: Refit) -> bool:
     fit = found.fit
     if not fit.solution.status.converged or fit.jumps is not None:
         return False
-    return fit.chi_square <= AT_NOISE * fit.count or fit.chi_square <= AT_NOISE * white_squares(found)
+    return (
+        fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
+        or fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * white_chi_square(found)
+    )
 
 
-def _misses(fit: Fit) -> bool:
+def _has_state_noise(fit: Fit) -> bool:
     """Whether it is the optimum of a model that the log's states do not quite follow."""
     return fit.solution.status.converged and fit.jumps is not None
 
@@ -295,13 +316,13 @@ def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
     And so do the loose gaps, wider than the last stage's, in which an interruption may leave a search.
     """
     if fit.solution.status.code is Code.INTERRUPTED and fit.solution.stats["gap_deviation"] > tightest:
-        return 3, _cost(fit)
+        return 3, _fit_cost(fit)
     if fit.jumps is not None:
-        return 1, _cost(fit)
-    return 0 if 2 * _cost(fit) <= NOISE_LEVEL * fit.count else 2, _cost(fit)
+        return 1, _fit_cost(fit)
+    return 0 if 2 * _fit_cost(fit) <= MAX_CHI_SQUARE_RATIO * fit.count else 2, _fit_cost(fit)
 
 
-def _cost(fit: Fit) -> float:
+def _fit_cost(fit: Fit) -> float:
     return fit.solution.stats["cost"]
 
 
@@ -309,27 +330,31 @@ def _are_alike(best: Fit, second: Fit) -> bool:
     """Whether both converged, at the same cost."""
     converged = best.solution.status.converged and second.solution.status.converged
     same = (best.jumps is None) == (second.jumps is None)
-    return converged and same and _cost(second) <= 1.001 * _cost(best)
+    return converged and same and _fit_cost(second) <= 1.001 * _fit_cost(best)
 
 
-def _fit_table(system: Model, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
+def _fit_table(
+    system: EstimationModel, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]
+) -> "pd.DataFrame":
     import pandas as pd
 
-    rows = [row for e in experiments for row in _agreements(system, e, runs[e.name])]
+    rows = [row for e in experiments for row in _agreement_rows(system, e, runs[e.name])]
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
 
-def _agreements(system: Model, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
+def _agreement_rows(system: EstimationModel, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
     units = {q.name: q.unit for q in system.outputs}
     rows: list[dict[str, object]] = []
-    for channel in measured_outputs(system, experiment):
+    for channel in outputs_in_log(system, experiment):
         figures = agreement(experiment.trajectory[channel], run[channel])
         noise = experiment.noise[channel]
         rows.append({"log": experiment.name, "channel": channel, **figures, "noise": noise, "unit": units[channel]})
     return rows
 
 
-def _leftover(system: Model, experiment: Experiment, run: Trajectory, channel: str) -> dict[str, object]:
+def _residual_diagnosis(
+    system: EstimationModel, experiment: Experiment, run: Trajectory, channel: str
+) -> dict[str, object]:
     """What of the inputs, and of its own past, is left in a channel's residuals."""
     log = experiment.trajectory
     residuals = log[channel] - run[channel]
@@ -340,17 +365,19 @@ def _leftover(system: Model, experiment: Experiment, run: Trajectory, channel: s
     return found
 
 
-def _correlated(system: Model, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> float:
+def _residual_correlation_time(
+    system: EstimationModel, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]
+) -> float:
     """By how much correlated residuals (model error, not noise) widen a variance: the mean over logs and channels."""
     times = [
         correlation_time(e.trajectory[channel] - runs[e.name][channel])
         for e in experiments
-        for channel in measured_outputs(system, e)
+        for channel in outputs_in_log(system, e)
     ]
     return float(np.mean(times))
 
 
-def _correlated_jumps(jumps: Array | None) -> float:
+def _jump_correlation_time(jumps: Array | None) -> float:
     """The same for what stands for noise of the states."""
     return 1.0 if jumps is None else float(np.mean([correlation_time(column) for column in jumps.T]))
 
@@ -371,7 +398,7 @@ def _estimates(
     return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
 
 
-def _square(free: Sequence[str], covariance: Array | None) -> "pd.DataFrame":
+def _covariance_frame(free: Sequence[str], covariance: Array | None) -> "pd.DataFrame":
     import pandas as pd
 
     values = np.full((len(free), len(free)), math.nan) if covariance is None else covariance

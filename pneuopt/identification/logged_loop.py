@@ -11,24 +11,23 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.rest import drifting
+from pneuopt.control.rest import unobservable_states
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, names
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-REFERENCES = {"speed": "speed_reference", "position": "position_reference"}
-ACTS = "controller_acts"  # 1 at the log's samples at which the controller computes, 0 in between
-SLACK = 1e-3  # of a sample time, by which a log's time may be off the controller's
-SMOOTHED = 21  # samples over which a position is differentiated where the fed-back speed is not logged
+REFERENCE_CHANNELS = {"speed": "speed_reference", "position": "position_reference"}
+CONTROLLER_ACTS = "controller_acts"  # 1 at the log's samples at which the controller computes, 0 in between
+SAMPLE_TIME_TOLERANCE = 1e-3  # of a sample time, by which a log's time may be off the controller's
+DIFFERENTIATION_WINDOW = 21  # samples over which a position is differentiated where the fed-back speed is not logged
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ class LoggedLoop:
         """What a log has to hold: "speed_reference" (or what is fed back), and inputs that are not controlled."""
         reference, *others = self.loop.inputs
         fed_back = self.loop.feedback.name
-        return (replace(reference, name=REFERENCES.get(fed_back, f"{fed_back}_reference")), *others)
+        return (replace(reference, name=REFERENCE_CHANNELS.get(fed_back, f"{fed_back}_reference")), *others)
 
     @property
     def outputs(self) -> tuple[Quantity, ...]:
@@ -89,18 +88,18 @@ class LoggedLoop:
         remedy = "identify the plant alone with it as input (loop.plant), which needs no controller; or leave it out"
         require(command not in measured, f"{name}: the log holds the command {command!r}; {remedy}", LogError)
         require(reference in measured, f"{name}: the loop needs the channel {reference!r} as input", LogError)
-        _acting(measured.t, self._sample_time, name)
+        _acting_samples(measured.t, self._sample_time, name)
 
     def discrete(self) -> DiscreteSystem:
         """The loop's sampled step; its last input says at which samples the controller acts."""
-        return _gated(self.loop.discrete(), self.inputs)
+        return _add_acting_input(self.loop.discrete(), self.inputs)
 
-    def driven(self, measured: Trajectory, name: str) -> Array:
+    def input_matrix(self, measured: Trajectory, name: str) -> Array:
         """The inputs of `discrete` along a log, shape (n, n_inputs)."""
         own = measured.matrix(names(self.inputs))
-        return np.column_stack([own, _acting(measured.t, self._sample_time, name)])
+        return np.column_stack([own, _acting_samples(measured.t, self._sample_time, name)])
 
-    def known_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
+    def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
         """What of a log's start state no measured output feels, taken from the candidate; NaN where it is to be found.
 
         The command is computed anew at the first sample; of previous error and derivative only a sum counts.
@@ -111,10 +110,10 @@ class LoggedLoop:
             idle = gain in parameters and not (parameters[gain].free or parameters[gain].value)
             held |= {state} if idle else set()
         seen = {self.loop.feedback.name, *(n for n in names(self.loop.plant.outputs) if n in measured)}
-        held |= set.intersection(*(set(drifting(self.loop.plant, n)) for n in seen))
+        held |= set.intersection(*(set(unobservable_states(self.loop.plant, n)) for n in seen))
         return np.array([states[n][0] if n in held else np.nan for n in names(self.states)])
 
-    def reference_column(self, measured: Trajectory) -> Trajectory:
+    def with_reference(self, measured: Trajectory) -> Trajectory:
         """The log with its reference named as `simulate` reads it."""
         return measured.with_columns({"reference": measured[self.inputs[0].name]})
 
@@ -125,11 +124,11 @@ class LoggedLoop:
         """
         out: list[Start] = []
         for was_at_rest in (True, False):
-            replayed = {n: self._replayed(log, n, was_at_rest=was_at_rest) for n, log in logs.items()}
+            replayed = {n: self._replay_controller(log, n, was_at_rest=was_at_rest) for n, log in logs.items()}
             plant = {n: self._plant_log(log, replayed[n]) for n, log in logs.items()}
             label = "from rest" if was_at_rest else "from an empty integral"
             for start in self.loop.plant.starts(plant)[: None if was_at_rest else 1]:
-                states = {n: run.with_columns(_own(replayed[n])) for n, run in start.states.items()}
+                states = {n: run.with_columns(_controller_states(replayed[n])) for n, run in start.states.items()}
                 out.append(Start(states, start.parameters, ", ".join(filter(None, (start.label, label)))))
         return out
 
@@ -148,17 +147,17 @@ class LoggedLoop:
 
         echo = define([], [self.loop.command, logged], [seen], plant.parameters, rhs)
         alone = replace(self.loop, plant=echo, actuated=self.loop.command.name, measured=seen.name)
-        discrete = _gated(alone.discrete(), alone.inputs)
+        discrete = _add_acting_input(alone.discrete(), alone.inputs)
         return discrete, Rollout(discrete.pieces), alone
 
-    def _replayed(self, log: Log, name: str, *, was_at_rest: bool) -> Trajectory:
+    def _replay_controller(self, log: Log, name: str, *, was_at_rest: bool) -> Trajectory:
         """The controller's states before each sample, and "control", along the logged feedback."""
         discrete, rollout, alone = self._controller
-        t, seen = log.measured.t, _fed_back(log.measured, self.loop.feedback.name, self.inputs[0].name, name)
+        t, seen = log.measured.t, _feedback_along_log(log.measured, self.loop.feedback.name, self.inputs[0].name, name)
         reference = log.measured[self.inputs[0].name]
-        acts = _acting(t, self._sample_time, name)
-        p, pid = alone.numbers(log.parameters), alone.pid
-        known = {**dict(zip(alone.parameters, p, strict=True)), "pid.Kp": alone.parallel(log.parameters).Kp}
+        acts = _acting_samples(t, self._sample_time, name)
+        p, pid = alone.parameter_vector(log.parameters), alone.pid
+        known = {**dict(zip(alone.parameters, p, strict=True)), "pid.Kp": alone.parallel_form(log.parameters).Kp}
         own = pid.start(reference[0], seen[0], 0.0, {n: known[f"pid.{n}"] for n in ("Kp", "b", "c")})
         x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.feedback, alone.command), own, strict=True)}
         x0 |= {"sensor.reading": seen[0], "feedforward.filter": reference[0]}
@@ -177,16 +176,16 @@ class LoggedLoop:
         return Log(measured, log.parameters.select(plant.parameters))
 
 
-def _own(replayed: Trajectory) -> dict[str, Array]:
+def _controller_states(replayed: Trajectory) -> dict[str, Array]:
     return {n: replayed[n] for n in replayed if n != "control"}
 
 
-def _gated(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:
+def _add_acting_input(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:
     """The same, with one more input that lets the controller act (1) or rest (0)."""
     assert discrete.update is not None
     assert discrete.ode is not None
     n = {k: discrete.step.size1_in(i) for i, k in enumerate(("t", "h", "x", "u", "p"))}
-    t, h, acts = ca.SX.sym("t"), ca.SX.sym("h"), ca.SX.sym(ACTS)
+    t, h, acts = ca.SX.sym("t"), ca.SX.sym("h"), ca.SX.sym(CONTROLLER_ACTS)
     x, u, p = (ca.SX.sym(k, n[k]) for k in "xup")
     fed = ca.vertcat(u, acts)
     step = ca.Function(
@@ -195,14 +194,16 @@ def _gated(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSyst
     ode = ca.Function("ode", [t, x, fed, p], [*discrete.ode(t, x, u, p)], ["t", "x", "u", "p"], ["xdot", "y"])
     after = x + acts * (discrete.update(t, x, u, p) - x)
     update = ca.Function("update", [t, x, fed, p], [after], ["t", "x", "u", "p"], ["x_after"])
-    return replace(discrete, inputs=(*inputs, Quantity(ACTS, "1")), step=step, ode=ode, update=update, sample_time=None)
+    return replace(
+        discrete, inputs=(*inputs, Quantity(CONTROLLER_ACTS, "1")), step=step, ode=ode, update=update, sample_time=None
+    )
 
 
-def _acting(t: Array, sample_time: float, name: str) -> Array:
+def _acting_samples(t: Array, sample_time: float, name: str) -> Array:
     """1 where the controller acts: at the log's first sample and every sample time after it."""
     phase = (t - t[0]) / sample_time
-    acts = np.abs(phase - np.round(phase)) < SLACK
-    missing = np.setdiff1d(np.arange(int(phase[-1] + SLACK) + 1), np.round(phase[acts]))
+    acts = np.abs(phase - np.round(phase)) < SAMPLE_TIME_TOLERANCE
+    missing = np.setdiff1d(np.arange(int(phase[-1] + SAMPLE_TIME_TOLERANCE) + 1), np.round(phase[acts]))
     if missing.size:
         raise LogError(
             f"{name}: the controller acts every {sample_time:g} s from the log's first sample on, but the log has no "
@@ -212,21 +213,21 @@ def _acting(t: Array, sample_time: float, name: str) -> Array:
     return np.asarray(acts, dtype=float)
 
 
-def _fed_back(measured: Trajectory, wanted: str, reference: str, name: str) -> Array:
+def _feedback_along_log(measured: Trajectory, wanted: str, reference: str, name: str) -> Array:
     """The fed-back signal along a log, without holes; a speed or position follows from the other."""
     if wanted in measured:
-        return _filled(measured.t, measured[wanted])
+        return _interpolate_gaps(measured.t, measured[wanted])
     t, step = measured.t, float(np.median(np.diff(measured.t)))
     if wanted == "speed" and "position" in measured:
-        window = min(SMOOTHED, (len(t) - 1) // 2 * 2 + 1)
-        return np.asarray(savgol_filter(_filled(t, measured["position"]), window, 2, deriv=1, delta=step))
+        window = min(DIFFERENTIATION_WINDOW, (len(t) - 1) // 2 * 2 + 1)
+        return np.asarray(savgol_filter(_interpolate_gaps(t, measured["position"]), window, 2, deriv=1, delta=step))
     told = f"{name}: the loop feeds back {wanted!r}; without it, or the motion it follows from, there is no start"
     require(wanted == "position" and "speed" in measured, told, LogError)
-    speed = _filled(t, measured["speed"])
+    speed = _interpolate_gaps(t, measured["speed"])
     travel = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
     return np.asarray(measured[reference][0] + travel)
 
 
-def _filled(t: Array, column: Array) -> Array:
+def _interpolate_gaps(t: Array, column: Array) -> Array:
     known = np.isfinite(column)
     return np.interp(t, t[known], column[known])

@@ -1,4 +1,4 @@
-"""`fitted`: a candidate's fit, repeated with weights for outliers (`Huber`, `SoftL1`) and noise levels from residuals.
+"""`fit_robustly`: a fit repeated with weights for outliers (`Huber`, `SoftL1`) and noise levels from its residuals.
 
 Iteratively reweighted least squares: each sample's noise is divided by the root of its weight psi(r)/r, where r is its
 residual over the channel's own scale (1.4826 MAD), and the next fit starts where the last one ended.
@@ -10,26 +10,25 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.checks import measured_outputs
-from pneuopt.identification.problem import Problem
-from pneuopt.identification.silence import WARM_STAGES, solved
+from pneuopt.identification.checks import outputs_in_log
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.silence import REFIT_STAGES, fit_holding_unidentifiable
 from pneuopt.identification.statistics import noise_level
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.convergence import NOISE_LEVEL
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
-from pneuopt.shooting.solution import Code, Status
 
-Array = NDArray[np.float64]
-REFITS = 12
-STILL = 0.05  # standard deviations that an estimate may still move from refit to refit
-SETTLED = 0.02  # relative change of a noise level, likewise
-LEAST_WEIGHT = 1e-8
-OUTLYING = 4.0  # of a channel's own scale: one in 16 000 samples of normal noise
+MAX_REFITS = 12
+ESTIMATE_CHANGE_TOLERANCE = 0.05  # standard deviations that an estimate may still move from refit to refit
+NOISE_CHANGE_TOLERANCE = 0.02  # relative change of a noise level, likewise
+MIN_WEIGHT = 1e-8
+OUTLIER_THRESHOLD = 4.0  # of a channel's own scale: one in 16 000 samples of normal noise
 
 
 class Loss(Protocol):
@@ -110,16 +109,18 @@ class Refit:
     ----------
     problem : Problem
     fit : Fit
-    spread : float
+    variance_inflation : float
         By how much the estimates' variance exceeds what the weighted squares say.
     """
 
-    problem: Problem
+    problem: EstimationProblem
     fit: Fit
-    spread: float = 1.0
+    variance_inflation: float = 1.0
 
 
-def fitted(problem: Problem, candidate: Start, loss: Loss | None = None, *, estimate_noise: bool = False) -> Refit:
+def fit_robustly(
+    problem: EstimationProblem, candidate: Start, loss: Loss | None = None, *, estimate_noise: bool = False
+) -> Refit:
     """Fit from one candidate; again with new weights and noise levels until neither they nor the estimates move.
 
     Parameters
@@ -136,111 +137,113 @@ def fitted(problem: Problem, candidate: Start, loss: Loss | None = None, *, esti
     Refit
         Its spread is Huber's sandwich ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for all.
     """
-    found = Refit(*solved(problem, candidate))
+    found = Refit(*fit_holding_unidentifiable(problem, candidate))
     if loss is None and not estimate_noise:
         return found
-    warm = replace(problem.method, stages=problem.method.stages[-WARM_STAGES:])
+    warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
     fits = [found.fit]
-    for _ in range(REFITS):
+    for _ in range(MAX_REFITS):
         if found.fit.solution.status.code in (Code.DIVERGED, Code.INTERRUPTED):
             break
-        before, found = found, _again(found, loss, warm, estimate_noise=estimate_noise)
+        before, found = found, _refit(found, loss, warm, estimate_noise=estimate_noise)
         fits.append(found.fit)
-        if _is_settled(before, found):
+        if _is_stationary(before, found):
             break
-    return _summed_up(replace(found, problem=replace(found.problem, method=problem.method)), fits, loss)
+    return _summarise(replace(found, problem=replace(found.problem, method=problem.method)), fits, loss)
 
 
-def white_squares(found: Refit) -> float:
+def white_chi_square(found: Refit) -> float:
     """What the squared residuals of a fit would sum up to, in noise variances, were they white at their own level.
 
     A wrong basin leaves more, for what varies slowly does not count (`noise_level`). With weights of a loss, nothing.
     """
-    problem, runs, total = found.problem, _runs(found), 0.0
+    problem, runs, total = found.problem, _trajectories(found), 0.0
     if problem.weights:
         return total
     for e in problem.experiments:
-        levels = _with_noise(problem, e, runs[e.name]).noise
-        for channel in measured_outputs(problem.system, e):
+        levels = _estimate_noise(problem, e, runs[e.name]).noise
+        for channel in outputs_in_log(problem.system, e):
             samples = int(np.isfinite(e.trajectory[channel]).sum())
             total += samples * (levels[channel] / e.noise[channel]) ** 2
     return total
 
 
-def _summed_up(found: Refit, fits: Sequence[Fit], loss: Loss | None) -> Refit:
+def _summarise(found: Refit, fits: Sequence[Fit], loss: Loss | None) -> Refit:
     """The last fit with the effort of all, and a status that judges the bulk of the samples, not the outliers."""
     solution = found.fit.solution
     effort = {n: sum(fit.solution.stats[n] for fit in fits) for n in ("iterations", "seconds")}
     status = solution.status
     if loss is not None and status.converged and found.fit.jumps is None:
-        status = Status(status.code, _told(found, len(fits)))
+        status = Status(status.code, _describe_outliers(found, len(fits)))
     solution = replace(solution, stats={**solution.stats, **effort, "refits": len(fits) - 1.0}, status=status)
     return replace(found, fit=replace(found.fit, solution=solution))
 
 
-def _told(found: Refit, fits: int) -> str:
+def _describe_outliers(found: Refit, fits: int) -> str:
     """In words: outliers, and what the model leaves beyond the noise in the other samples."""
     worst, level, beyond, count = "", 1.0, 0, 0
-    runs = _runs(found)
+    runs = _trajectories(found)
     for e in found.problem.experiments:
-        residuals = _residuals(found.problem, e, runs[e.name])
-        scales = _scales(residuals)
-        beyond += int(np.sum(np.abs(residuals) > OUTLYING * scales))
+        residuals = _residuals_in_noise(found.problem, e, runs[e.name])
+        scales = _channel_scales(residuals)
+        beyond += int(np.sum(np.abs(residuals) > OUTLIER_THRESHOLD * scales))
         count += int(np.isfinite(residuals).sum())
         if scales.max() > level:
-            level, channel = float(scales.max()), measured_outputs(found.problem.system, e)[int(np.argmax(scales))]
+            level, channel = float(scales.max()), outputs_in_log(found.problem.system, e)[int(np.argmax(scales))]
             worst = f"{channel} of {e.name}"
-    told = f"{fits - 1} refits, {beyond} of {count} samples are outliers, beyond {OUTLYING:g} standard deviations"
-    if level**2 <= NOISE_LEVEL:
-        return told
-    return f"{told}; the model does not explain the log to its noise: residuals are {level:.2g} times that of {worst}"
+    message = (
+        f"{fits - 1} refits, {beyond} of {count} samples are outliers, beyond {OUTLIER_THRESHOLD:g} standard deviations"
+    )
+    if level**2 <= MAX_CHI_SQUARE_RATIO:
+        return message
+    return (
+        f"{message}; the model does not explain the log to its noise: residuals are {level:.2g} times that of {worst}"
+    )
 
 
-def _again(found: Refit, loss: Loss | None, method: LeastSquares, *, estimate_noise: bool) -> Refit:
-    problem, runs = found.problem, _runs(found)
+def _refit(found: Refit, loss: Loss | None, method: LeastSquares, *, estimate_noise: bool) -> Refit:
+    problem, runs = found.problem, _trajectories(found)
     if estimate_noise:
         problem = replace(
-            problem, experiments=tuple(_with_noise(problem, e, runs[e.name]) for e in problem.experiments)
+            problem, experiments=tuple(_estimate_noise(problem, e, runs[e.name]) for e in problem.experiments)
         )
-    residuals = {e.name: _residuals(problem, e, runs[e.name]) for e in problem.experiments}
-    scales = {n: _scales(r) for n, r in residuals.items()}
-    weights = (
-        {} if loss is None else {n: np.fmax(loss.weight(r / scales[n]), LEAST_WEIGHT) for n, r in residuals.items()}
-    )
+    residuals = {e.name: _residuals_in_noise(problem, e, runs[e.name]) for e in problem.experiments}
+    scales = {n: _channel_scales(r) for n, r in residuals.items()}
+    weights = {} if loss is None else {n: np.fmax(loss.weight(r / scales[n]), MIN_WEIGHT) for n, r in residuals.items()}
     problem = replace(problem, weights={n: np.nan_to_num(w, nan=1.0) for n, w in weights.items()}, method=method)
     own = found.fit.solution.parameters
     start = Start(runs, {n: own.value(n) for n in own.free_names}, "refit")
     fit = solve_least_squares(problem.transcription(start), method)
-    return Refit(problem, fit, 1.0 if loss is None else _spread(loss, residuals, scales, weights))
+    return Refit(problem, fit, 1.0 if loss is None else _sandwich_factor(loss, residuals, scales, weights))
 
 
-def _runs(found: Refit) -> Mapping[str, Trajectory]:
+def _trajectories(found: Refit) -> Mapping[str, Trajectory]:
     logs = (e.name for e in found.problem.experiments)
     return dict(zip(logs, found.fit.solution.trajectories, strict=True))
 
 
-def _residuals(problem: Problem, experiment: Experiment, run: Trajectory) -> Array:
+def _residuals_in_noise(problem: EstimationProblem, experiment: Experiment, run: Trajectory) -> Array:
     """In noise standard deviations, shape (n, n_measured)."""
-    outputs = measured_outputs(problem.system, experiment)
+    outputs = outputs_in_log(problem.system, experiment)
     noise = np.array([experiment.noise[o] for o in outputs])
     return np.asarray((experiment.trajectory.matrix(outputs) - run.matrix(outputs)) / noise)
 
 
-def _scales(residuals: Array) -> Array:
+def _channel_scales(residuals: Array) -> Array:
     """Each channel's own: 1.4826 MAD, or the noise where more than half of the residuals vanish."""
     scales = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
     return np.where(scales > 0, scales, 1.0)
 
 
-def _with_noise(problem: Problem, experiment: Experiment, run: Trajectory) -> Experiment:
+def _estimate_noise(problem: EstimationProblem, experiment: Experiment, run: Trajectory) -> Experiment:
     levels = {}
-    for channel in measured_outputs(problem.system, experiment):
+    for channel in outputs_in_log(problem.system, experiment):
         level = noise_level(experiment.trajectory[channel] - run[channel], run.t)
         levels[channel] = level if level > 0 else experiment.noise[channel]
     return experiment.with_noise(levels)
 
 
-def _spread(
+def _sandwich_factor(
     loss: Loss, residuals: Mapping[str, Array], scales: Mapping[str, Array], weights: Mapping[str, Array]
 ) -> float:
     """Huber's sandwich at the scale of each channel, over the variance that a weighted least squares takes."""
@@ -251,7 +254,7 @@ def _spread(
     return float(np.mean((w * r) ** 2) * np.mean(w) / (np.mean(loss.slope(r / s)) ** 2 * np.mean(w * r**2)))
 
 
-def _is_settled(before: Refit, after: Refit) -> bool:
+def _is_stationary(before: Refit, after: Refit) -> bool:
     old, new = before.fit.solution.parameters, after.fit.solution.parameters
     free = new.free_names
     moved = np.array([new.value(n) - old.value(n) for n in free])
@@ -261,4 +264,6 @@ def _is_settled(before: Refit, after: Refit) -> bool:
     steps = np.abs(moved[deviation > 0]) / deviation[deviation > 0]
     logs = zip(before.problem.experiments, after.problem.experiments, strict=True)
     levels = [abs(math.log(b.noise[n] / a.noise[n])) for a, b in logs for n in b.noise]
-    return bool(np.max(steps, initial=0.0) < STILL and max(levels, default=0.0) < SETTLED)
+    return bool(
+        np.max(steps, initial=0.0) < ESTIMATE_CHANGE_TOLERANCE and max(levels, default=0.0) < NOISE_CHANGE_TOLERANCE
+    )

@@ -9,15 +9,17 @@ from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import names
-from pneuopt.identification.problem import Problem
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.quantities.status import Code
 from pneuopt.shooting.least_squares import Fit, solve_least_squares
-from pneuopt.shooting.solution import Code
 
-HELD_STAGES = 3  # of the search; tighter gaps would force a wrong guess on the log
-HELD = 1e-9  # relative width of the bounds that hold a guess: the compiled equations stay those of the search
+GUESS_STAGES = 3  # of the search; tighter gaps would force a wrong guess on the log
+GUESS_BOUND_WIDTH = (
+    1e-9  # relative width of the bounds that hold a guess: the compiled equations stay those of the search
+)
 
 
-def attempts(problem: Problem, confirms: Callable[[], bool] = lambda: False) -> Iterator[Start]:
+def multistart(problem: EstimationProblem, confirms: Callable[[], bool] = lambda: False) -> Iterator[Start]:
     """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
 
     Parameters
@@ -38,25 +40,25 @@ def attempts(problem: Problem, confirms: Callable[[], bool] = lambda: False) -> 
     """
     candidates = problem.candidates()
     yield candidates[0]
-    guessed = [] if confirms() else [c for c in candidates if c.tried]
-    settled = [_settled(problem, c) for c in guessed] if len(guessed) > 1 else []
+    guessed = [] if confirms() else [c for c in candidates if c.trial_parameters]
+    settled = [_settle_start(problem, c) for c in guessed] if len(guessed) > 1 else []
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
-    yield from [c for c in candidates[1:] if not settled or not c.tried]
+    yield from [c for c in candidates[1:] if not settled or not c.trial_parameters]
 
 
-def _settled(problem: Problem, candidate: Start) -> tuple[float, Start]:
+def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[float, Start]:
     """The cost that a start reaches with its guesses held, and where."""
     transcription = problem.transcription(candidate)
-    guesses = {n: candidate.parameters[n] for n in candidate.tried}
-    bounds = {n: (v - HELD * abs(v), v + HELD * abs(v)) for n, v in guesses.items()}
+    guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
+    bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
-    fit = solve_least_squares(held, replace(problem.method, stages=problem.method.stages[:HELD_STAGES]))
+    fit = solve_least_squares(held, replace(problem.method, stages=problem.method.stages[:GUESS_STAGES]))
     if fit.solution.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
-    return fit.solution.stats["cost"], _continued(problem, candidate, fit, guesses)
+    return fit.solution.stats["cost"], _continue_start(problem, candidate, fit, guesses)
 
 
-def _continued(problem: Problem, candidate: Start, fit: Fit, guesses: dict[str, float]) -> Start:
+def _continue_start(problem: EstimationProblem, candidate: Start, fit: Fit, guesses: dict[str, float]) -> Start:
     """The start that goes on where a fit ended."""
     found, states = fit.solution.parameters, names(problem.system.states)
     runs = {e.name: t.select(states) for e, t in zip(problem.experiments, fit.solution.trajectories, strict=True)}

@@ -5,27 +5,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
-from pneuopt.identification.checks import measured_outputs
+from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.transcription import Phase, Residuals, Transcription, every
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
-Array = NDArray[np.float64]
-Model = System | LoggedLoop
+EstimationModel = System | LoggedLoop
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class EstimationProblem:
     """What is to be identified, and its translation to a transcription and back.
 
     Parameters
@@ -40,7 +39,7 @@ class Problem:
         Free parameters that the logs do not tell, and where they stay.
     """
 
-    system: Model
+    system: EstimationModel
     experiments: tuple[Experiment, ...]
     parameters: ParameterSet
     method: LeastSquares
@@ -49,7 +48,7 @@ class Problem:
 
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
-        logs = {e.name: Log(e.trajectory, conditioned(self.parameters, e)) for e in self.experiments}
+        logs = {e.name: Log(e.trajectory, apply_conditions(self.parameters, e)) for e in self.experiments}
         return self.system.starts(logs)
 
     def unknowns(self) -> ParameterSet:
@@ -73,22 +72,22 @@ class Problem:
         parameters = self.unknowns().with_values(candidate.parameters)
         held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.held.items()}
         parameters = parameters | ParameterSet(held)
-        return Transcription(self._sampled(), parameters, phases, residuals)
+        return Transcription(self._discretise(), parameters, phases, residuals)
 
-    def _sampled(self) -> DiscreteSystem:
+    def _discretise(self) -> DiscreteSystem:
         return self.system.discrete() if isinstance(self.system, LoggedLoop) else discretise(self.system)
 
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
-        nodes, guess = every(len(t), self._segment(h)), states.matrix(names(self.system.states))
+        nodes, guess = regular_nodes(len(t), self._samples_a_segment(h)), states.matrix(names(self.system.states))
         if isinstance(self.system, LoggedLoop):
-            driven = self.system.driven(experiment.trajectory, experiment.name)
-            start = self.system.known_start(experiment.trajectory, states, self.parameters)
+            driven = self.system.input_matrix(experiment.trajectory, experiment.name)
+            start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
             return Phase(experiment.name, t, h, driven, nodes, start, guess=guess)
         return Phase(experiment.name, t, h, experiment.trajectory.matrix(names(self.system.inputs)), nodes, guess=guess)
 
-    def _segment(self, h: Array) -> int:
+    def _samples_a_segment(self, h: Array) -> int:
         """Samples between two nodes; a static map has no gaps, so its cut is only for batching."""
         if not self.system.states:
             return 100
@@ -96,26 +95,28 @@ class Problem:
         return len(h) if math.isinf(samples) else max(2, round(samples))
 
     def _residuals(self, index: int, experiment: Experiment) -> Residuals:
-        outputs = measured_outputs(self.system, experiment)
+        outputs = outputs_in_log(self.system, experiment)
         noise = np.array([experiment.noise[o] for o in outputs])
         if experiment.name in self.weights:
             noise = noise[:, None] / np.sqrt(self.weights[experiment.name].T)
         return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
 
 
-def as_logged(model: System | ClosedLoop) -> Model:
+def as_estimation_model(model: System | ClosedLoop) -> EstimationModel:
     """The model as an identification reads it from a log."""
     return LoggedLoop(model) if isinstance(model, ClosedLoop) else model
 
 
-def free_run(model: Model, inputs: Trajectory, parameters: ParameterSet, initial: Mapping[str, float]) -> Trajectory:
+def free_run(
+    model: EstimationModel, inputs: Trajectory, parameters: ParameterSet, initial: Mapping[str, float]
+) -> Trajectory:
     """Simulate the model along a log from a known state."""
     if isinstance(model, LoggedLoop):
-        return simulate(model.loop, model.reference_column(inputs), parameters, initial=initial)
+        return simulate(model.loop, model.with_reference(inputs), parameters, initial=initial)
     return simulate(model, inputs, parameters, initial=initial)
 
 
-def conditioned(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:
+def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:
     """The parameters as they are in one log, where its conditions are known and so not free."""
     try:
         return parameters.with_values(experiment.conditions).fixed(*experiment.conditions)

@@ -12,9 +12,9 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.system import System, names
 from pneuopt.identification.checks import check_logs
-from pneuopt.identification.problem import Problem, as_logged
+from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.errors import check_known, require
+from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
@@ -22,14 +22,14 @@ from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_POINTS = 14  # refits on one side
-CLOSE = 0.003  # of the level's root, to which an end is located
-LONGEST = 1.5  # e-folds of a log parameter between two refits
-PROBE = 0.3  # e-folds, at most, over which the curvature at the estimate is measured
-ITERATIONS = 40  # of a refit
+MAX_REFITS_A_SIDE = 14  # refits on one side
+ROOT_TOLERANCE = 0.003  # of the level's root, to which an end is located
+MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits
+MAX_LOG_PROBE = 0.3  # e-folds, at most, over which the curvature at the estimate is measured
+REFIT_ITERATIONS = 40  # of a refit
 
 
-class Fitted(Protocol):
+class ProfileSource(Protocol):
     """What a profile needs of an identification's result."""
 
     @property
@@ -88,7 +88,7 @@ class Profile:
         return math.isinf(self.low) or math.isinf(self.high)
 
     def __repr__(self) -> str:
-        return f"Profile of {self.name}: {self.told}"
+        return f"Profile of {self.name}: {self.sentence}"
 
     @property
     def threshold(self) -> float:
@@ -96,7 +96,7 @@ class Profile:
         return float(chi2.ppf(self.level, 1))
 
     @property
-    def told(self) -> str:
+    def sentence(self) -> str:
         """The interval in words."""
         low, high = f"{self.low:.5g} {self.unit}", f"{self.high:.5g} {self.unit}"
         tried = self.curve["value"]
@@ -112,7 +112,7 @@ class Profile:
 def profile(
     system: System | ClosedLoop,
     experiments: Sequence[Experiment],
-    result: Fitted,
+    result: ProfileSource,
     name: str,
     *,
     level: float = 0.95,
@@ -145,20 +145,20 @@ def profile(
     InputError
         If the parameter is not among the estimates, or the logs are not those of the result.
     """
-    check_known("estimate", [name], result.estimates.index)
+    check_names("estimate", [name], result.estimates.index)
     require(0 < level < 1, f"a level lies between 0 and 1, got {level:g}")
-    model = as_logged(system)
+    model = as_estimation_model(system)
     logs = check_logs(model, experiments, result.parameters)
     given = tuple(e.name for e in logs)
     require(
         given == tuple(result.trajectories), f"the result is of {', '.join(result.trajectories)}, not of these logs"
     )
     logs = [e.with_noise(result.fit["noise"][e.name].to_dict()) for e in logs]
-    problem = Problem(model, tuple(logs), model.parameters | result.parameters, method or LeastSquares())
-    return traced(problem, result, name, level)
+    problem = EstimationProblem(model, tuple(logs), model.parameters | result.parameters, method or LeastSquares())
+    return trace_profile(problem, result, name, level)
 
 
-def traced(problem: Problem, result: Fitted, name: str, level: float = 0.95) -> Profile:
+def trace_profile(problem: EstimationProblem, result: ProfileSource, name: str, level: float = 0.95) -> Profile:
     """`profile`, of a problem already posed."""
     if problem.method.progress is not None:
         problem.method.progress(f"how far {name} can move")
@@ -167,11 +167,11 @@ def traced(problem: Problem, result: Fitted, name: str, level: float = 0.95) -> 
     for side in (-1, 1):
         _bracket(refits, side, target)
     p = refits.parameter
-    low, high = (_end(refits, side, target) for side in (-1, 1))
+    low, high = (_interval_end(refits, side, target) for side in (-1, 1))
     return Profile(name, p.unit, p.value, low, high, level, refits.curve())
 
 
-class _Point(NamedTuple):
+class _ProfilePoint(NamedTuple):
     """A refit."""
 
     z: float
@@ -185,25 +185,25 @@ class _Point(NamedTuple):
 class _Refits:
     """Fits with one parameter held, each started from the nearest one."""
 
-    def __init__(self, problem: Problem, result: Fitted, name: str) -> None:
+    def __init__(self, problem: EstimationProblem, result: ProfileSource, name: str) -> None:
         self.problem, self.name = problem, name
         given, found = problem.unknowns(), {str(n): float(v) for n, v in result.estimates["value"].items()}
         values = {n: v if math.isfinite(v) else given.value(n) for n, v in found.items()}
-        self.start = Start(_states(names(problem.system.states), result.trajectories), values, "fit")
+        self.start = Start(_select_states(names(problem.system.states), result.trajectories), values, "fit")
         self.parameter = replace(problem.unknowns()[name], value=values[name])
-        last, steps = Stage(result.stats["gap_deviation"], ITERATIONS, refine=4), int(result.stats["substeps"])
+        last, steps = Stage(result.stats["gap_deviation"], REFIT_ITERATIONS, refine=4), int(result.stats["substeps"])
         self.method = replace(problem.method, stages=(last,), substeps=max(1, steps // 4), progress=None)
-        self.spread = self._searched_spread(float(result.estimates["stderr"][name]))
-        self.points: list[_Point] = []
-        self.at(self.searched(self.parameter.value))
+        self.spread = self._search_deviation(float(result.estimates["stderr"][name]))
+        self.points: list[_ProfilePoint] = []
+        self.refit_at(self.to_search(self.parameter.value))
         self.scale = self._scale(result.stats["chi_square_ratio"] * result.stats["correlation_time"])
 
     @property
     def centre(self) -> float:
         """The estimate, as searched."""
-        return self.searched(self.parameter.value)
+        return self.to_search(self.parameter.value)
 
-    def searched(self, value: float) -> float:
+    def to_search(self, value: float) -> float:
         """A value as it is searched; a bound that is not positive is none for a logarithm."""
         if self.parameter.log:
             return math.log(value) if value > 0 else -math.inf
@@ -213,22 +213,22 @@ class _Refits:
         """The parameter's value at a searched one."""
         return math.exp(z) if self.parameter.log else z
 
-    def at(self, z: float) -> _Point:
+    def refit_at(self, z: float) -> _ProfilePoint:
         """The fit with the parameter held there."""
         start = self.start
         if self.points:
             nearest = min(self.points, key=lambda known: abs(known.z - z)).fit.solution
             runs = dict(zip((e.name for e in self.problem.experiments), nearest.trajectories, strict=True))
             values = {n: nearest.parameters.value(n) for n in start.parameters}
-            start = Start(_states(names(self.problem.system.states), runs), values)
+            start = Start(_select_states(names(self.problem.system.states), runs), values)
         posed = self.problem.transcription(start)
         held = replace(self.parameter, value=self.value(z), lower=self.value(z), upper=self.value(z))
         posed = replace(posed, parameters=posed.parameters | ParameterSet({self.name: held}))
-        point = _Point(z, solve_least_squares(posed, self.method))
+        point = _ProfilePoint(z, solve_least_squares(posed, self.method))
         self.points.append(point)
         return point
 
-    def root(self, point: _Point) -> float:
+    def deviance_root(self, point: _ProfilePoint) -> float:
         """Distance from the best fit, in standard deviations were the model linear; infinite where nothing fits."""
         least = min(p.cost for p in self.points)
         return math.sqrt(max(0.0, 2 * (point.cost - least) / self.scale)) if math.isfinite(point.cost) else math.inf
@@ -240,28 +240,28 @@ class _Refits:
         rows = []
         for point in sorted(self.points, key=lambda known: known.z):
             others = {n: point.fit.solution.parameters.value(n) for n in self.start.parameters if n != self.name}
-            rows.append({"value": self.value(point.z), "deviance": self.root(point) ** 2, **others})
+            rows.append({"value": self.value(point.z), "deviance": self.deviance_root(point) ** 2, **others})
         return pd.DataFrame(rows)
 
-    def _searched_spread(self, stderr: float) -> float:
+    def _search_deviation(self, stderr: float) -> float:
         return stderr / self.parameter.value if self.parameter.log else stderr
 
     def _scale(self, noise: float) -> float:
         """Cost that is worth one variance: soft gaps rise less than the likelihood, which the standard error knows."""
         if not (math.isfinite(self.spread) and self.spread > 0):
             return noise
-        step = min(self.spread, PROBE) if self.parameter.log else self.spread
+        step = min(self.spread, MAX_LOG_PROBE) if self.parameter.log else self.spread
         around = [self.centre + step, self.centre - step]
-        lower, upper = self.searched(self.parameter.lower), self.searched(self.parameter.upper)
+        lower, upper = self.to_search(self.parameter.lower), self.to_search(self.parameter.upper)
         if not all(lower <= z <= upper for z in around):
             return noise
         middle = self.points[0].cost
-        rise = sum(self.at(z).cost - middle for z in around)
+        rise = sum(self.refit_at(z).cost - middle for z in around)
         found = rise * (self.spread / step) ** 2
         return min(max(found, 0.1 * noise), noise) if math.isfinite(found) else noise
 
 
-def _states(own: Sequence[str], runs: Mapping[str, Trajectory]) -> Mapping[str, Trajectory]:
+def _select_states(own: Sequence[str], runs: Mapping[str, Trajectory]) -> Mapping[str, Trajectory]:
     """What a start takes of fitted runs."""
     return {log: Trajectory(run.t, {n: run[n] for n in own}) for log, run in runs.items()}
 
@@ -269,26 +269,26 @@ def _states(own: Sequence[str], runs: Mapping[str, Trajectory]) -> Mapping[str, 
 def _bracket(refits: _Refits, side: int, target: float) -> None:
     """Refit on one side until the profile has left the level, then closely around that; or to the bound."""
     p = refits.parameter
-    bound = refits.searched(p.lower if side < 0 else p.upper)
+    bound = refits.to_search(p.lower if side < 0 else p.upper)
     inside, step = refits.points[0], _first_step(refits, target)
-    for _ in range(MOST_POINTS):
+    for _ in range(MAX_REFITS_A_SIDE):
         z = side * min(side * inside.z + step, side * bound)
         if z == inside.z:
             return
-        point = refits.at(z)
-        if refits.root(point) >= target:
-            _locate(refits, inside, point, target)
+        point = refits.refit_at(z)
+        if refits.deviance_root(point) >= target:
+            _locate_crossing(refits, inside, point, target)
             return
-        gained = refits.root(point) - refits.root(inside)
-        wanted = (target - refits.root(point)) * abs(z - inside.z) / gained if gained > 0 else math.inf
-        inside, step = point, min(max(1.05 * wanted, 0.1 * step), 3 * step, LONGEST if p.log else math.inf)
+        gained = refits.deviance_root(point) - refits.deviance_root(inside)
+        wanted = (target - refits.deviance_root(point)) * abs(z - inside.z) / gained if gained > 0 else math.inf
+        inside, step = point, min(max(1.05 * wanted, 0.1 * step), 3 * step, MAX_LOG_STEP if p.log else math.inf)
 
 
-def _end(refits: _Refits, side: int, target: float) -> float:
+def _interval_end(refits: _Refits, side: int, target: float) -> float:
     """The outermost crossing of the level on one side; infinite where the outermost refit is still believed."""
     points = sorted(refits.points, key=lambda known: -side * known.z)
     for outside, inside in itertools.pairwise(points):
-        a, b = refits.root(inside), refits.root(outside)
+        a, b = refits.deviance_root(inside), refits.deviance_root(outside)
         if a < target <= b:
             share = (target - a) / (b - a) if math.isfinite(b) else 0.5
             return refits.value(inside.z + share * (outside.z - inside.z))
@@ -301,18 +301,18 @@ def _first_step(refits: _Refits, target: float) -> float:
     """To where the linear interval ends, as searched, and a little further."""
     p, linear = refits.parameter, 1.05 * target * refits.spread
     if p.log:
-        return min(linear, LONGEST) if math.isfinite(linear) else LONGEST
+        return min(linear, MAX_LOG_STEP) if math.isfinite(linear) else MAX_LOG_STEP
     return linear if math.isfinite(linear) and linear > 0 else 0.1 * max(abs(p.value), 1e-6)
 
 
-def _locate(refits: _Refits, inside: _Point, outside: _Point, target: float) -> None:
+def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float) -> None:
     """Refit ever nearer to the crossing, by false position on the root of the deviance, which is nearly linear."""
-    for _ in range(MOST_POINTS):
-        a, b = refits.root(inside), refits.root(outside)
+    for _ in range(MAX_REFITS_A_SIDE):
+        a, b = refits.deviance_root(inside), refits.deviance_root(outside)
         if not a < target <= b:  # a refit has found a better fit, from which all are counted now
             return
         share = (target - a) / (b - a) if math.isfinite(b) else 0.5
-        point = refits.at(inside.z + min(max(share, 0.05), 0.95) * (outside.z - inside.z))
-        if abs(refits.root(point) - target) < CLOSE * target:
+        point = refits.refit_at(inside.z + min(max(share, 0.05), 0.95) * (outside.z - inside.z))
+        if abs(refits.deviance_root(point) - target) < ROOT_TOLERANCE * target:
             return
-        inside, outside = (point, outside) if refits.root(point) < target else (inside, point)
+        inside, outside = (point, outside) if refits.deviance_root(point) < target else (inside, point)

@@ -1,4 +1,4 @@
-"""`derived`: a figure computed from estimates, with the confidence interval that theirs imply."""
+"""`propagate_error`: a figure computed from estimates, with the confidence interval that theirs imply."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -6,20 +6,20 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pneuopt.identification.statistics import confidence_interval
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-Values = Mapping[str, float]
-STEP = 1e-3  # standard deviations over which a slope is taken
+ParameterValues = Mapping[str, float]
+DELTA_METHOD_STEP = 1e-3  # standard deviations over which a slope is taken
 
 
-class Estimated(Protocol):
+class EstimateSource(Protocol):
     """What a derived figure needs of an identification's result."""
 
     @property
@@ -39,7 +39,7 @@ class Estimated(Protocol):
 
 
 @dataclass(frozen=True)
-class Derived:
+class PropagatedValue:
     """A figure with its 95 % confidence interval.
 
     Attributes
@@ -54,7 +54,7 @@ class Derived:
     ci_high: float
 
 
-def derived(result: Estimated, function: Callable[[Values], float]) -> Derived:
+def propagate_error(result: EstimateSource, function: Callable[[ParameterValues], float]) -> PropagatedValue:
     """A function of the parameters, with its interval by the delta method.
 
     Parameters
@@ -84,19 +84,21 @@ def derived(result: Estimated, function: Callable[[Values], float]) -> Derived:
     >>> ratio.value, round(ratio.stderr, 4)
     (1.5, 0.0625)
     """
-    values, stderr = propagated(result, lambda p: [function(p)])
+    values, stderr = propagate_deviations(result, lambda p: [function(p)])
     value, spread = float(values[0]), float(stderr[0])
-    return Derived(value, spread, *confidence_interval(value, spread, log=False))
+    return PropagatedValue(value, spread, *confidence_interval(value, spread, log=False))
 
 
-def propagated(result: Estimated, function: Callable[[Values], ArrayLike]) -> tuple[Array, Array]:
+def propagate_deviations(
+    result: EstimateSource, function: Callable[[ParameterValues], ArrayLike]
+) -> tuple[Array, Array]:
     """Several figures at once, and the standard deviation of each; a curve over a grid, say.
 
     Parameters
     ----------
     result : IdentificationResult
     function : callable
-        As for `derived`; returns n numbers.
+        As for `propagate_error`; returns n numbers.
 
     Returns
     -------
@@ -108,7 +110,9 @@ def propagated(result: Estimated, function: Callable[[Values], ArrayLike]) -> tu
     at = {**known, **{n: known[n.partition("[")[0]] if math.isnan(v) else v for n, v in found.items()}}
     covariance = result.covariance.to_numpy(dtype=float)
     variances = np.diag(covariance)
-    slopes = [_slope(function, at, str(n), v) for n, v in zip(result.covariance.index, variances, strict=True)]
+    slopes = [
+        _central_difference(function, at, str(n), v) for n, v in zip(result.covariance.index, variances, strict=True)
+    ]
     value = np.asarray(function(at), dtype=float)
     J = np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
     used = np.any(J != 0, axis=0)  # of a parameter without an interval, only one that does not count is harmless
@@ -116,7 +120,9 @@ def propagated(result: Estimated, function: Callable[[Values], ArrayLike]) -> tu
     return value, np.sqrt(variance)
 
 
-def _slope(function: Callable[[Values], ArrayLike], at: Values, name: str, variance: float) -> Array:
-    step = STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
+def _central_difference(
+    function: Callable[[ParameterValues], ArrayLike], at: ParameterValues, name: str, variance: float
+) -> Array:
+    step = DELTA_METHOD_STEP * math.sqrt(variance) if variance > 0 else 1e-6 * max(abs(at[name]), 1e-6)
     up, down = (np.asarray(function({**at, name: at[name] + side * step}), dtype=float) for side in (1, -1))
     return np.asarray((up - down) / (2 * step))

@@ -6,34 +6,45 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.checks import measured_outputs
-from pneuopt.identification.identifiability import Verdict, expected, from_covariance, listed
-from pneuopt.identification.problem import Problem
-from pneuopt.identification.profiles import Profile, traced
-from pneuopt.shooting.convergence import NOISE_LEVEL
-from pneuopt.shooting.equations import gaps_of
+from pneuopt.identification.checks import outputs_in_log
+from pneuopt.identification.identifiability import (
+    Verdict,
+    join_names,
+    verdict_from_covariance,
+    verdict_from_sensitivities,
+)
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.profiles import Profile, trace_profile
+from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
+from pneuopt.shooting.equations import segment_gaps
 from pneuopt.shooting.segments import segment, start_nodes
-from pneuopt.shooting.solution import Code, Status
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pneuopt.identification.identify import IdentificationResult
 
-Array = NDArray[np.float64]
-DOUBTFUL = 0.15  # relative standard deviation beyond which the likelihood of a log parameter is no parabola
-OUTSIDE = 3.0  # standard deviations that another parameter moves along a profile, beyond which it is profiled, too
-BLOCK = 50  # samples over which residuals are compared
-SUBSTEPS = 20  # of a sample, at which gaps are shown
-NO_GAP = 1e-4  # of a nominal size
-WIDTH, NARROW, NARROWER = "friction.smoothing", 1e-4, 0.1  # [m/s], narrower takes ever finer steps
-AT_BOUND, NOT_TOLD = "at its bound", "not told"
+MAX_LINEAR_DEVIATION = 0.15  # relative standard deviation beyond which the likelihood of a log parameter is no parabola
+PROFILE_DRAG_DEVIATIONS = (
+    3.0  # standard deviations that another parameter moves along a profile, beyond which it is profiled, too
+)
+RESIDUAL_BLOCK_SAMPLES = 50  # samples over which residuals are compared
+GAP_SUBSTEPS = 20  # of a sample, at which gaps are shown
+MIN_REPORTED_GAP = 1e-4  # of a nominal size
+SMOOTHING_PARAMETER, NARROW_SMOOTHING, SMOOTHING_REDUCTION = (
+    "friction.smoothing",
+    1e-4,
+    0.1,
+)  # [m/s], narrower takes ever finer steps
+AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "not told"
 
 
-def scrutinised(problem: Problem, result: "IdentificationResult", untold: Sequence[str] = ()) -> "IdentificationResult":
+def review_fit(
+    problem: EstimationProblem, result: "IdentificationResult", untold: Sequence[str] = ()
+) -> "IdentificationResult":
     """Mark what the fit says without knowing it.
 
     Parameters
@@ -53,35 +64,41 @@ def scrutinised(problem: Problem, result: "IdentificationResult", untold: Sequen
     """
     start = Start(result.trajectories, {str(n): float(v) for n, v in result.estimates["value"].items()}, "fit")
     if not result.status.converged:
-        verdict = _at(problem, start, result)
+        verdict = _verdict_at(problem, start, result)
         status = (
             result.status
             if result.status.code is Code.INTERRUPTED
-            else _located(problem, start, result.status, verdict)
+            else _locate_failure(problem, start, result.status, verdict)
         )
-        blank = _blank(result.estimates, result.estimates.index)
+        blank = _blank_intervals(result.estimates, result.estimates.index)
         return replace(
             result,
-            estimates=_noted(blank, verdict),
+            estimates=_add_notes(blank, verdict),
             covariance=result.covariance * math.nan,
             status=status,
             verdict=verdict,
         )
-    result = replace(result, estimates=_blank(result.estimates, untold))
+    result = replace(result, estimates=_blank_intervals(result.estimates, untold))
     profiles = _profiles(problem, result)
-    trusted = result.stats["chi_square_ratio"] <= NOISE_LEVEL
-    verdict = from_covariance(problem, start, _without(result.covariance, untold), trusted=trusted)
+    trusted = result.stats["chi_square_ratio"] <= MAX_CHI_SQUARE_RATIO
+    verdict = verdict_from_covariance(problem, start, _blank_covariance(result.covariance, untold), trusted=trusted)
     verdict = verdict.with_profiles(profiles)
     if untold:
-        verdict = verdict.with_untold(untold, _at(problem, start, result), _kept(problem))
-    estimates = _noted(_corrected(result.estimates, profiles, verdict), verdict)
-    covariance = _without(result.covariance, estimates.index[estimates["stderr"].isna()])
-    told = f"{result.status.message}; the logs do not tell {listed(verdict.untold)}" if verdict.untold else ""
-    status = Status(result.status.code, told) if told else result.status
+        verdict = verdict.with_unidentifiable(
+            untold, _verdict_at(problem, start, result), _names_at_given_value(problem)
+        )
+    estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
+    covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
+    message = (
+        f"{result.status.message}; the logs do not tell {join_names(verdict.unidentifiable)}"
+        if verdict.unidentifiable
+        else ""
+    )
+    status = Status(result.status.code, message) if message else result.status
     return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
 
 
-def _without(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
+def _blank_covariance(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
     """NaN for these."""
     out, gone = covariance.copy(), list(names)
     out.loc[gone] = math.nan
@@ -89,54 +106,60 @@ def _without(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame"
     return out
 
 
-def _blank(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
+def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
     """No interval for these."""
     out = estimates.copy()
     out.loc[list(names), ["stderr", "ci_low", "ci_high"]] = math.nan
     return out
 
 
-def _kept(problem: Problem) -> tuple[str, ...]:
+def _names_at_given_value(problem: EstimationProblem) -> tuple[str, ...]:
     """Of what is held, that which stays at its given value."""
     given = problem.unknowns()
     return tuple(n for n, v in problem.held.items() if v == given.value(n))
 
 
-def _at(problem: Problem, start: Start, result: "IdentificationResult") -> Verdict:
+def _verdict_at(problem: EstimationProblem, start: Start, result: "IdentificationResult") -> Verdict:
     """The verdict where a search gave up, from the sensitivities there."""
-    return expected(problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["correlation_time"]))
+    return verdict_from_sensitivities(
+        problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["correlation_time"])
+    )
 
 
-def _profiles(problem: Problem, result: "IdentificationResult") -> dict[str, Profile]:
+def _profiles(problem: EstimationProblem, result: "IdentificationResult") -> dict[str, Profile]:
     """Profiles of what is doubtful, and of what that drags along."""
     found: dict[str, Profile] = {}
     rows = result.estimates
     known = rows.index[np.isfinite(rows["stderr"])]
     unknowns = problem.unknowns()
-    waiting = [n for n in known if unknowns[n].log and rows["stderr"][n] > DOUBTFUL * rows["value"][n]]
+    waiting = [n for n in known if unknowns[n].log and rows["stderr"][n] > MAX_LINEAR_DEVIATION * rows["value"][n]]
     try:
         while waiting:
             name = waiting.pop(0)
-            found[name] = traced(problem, result, name)
-            dragged = [n for n in _dragged(found[name], rows) if n in known and n not in found and n not in waiting]
+            found[name] = trace_profile(problem, result, name)
+            dragged = [
+                n
+                for n in _parameters_outside_interval(found[name], rows)
+                if n in known and n not in found and n not in waiting
+            ]
             waiting += dragged if found[name].is_open else []
     except KeyboardInterrupt:
         return found
     return found
 
 
-def _dragged(profile: Profile, estimates: "pd.DataFrame") -> Iterator[str]:
+def _parameters_outside_interval(profile: Profile, estimates: "pd.DataFrame") -> Iterator[str]:
     """Other parameters that leave their linear interval while the profiled one is still believed."""
     believed = profile.curve[profile.curve["deviance"] <= profile.threshold]
     for name in estimates.index.drop(profile.name):
         moved = (believed[name] - estimates["value"][name]).abs().max()
-        if moved > OUTSIDE * estimates["stderr"][name]:
+        if moved > PROFILE_DRAG_DEVIATIONS * estimates["stderr"][name]:
             yield str(name)
 
 
-def _corrected(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdict: Verdict) -> "pd.DataFrame":
+def _replace_intervals(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdict: Verdict) -> "pd.DataFrame":
     """The profiles' intervals in place of the linear ones; no standard deviation where there is no closed interval."""
-    out = _blank(estimates, verdict.untold)
+    out = _blank_intervals(estimates, verdict.unidentifiable)
     for name, found in profiles.items():
         out.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
         if found.is_open:
@@ -144,54 +167,60 @@ def _corrected(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdi
     return out
 
 
-def _noted(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
+def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
     """A note beside each number that is none, and no number where nothing is told."""
-    untold, bound = set(verdict.untold), estimates["at_bound"]
-    notes = [AT_BOUND if bound[n] else NOT_TOLD if n in untold else "" for n in estimates.index]
+    untold, bound = set(verdict.unidentifiable), estimates["at_bound"]
+    notes = [AT_BOUND_NOTE if bound[n] else UNIDENTIFIABLE_NOTE if n in untold else "" for n in estimates.index]
     out = estimates.assign(note=notes)
-    return out.assign(value=out["value"].where(out["note"] != NOT_TOLD))
+    return out.assign(value=out["value"].where(out["note"] != UNIDENTIFIABLE_NOTE))
 
 
-def _located(problem: Problem, start: Start, status: Status, verdict: Verdict) -> Status:
+def _locate_failure(problem: EstimationProblem, start: Start, status: Status, verdict: Verdict) -> Status:
     """A failure with the place where it is worst."""
     parts = [status.message, _worst_residual(problem, start), _worst_gap(problem, start)]
-    if verdict.untold:
-        parts.append(f"the logs do not tell {listed(verdict.untold)}: fix what is not told, or log a run that tells it")
-    parts.append(_narrower(problem))
+    if verdict.unidentifiable:
+        parts.append(
+            f"the logs do not tell {join_names(verdict.unidentifiable)}: "
+            "fix what is not told, or log a run that tells it"
+        )
+    parts.append(_smoothing_advice(problem))
     return Status(status.code, "; ".join(part for part in parts if part))
 
 
-def _narrower(problem: Problem) -> str:
+def _smoothing_advice(problem: EstimationProblem) -> str:
     """A remedy for logs that stick: smoothed friction creeps meanwhile, at a speed of its width's order."""
-    width = problem.parameters[WIDTH].value if WIDTH in problem.parameters else NARROW
-    told = f"if the logs stick, try {WIDTH} = {max(NARROW, NARROWER * width):g} m/s in place of {width:g} m/s"
-    return f"{told}: above it the model creeps where the drive stands still" if width > NARROW else ""
+    width = (
+        problem.parameters[SMOOTHING_PARAMETER].value if SMOOTHING_PARAMETER in problem.parameters else NARROW_SMOOTHING
+    )
+    narrower = max(NARROW_SMOOTHING, SMOOTHING_REDUCTION * width)
+    message = f"if the logs stick, try {SMOOTHING_PARAMETER} = {narrower:g} m/s in place of {width:g} m/s"
+    return f"{message}: above it the model creeps where the drive stands still" if width > NARROW_SMOOTHING else ""
 
 
-def _worst_residual(problem: Problem, start: Start) -> str:
+def _worst_residual(problem: EstimationProblem, start: Start) -> str:
     """Log, channel and time span of the largest residuals."""
-    worst, told = NOISE_LEVEL, ""
+    worst, message = MAX_CHI_SQUARE_RATIO, ""
     for log in problem.experiments:
         t, run = log.trajectory.t, start.states[log.name]
-        for channel in measured_outputs(problem.system, log):
+        for channel in outputs_in_log(problem.system, log):
             off = (log.trajectory[channel] - run[channel]) / log.noise[channel]
-            for first in range(0, len(t), BLOCK):
-                part = off[first : first + BLOCK]
+            for first in range(0, len(t), RESIDUAL_BLOCK_SAMPLES):
+                part = off[first : first + RESIDUAL_BLOCK_SAMPLES]
                 size = math.sqrt(float(np.nanmean(part**2))) if np.isfinite(part).any() else 0.0
                 if size > worst:
-                    last = min(first + BLOCK, len(t)) - 1
-                    worst, told = size, f"{channel} of {log.name} from {t[first]:.4g} to {t[last]:.4g} s"
-    return f"the worst residuals, {worst:.3g} times the noise, are {told}" if told else ""
+                    last = min(first + RESIDUAL_BLOCK_SAMPLES, len(t)) - 1
+                    worst, message = size, f"{channel} of {log.name} from {t[first]:.4g} to {t[last]:.4g} s"
+    return f"the worst residuals, {worst:.3g} times the noise, are {message}" if message else ""
 
 
-def _worst_gap(problem: Problem, start: Start) -> str:
+def _worst_gap(problem: EstimationProblem, start: Start) -> str:
     """State, log and time of the largest gap between two segments."""
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     nodes = start_nodes(segments)
-    ends = segments.run(nodes, q, SUBSTEPS, sensitivities=False).x_end
-    gaps = np.abs(gaps_of(segments, nodes, ends))
-    if not gaps.size or not np.isfinite(gaps).all() or gaps.max() < NO_GAP:
+    ends = segments.run(nodes, q, GAP_SUBSTEPS, sensitivities=False).x_end
+    gaps = np.abs(segment_gaps(segments, nodes, ends))
+    if not gaps.size or not np.isfinite(gaps).all() or gaps.max() < MIN_REPORTED_GAP:
         return ""
     row, column = np.unravel_index(int(np.argmax(gaps)), gaps.shape)
     state = problem.system.states[int(column)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.system import System, names
 from pneuopt.identification.identify import IdentificationResult, identify, validate
-from pneuopt.identification.review import AT_BOUND, NOT_TOLD
+from pneuopt.identification.review import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
@@ -18,8 +18,8 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     import pandas as pd
 
-LEVEL = 0.01  # of a nested test: a simpler model is given up below this probability
-WORSE = 1.02  # held-out NRMSE, relative to a simpler model's, from which the richer one is not believed
+NESTED_TEST_LEVEL = 0.01  # of a nested test: a simpler model is given up below this probability
+MAX_HELD_OUT_RATIO = 1.02  # held-out NRMSE, relative to a simpler model's, from which the richer one is not believed
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,21 +92,21 @@ def select_model(
     that a candidate with such parameters gives way to a simpler one that fits as well.
     """
     require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
-    given = {name: _given(system, parameters, free) for name, system in candidates.items()}
-    _check_known(given, parameters, free)
+    given = {name: _candidate_parameters(system, parameters, free) for name, system in candidates.items()}
+    _check_names(given, parameters, free)
     fits = {n: identify(s, experiments, given[n], method=method, throw=False) for n, s in candidates.items()}
     converged = [n for n, fit in fits.items() if fit.status.converged]
     if not converged:
-        told = "; ".join(f"{n}: {fit.status.message}" for n, fit in fits.items())
-        raise ConvergenceError(f"none of the candidates converged: {told}", fits)
-    predicted = {n: _predicted(candidates[n], held_out, fits[n]) for n in converged}
-    rows = _judged(candidates, fits, predicted)
-    chosen, passed_over = _chosen(rows)
-    return ModelSelection(_tabulated(rows), chosen, _reason(rows, chosen, passed_over), fits)
+        message = "; ".join(f"{n}: {fit.status.message}" for n, fit in fits.items())
+        raise ConvergenceError(f"none of the candidates converged: {message}", fits)
+    predicted = {n: _mean_nrmse(candidates[n], held_out, fits[n]) for n in converged}
+    rows = _candidate_rows(candidates, fits, predicted)
+    chosen, passed_over = _choose(rows)
+    return ModelSelection(_selection_table(rows), chosen, _selection_reason(rows, chosen, passed_over), fits)
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _CandidateRow:
     """A row of the table."""
 
     converged: bool
@@ -116,18 +116,18 @@ class _Judged:
     contains: str
     p_value: float
     held_out_nrmse: float
-    untold: str
+    unidentifiable: str
     at_bound: str
     message: str
 
 
-def _given(system: System, parameters: ParameterSet, free: Sequence[str]) -> ParameterSet:
+def _candidate_parameters(system: System, parameters: ParameterSet, free: Sequence[str]) -> ParameterSet:
     own = system.parameters | parameters.select(n for n in parameters if n in system.parameters)
     matched = [n for n in own if any(fnmatch.fnmatch(n, pattern) for pattern in free)]
     return own.freed(*matched) if matched else own
 
 
-def _check_known(given: Mapping[str, ParameterSet], parameters: ParameterSet, free: Sequence[str]) -> None:
+def _check_names(given: Mapping[str, ParameterSet], parameters: ParameterSet, free: Sequence[str]) -> None:
     every = sorted({n for own in given.values() for n in own})
     for name in parameters:
         if name not in every:
@@ -137,7 +137,7 @@ def _check_known(given: Mapping[str, ParameterSet], parameters: ParameterSet, fr
             raise UnknownNameError("parameter", pattern, every)
 
 
-def _tabulated(rows: Mapping[str, _Judged]) -> "pd.DataFrame":
+def _selection_table(rows: Mapping[str, _CandidateRow]) -> "pd.DataFrame":
     import pandas as pd
 
     table = pd.DataFrame.from_dict({n: asdict(row) for n, row in rows.items()}, orient="index")
@@ -145,40 +145,40 @@ def _tabulated(rows: Mapping[str, _Judged]) -> "pd.DataFrame":
     return table
 
 
-def _predicted(system: System, held_out: Sequence[Experiment], fit: IdentificationResult) -> float:
+def _mean_nrmse(system: System, held_out: Sequence[Experiment], fit: IdentificationResult) -> float:
     """Mean NRMSE over the held-out runs and channels; NaN without any."""
     if not held_out:
         return math.nan
     return float(validate(system, held_out, fit.parameters)["nrmse"].mean())
 
 
-def _judged(
+def _candidate_rows(
     candidates: Mapping[str, System], fits: Mapping[str, IdentificationResult], predicted: Mapping[str, float]
-) -> dict[str, _Judged]:
+) -> dict[str, _CandidateRow]:
     """What the figures say of each candidate, the lowest BIC first, those that did not converge last."""
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
     scale = _variance(fits[best]) * fits[best].stats["correlation_time"]
-    count = _samples(fits[best]) / fits[best].stats["correlation_time"]
+    count = _residual_count(fits[best]) / fits[best].stats["correlation_time"]
     rows = {}
     for name, fit in fits.items():
         k, deviance = len(fit.estimates), _chi_square(fit) / scale
         inside, p, bic = "", math.nan, math.nan
         if name in predicted:
-            inside, bic = _contained(name, candidates, fits, predicted), bayes_information(deviance, k, count)
+            inside, bic = _largest_submodel(name, candidates, fits, predicted), bayes_information(deviance, k, count)
         if inside:
             p = likelihood_ratio_p(_chi_square(fits[inside]) / scale - deviance, k - len(fits[inside].estimates))
         held_out = predicted.get(name, math.nan)
-        told = _noted(fit, NOT_TOLD), _noted(fit, AT_BOUND), fit.status.message
-        rows[name] = _Judged(fit.status.converged, k, deviance, bic, inside, p, held_out, *told)
+        notes = _names_with_note(fit, UNIDENTIFIABLE_NOTE), _names_with_note(fit, AT_BOUND_NOTE), fit.status.message
+        rows[name] = _CandidateRow(fit.status.converged, k, deviance, bic, inside, p, held_out, *notes)
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
 
 
-def _noted(fit: IdentificationResult, note: str) -> str:
+def _names_with_note(fit: IdentificationResult, note: str) -> str:
     """The parameters with this note."""
     return ", ".join(str(n) for n, said in fit.estimates["note"].items() if said == note)
 
 
-def _contained(
+def _largest_submodel(
     name: str,
     candidates: Mapping[str, System],
     fits: Mapping[str, IdentificationResult],
@@ -198,41 +198,44 @@ def _chi_square(fit: IdentificationResult) -> float:
 
 
 def _variance(fit: IdentificationResult) -> float:
-    return _chi_square(fit) / max(1.0, _samples(fit) - len(fit.estimates))
+    return _chi_square(fit) / max(1.0, _residual_count(fit) - len(fit.estimates))
 
 
-def _samples(fit: IdentificationResult) -> float:
+def _residual_count(fit: IdentificationResult) -> float:
     return float(fit.fit["samples"].sum())
 
 
-def _chosen(rows: Mapping[str, _Judged]) -> tuple[str, str]:
+def _choose(rows: Mapping[str, _CandidateRow]) -> tuple[str, str]:
     """The lowest BIC that is no chance and predicts as well as what it contains; and what had to be passed over."""
     passed_over, name = "", next(iter(rows))
     while inside := rows[name].contains:
         row = rows[name]
-        if row.p_value <= LEVEL and not row.held_out_nrmse > WORSE * rows[inside].held_out_nrmse:
+        if (
+            row.p_value <= NESTED_TEST_LEVEL
+            and not row.held_out_nrmse > MAX_HELD_OUT_RATIO * rows[inside].held_out_nrmse
+        ):
             break
         passed_over, name = passed_over or name, inside
     return name, passed_over
 
 
-def _reason(rows: Mapping[str, _Judged], chosen: str, passed_over: str) -> str:
+def _selection_reason(rows: Mapping[str, _CandidateRow], chosen: str, passed_over: str) -> str:
     """One sentence: what speaks for the choice, and what against its neighbours."""
     row, good = rows[chosen], [n for n, r in rows.items() if r.converged]
-    told = f"{chosen}, of {len(good)} converged candidates"
+    message = f"{chosen}, of {len(good)} converged candidates"
     if passed_over:
         p = rows[passed_over].p_value
-        why = f"may be chance (p = {p:.2g})" if p > LEVEL else "predict the held-out runs worse"
-        told += f", for {passed_over}'s extra terms {why}"
+        why = f"may be chance (p = {p:.2g})" if p > NESTED_TEST_LEVEL else "predict the held-out runs worse"
+        message += f", for {passed_over}'s extra terms {why}"
     elif len(good) > 1:
-        told += f", has the lowest BIC, {rows[good[1]].bic - row.bic:.4g} below {good[1]}"
+        message += f", has the lowest BIC, {rows[good[1]].bic - row.bic:.4g} below {good[1]}"
     if row.contains:
-        told += f"; {row.contains}, which it contains, is refuted (p = {row.p_value:.2g})"
+        message += f"; {row.contains}, which it contains, is refuted (p = {row.p_value:.2g})"
     if math.isfinite(row.held_out_nrmse):
-        told += f"; it predicts held-out runs with an NRMSE of {row.held_out_nrmse:.2%}"
-    if row.untold:
-        told += f"; the logs do not tell its {row.untold}"
+        message += f"; it predicts held-out runs with an NRMSE of {row.held_out_nrmse:.2%}"
+    if row.unidentifiable:
+        message += f"; the logs do not tell its {row.unidentifiable}"
     if row.at_bound:
-        told += f"; at a bound: {row.at_bound}"
+        message += f"; at a bound: {row.at_bound}"
     failed = [n for n in rows if n not in good]
-    return told + (f"; not converged: {', '.join(failed)}" if failed else "")
+    return message + (f"; not converged: {', '.join(failed)}" if failed else "")

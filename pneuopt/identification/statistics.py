@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2, norm
 
-Array = NDArray[np.float64]
+from pneuopt.quantities.arrays import Array
 
 
 def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
@@ -66,14 +66,14 @@ def noise_level(column: ArrayLike, t: ArrayLike | None = None) -> float:
     steps = np.abs(np.diff(column[known]))
     if not np.any(steps > 0):
         return math.nan
-    off = _off_line(time, column)  # not across a hole, as long as some samples have both neighbours
-    off = off[np.isfinite(off)] if np.isfinite(off).any() else _off_line(time[known], column[known])
+    off = _line_deviation(time, column)  # not across a hole, as long as some samples have both neighbours
+    off = off[np.isfinite(off)] if np.isfinite(off).any() else _line_deviation(time[known], column[known])
     random = 1.4826 * float(np.median(np.abs(off - np.median(off)))) if off.size else 0.0
     resolution = float(np.min(steps[steps > 1e-9 * np.max(steps)])) / math.sqrt(12)
     return max(random, resolution)
 
 
-def _off_line(t: Array, y: Array) -> Array:
+def _line_deviation(t: Array, y: Array) -> Array:
     """Distance of inner samples from the line through their neighbours, scaled to the noise of one sample."""
     left = (t[2:] - t[1:-1]) / (t[2:] - t[:-2])
     distance = y[1:-1] - left * y[:-2] - (1 - left) * y[2:]

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_known, require
-from pneuopt.quantities.units import read_value, scale_of
-
-Array = NDArray[np.float64]
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
+from pneuopt.quantities.units import read_value, si_conversion
 
 CHANNELS: Mapping[str, str] = {
     "time": "s",
@@ -30,12 +28,12 @@ CHANNELS: Mapping[str, str] = {
 }
 """The channels of a log and their SI units."""
 
-SHORTEST = 10
+MIN_SAMPLES = 10
 """Samples that a log has at least."""
 
 _SYNONYMS = {"t": "time", "velocity": "speed", "displacement": "position", "voltage": "valve_voltage"}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_BRACKETS = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")
+_BRACKETED_UNIT = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")
 
 
 def read_columns(path: Path, raw: bytes, entries: Mapping[str, Any] | None, where: str) -> dict[str, Array]:
@@ -63,10 +61,10 @@ def read_columns(path: Path, raw: bytes, entries: Mapping[str, Any] | None, wher
         If the file cannot be understood beyond doubt.
     """
     table = _read_table(path, raw)
-    found = _header_columns(table) if entries is None else _named_columns(table, entries, where)
+    found = _columns_from_header(table) if entries is None else _columns_from_entries(table, entries, where)
     require("time" in found, f'{path}: no time; name a column "time [s]", or say which in a sidecar', LogError)
     require(len(found) > 1, f"{path}: no channel but time; known: {', '.join(CHANNELS)}", LogError)
-    numbers = _numbers(table, [column.place for column in found.values()])
+    numbers = _parse_numbers(table, [column.place for column in found.values()])
     values = {channel: c.factor * numbers[c.place] + c.offset for channel, c in found.items()}
     _check_samples(table, found, values)
     return values
@@ -105,10 +103,10 @@ def _read_table(path: Path, raw: bytes) -> _Table:
         require(header.count(name) == 1, f"{path}: two columns are named {name!r}; rename one", LogError)
         require(not _NUMBER.fullmatch(name), f"{path}: row 1 holds the number {name!r}, not a column's name", LogError)
     require(len(lines) > 1, f"{path}: a header, but no samples", LogError)
-    return _Table(path, header, _even(path, lines[1:], len(header), delimiter), delimiter)
+    return _Table(path, header, _check_field_counts(path, lines[1:], len(header), delimiter), delimiter)
 
 
-def _even(path: Path, lines: list[str], width: int, delimiter: str) -> list[str]:
+def _check_field_counts(path: Path, lines: list[str], width: int, delimiter: str) -> list[str]:
     """Check that every row has as many fields as the header; a trailing delimiter is dropped."""
     quoted = any('"' in line for line in lines)
     counts = [len(_cells(line, delimiter)) if quoted else line.count(delimiter) + 1 for line in lines]
@@ -130,24 +128,24 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [""])]
 
 
-def _header_columns(table: _Table) -> dict[str, _Column]:
+def _columns_from_header(table: _Table) -> dict[str, _Column]:
     """Columns whose header names a channel and its unit; one that nearly does is an error."""
     found: dict[str, _Column] = {}
     for name in filter(None, table.header):
-        channel, unit = _channel_of(name)
+        channel, unit = _split_channel(name)
         if not channel:
-            _check_near_miss(table.path, name)
+            _check_misspelling(table.path, name)
             continue
         where = f"{table.path}: column {name!r}"
         require(channel not in found, f"{where}: {channel!r} has another column; name one in a sidecar", LogError)
         try:
-            found[channel] = _column(table, channel, {"column": name, "unit": unit} if unit else name, where)
+            found[channel] = _resolve_column(table, channel, {"column": name, "unit": unit} if unit else name, where)
         except UnitError as error:
             raise UnitError(f"{error} (or list the columns to use in a sidecar)") from None
     return found
 
 
-def _channel_of(name: str) -> tuple[str, str]:
+def _split_channel(name: str) -> tuple[str, str]:
     """Split "position [mm]" or "position_mm" into channel and unit; ("", "") if it names no channel."""
     bare, unit = _split_unit(name)
     plain = bare.casefold().replace(" ", "_")
@@ -160,11 +158,11 @@ def _channel_of(name: str) -> tuple[str, str]:
 
 
 def _split_unit(name: str) -> tuple[str, str]:
-    match = _BRACKETS.fullmatch(name)
+    match = _BRACKETED_UNIT.fullmatch(name)
     return (match[1] or match[3], match[2] or match[4] or "") if match else (name, "")
 
 
-def _check_near_miss(path: Path, name: str) -> None:
+def _check_misspelling(path: Path, name: str) -> None:
     bare, unit = _split_unit(name)
     parts = bare.casefold().replace(" ", "_").split("_")
     for n in range(len(parts), 0 if not unit else len(parts) - 1, -1):
@@ -178,14 +176,14 @@ def _check_near_miss(path: Path, name: str) -> None:
         )
 
 
-def _named_columns(table: _Table, entries: Mapping[str, Any], where: str) -> dict[str, _Column]:
-    check_known("channel", entries, CHANNELS, where)
-    return {channel: _column(table, channel, entry, f"{where}.{channel}") for channel, entry in entries.items()}
+def _columns_from_entries(table: _Table, entries: Mapping[str, Any], where: str) -> dict[str, _Column]:
+    check_names("channel", entries, CHANNELS, where)
+    return {channel: _resolve_column(table, channel, entry, f"{where}.{channel}") for channel, entry in entries.items()}
 
 
-def _column(table: _Table, channel: str, entry: Any, where: str) -> _Column:
+def _resolve_column(table: _Table, channel: str, entry: Any, where: str) -> _Column:
     said = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
-    check_known("key", said, ("column", "unit", "centre", "scale"), where)
+    check_names("key", said, ("column", "unit", "centre", "scale"), where)
     require(isinstance(said.get("column"), str), f'{where}: say which column: {{ column = "U valve" }}', LogError)
     name = said["column"]
     bare, unit = _split_unit(name)
@@ -193,16 +191,16 @@ def _column(table: _Table, channel: str, entry: Any, where: str) -> _Column:
         name = bare
     if name not in table.header:
         raise UnknownNameError("column", said["column"], filter(None, table.header), where)
-    unit = str(said.get("unit") or unit or _channel_of(name)[1])
+    unit = str(said.get("unit") or unit or _split_channel(name)[1])
     require(bool(unit), f'{where}: no unit; write "{bare} [{CHANNELS[channel]}]", or unit = "..."', UnitError)
     raw_centre = read_value(said["centre"], unit, where=f"{where}.centre") if "centre" in said else 0.0
-    factor, offset = _gain(unit, said.get("scale"), CHANNELS[channel], where)
+    factor, offset = _column_scaling(unit, said.get("scale"), CHANNELS[channel], where)
     return _Column(table.header.index(name), factor, offset - factor * raw_centre)
 
 
-def _gain(unit: str, scale: str | float | None, target: str, where: str) -> tuple[float, float]:
+def _column_scaling(unit: str, scale: str | float | None, target: str, where: str) -> tuple[float, float]:
     if scale is None:
-        return scale_of(unit, target, where=where)
+        return si_conversion(unit, target, where=where)
     # A sensor's "1 bar(g)/V" says where the pressure counts from; the gain itself is a difference.
     level = re.search(r"\([ag]\)", f"{unit} {scale}")
     require(
@@ -212,18 +210,18 @@ def _gain(unit: str, scale: str | float | None, target: str, where: str) -> tupl
     )
     bare, bare_target = (re.sub(r"\([ag]\)", "", text) for text in (unit, target))
     gain = read_value(re.sub(r"\([ag]\)", "", str(scale)), f"({bare_target})/({bare})", where=f"{where}.scale")
-    return gain, scale_of(bare_target + (level[0] if level else ""), target, where=f"{where}.scale")[1]
+    return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where}.scale")[1]
 
 
-def _numbers(table: _Table, used: Sequence[int]) -> dict[int, Array]:
+def _parse_numbers(table: _Table, used: Sequence[int]) -> dict[int, Array]:
     for decimal in (".", ","):
-        numbers = _parse(table, used, decimal)
+        numbers = _parse_with_decimal(table, used, decimal)
         if numbers is not None:
             return numbers
-    raise _refusal(table, used)
+    raise _number_error(table, used)
 
 
-def _parse(table: _Table, used: Sequence[int], decimal: str) -> dict[int, Array] | None:
+def _parse_with_decimal(table: _Table, used: Sequence[int], decimal: str) -> dict[int, Array] | None:
     import pandas as pd
 
     try:
@@ -250,7 +248,7 @@ def _parse(table: _Table, used: Sequence[int], decimal: str) -> dict[int, Array]
     return numbers
 
 
-def _refusal(table: _Table, used: Sequence[int]) -> LogError:
+def _number_error(table: _Table, used: Sequence[int]) -> LogError:
     """Name the first cell that is not a number."""
     rows = [_cells(line, table.delimiter) for line in table.lines]
     decimal = (
@@ -269,7 +267,11 @@ def _refusal(table: _Table, used: Sequence[int]) -> LogError:
 
 def _check_samples(table: _Table, found: Mapping[str, _Column], values: Mapping[str, Array]) -> None:
     t = values["time"]
-    require(t.size >= SHORTEST, f"{table.path}: {t.size} samples are too few; at least {SHORTEST} are needed", LogError)
+    require(
+        t.size >= MIN_SAMPLES,
+        f"{table.path}: {t.size} samples are too few; at least {MIN_SAMPLES} are needed",
+        LogError,
+    )
     for channel, column in values.items():
         missing = np.isnan(column)
         where = f"column {table.header[found[channel].place]!r}"

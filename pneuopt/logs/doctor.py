@@ -5,18 +5,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE
 
-Array = NDArray[np.float64]
-BLOCKS = 20  # of a log, whose means tell motion from noise
-VACUUM = 0.3  # of the atmosphere: no pneumatic chamber is exhausted further
-RETURNS = 0.3  # of the path: a log that ends this near to its beginning does no net work on a load
-AGAINST = -0.2  # of the power's absolute value: what a brake would take, not a drive
-AREA_RATIOS = (
+MEAN_BLOCKS = 20  # of a log, whose means tell motion from noise
+MIN_PRESSURE_RATIO = 0.3  # of the atmosphere: no pneumatic chamber is exhausted further
+MAX_NET_TRAVEL_SHARE = 0.3  # of the path: a log that ends this near to its beginning does no net work on a load
+MIN_WORK_SHARE = -0.2  # of the power's absolute value: what a brake would take, not a drive
+ROD_AREA_RATIOS = (
     0.7,
     0.75,
     0.8,
@@ -25,11 +24,14 @@ AREA_RATIOS = (
     0.95,
     1.0,
 )  # of the rod's side to the other: any real cylinder has one of these
-SLOPES = (0.8, 1.25)  # of a speed over its position's slope
-LATE = 0.1  # [s] within which a drive's speed follows its valve
-OPPOSED = (-0.6, 0.3)  # correlations of command and speed: the least below, and the largest below that, is a wrong sign
-TO_AND_FRO = 1.9  # times its range that a piston travels only if something commands it to come back
-CLIPPED = 0.02  # share of the samples at exactly the largest value
+SPEED_SLOPE_RATIOS = (0.8, 1.25)  # of a speed over its position's slope
+MAX_COMMAND_LAG = 0.1  # [s] within which a drive's speed follows its valve
+WRONG_SIGN_CORRELATIONS = (
+    -0.6,
+    0.3,
+)  # correlations of command and speed: the least below, and the largest below that, is a wrong sign
+RECIPROCATING_TRAVEL_RATIO = 1.9  # times its range that a piston travels only if something commands it to come back
+CLIPPED_SHARE = 0.02  # share of the samples at exactly the largest value
 
 
 @dataclass(frozen=True)
@@ -77,14 +79,14 @@ def examine(experiment: Experiment) -> tuple[Finding, ...]:
     """
     log = experiment.trajectory
     checks = (
-        *(_silent(experiment), _contradicting(log), _braking(log), _commanded(log)),
-        *(_pressures(experiment), _sampling(log)),
+        *(_check_has_motion(experiment), _check_position_speed(log), _check_work_sign(log), _check_command(log)),
+        *(_check_pressures(experiment), _check_sampling(log)),
     )
     found = [finding for check in checks for finding in check]
     return tuple(sorted(found, key=lambda f: not f.fault))
 
 
-def _silent(experiment: Experiment) -> Iterator[Finding]:
+def _check_has_motion(experiment: Experiment) -> Iterator[Finding]:
     """Channels without motion."""
     for name in ("position", "speed"):
         if name not in experiment.trajectory:
@@ -93,15 +95,15 @@ def _silent(experiment: Experiment) -> Iterator[Finding]:
         y, noise = y[np.isfinite(y)], experiment.noise.get(name, 0.0)
         if y.size and not np.any(np.diff(y)) and (name == "position" or y[0] == 0):
             yield Finding(name, f"{name!r} is constant: without motion a log tells nothing about friction", True)
-        elif y.size >= 2 * BLOCKS and (_is_still(y, noise) or (name == "position" and _is_white(y))):
-            told = f"{name!r} shows noise and no motion: log a run in which the drive moves"
-            yield Finding(name, told, True)
+        elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == "position" and _is_white(y))):
+            message = f"{name!r} shows noise and no motion: log a run in which the drive moves"
+            yield Finding(name, message, True)
 
 
-def _is_still(y: Array, noise: float) -> bool:
+def _is_motionless(y: Array, noise: float) -> bool:
     """Whether a channel stays where it is, to its noise, and so do its block means."""
-    size = y.size // BLOCKS
-    means = y[: BLOCKS * size].reshape(BLOCKS, size).mean(axis=1)
+    size = y.size // MEAN_BLOCKS
+    means = y[: MEAN_BLOCKS * size].reshape(MEAN_BLOCKS, size).mean(axis=1)
     return float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
 
 
@@ -111,11 +113,11 @@ def _is_white(y: Array) -> bool:
     return abs(float(e[1:] @ e[:-1])) < 3 / math.sqrt(e.size) * float(e @ e)
 
 
-def _contradicting(log: Trajectory) -> Iterator[Finding]:
+def _check_position_speed(log: Trajectory) -> Iterator[Finding]:
     """Position and speed that do not belong together."""
     if "position" not in log or "speed" not in log:
         return
-    slope, speed = _slope(log), log["speed"]
+    slope, speed = _position_slope(log), log["speed"]
     known = np.isfinite(slope) & np.isfinite(speed)
     slope, speed = slope[known], speed[known]
     power = math.sqrt(float(slope @ slope) * float(speed @ speed))
@@ -124,58 +126,60 @@ def _contradicting(log: Trajectory) -> Iterator[Finding]:
     ratio = float(speed @ slope) / float(slope @ slope)
     if ratio < 0:
         yield Finding("speed", "position and speed run against each other: change the sign of one", True)
-    elif not SLOPES[0] < ratio < SLOPES[1]:
+    elif not SPEED_SLOPE_RATIOS[0] < ratio < SPEED_SLOPE_RATIOS[1]:
         yield Finding("speed", f"speed is {ratio:.3g} times the slope of the position: check both units", True)
 
 
-def _braking(log: Trajectory) -> Iterator[Finding]:
+def _check_work_sign(log: Trajectory) -> Iterator[Finding]:
     """Whatever drives has to do work against friction, once the load is back where it was."""
-    motion = _motion(log)
+    motion = _motion_speed(log)
     if motion is None:
         return
     drives = {"force": ("the force brakes", "'force'")}
     if "pressure_a" in log and "pressure_b" in log:
         drives["pressures"] = ("the pressures brake", "the position, or exchange pressure_a and pressure_b")
-    for name, (told, remedy) in drives.items():
+    for name, (message, remedy) in drives.items():
         if name == "force" and name not in log:
             continue
         if name == "force":
             share = _work_share(log.t, log["force"], motion, centred=False)
         else:
-            pushes = (log["pressure_a"] - ratio * log["pressure_b"] for ratio in AREA_RATIOS)
+            pushes = (log["pressure_a"] - ratio * log["pressure_b"] for ratio in ROD_AREA_RATIOS)
             share = max(_work_share(log.t, push, motion, centred=True) for push in pushes)
-        if share < AGAINST:
-            why = f"{told} the motion on balance ({100 * share:.0f} % of its power), which no drive does"
+        if share < MIN_WORK_SHARE:
+            why = f"{message} the motion on balance ({100 * share:.0f} % of its power), which no drive does"
             yield Finding(name, f"{why}: change the sign of {remedy}", True)
 
 
-def _commanded(log: Trajectory) -> Iterator[Finding]:
+def _check_command(log: Trajectory) -> Iterator[Finding]:
     """A piston that does not do what its valve is told."""
-    motion = _motion(log)
+    motion = _motion_speed(log)
     if motion is None or "valve_voltage" not in log:
         return
     known = np.isfinite(motion) & np.isfinite(log["valve_voltage"])
     t, command, motion = log.t[known], log["valve_voltage"][known], motion[known]
-    if len(t) < 2 * BLOCKS:
+    if len(t) < 2 * MEAN_BLOCKS:
         return
     if not np.any(np.diff(command)):
-        travel = np.cumsum(motion[1:] * np.diff(t))[:: max(1, len(t) // (5 * BLOCKS))]  # coarse: noise is no travel
-        if float(np.abs(np.diff(travel)).sum()) > TO_AND_FRO * float(np.ptp(travel)) > 0:
-            told = "'valve_voltage' is constant while the piston goes to and fro: log the command that moves it"
-            yield Finding("valve_voltage", told, True)
+        travel = np.cumsum(motion[1:] * np.diff(t))[
+            :: max(1, len(t) // (5 * MEAN_BLOCKS))
+        ]  # coarse: noise is no travel
+        if float(np.abs(np.diff(travel)).sum()) > RECIPROCATING_TRAVEL_RATIO * float(np.ptp(travel)) > 0:
+            message = "'valve_voltage' is constant while the piston goes to and fro: log the command that moves it"
+            yield Finding("valve_voltage", message, True)
         return
-    lowest, highest = _correlations(t, command, motion)
-    if lowest < OPPOSED[0] and highest < OPPOSED[1]:
-        told = f"the piston runs against the valve's command (correlation {lowest:.2f}): change the sign of "
-        yield Finding("valve_voltage", told + "'valve_voltage', or of the motion", True)
+    lowest, highest = _command_correlations(t, command, motion)
+    if lowest < WRONG_SIGN_CORRELATIONS[0] and highest < WRONG_SIGN_CORRELATIONS[1]:
+        message = f"the piston runs against the valve's command (correlation {lowest:.2f}): change the sign of "
+        yield Finding("valve_voltage", message + "'valve_voltage', or of the motion", True)
 
 
-def _correlations(t: Array, command: Array, motion: Array) -> tuple[float, float]:
-    """The least and the largest correlation of a speed with the command up to `LATE` before; NaN where it is still."""
+def _command_correlations(t: Array, command: Array, motion: Array) -> tuple[float, float]:
+    """Least and largest correlation of a speed with the command up to `MAX_COMMAND_LAG` before; NaN at rest."""
     grid = np.linspace(t[0], t[-1], t.size)
     u, v = np.interp(grid, t, command), np.interp(grid, t, motion)
-    most = min(round(LATE / float(grid[1] - grid[0])), t.size // 4)
-    lags = range(0, most + 1, max(1, most // BLOCKS))
+    most = min(round(MAX_COMMAND_LAG / float(grid[1] - grid[0])), t.size // 4)
+    lags = range(0, most + 1, max(1, most // MEAN_BLOCKS))
     if np.ptp(v) == 0 or any(np.ptp(u[: u.size - k]) == 0 for k in lags):
         return math.nan, math.nan
     found = [float(np.corrcoef(u[: u.size - k], v[k:])[0, 1]) for k in lags]
@@ -189,14 +193,14 @@ def _work_share(t: Array, push: Array, motion: Array, *, centred: bool) -> float
         return math.nan
     t, push, motion = t[known], push[known], motion[known]
     path = float(np.trapezoid(np.abs(motion), t))
-    if path == 0 or abs(float(np.trapezoid(motion, t))) > RETURNS * path:
+    if path == 0 or abs(float(np.trapezoid(motion, t))) > MAX_NET_TRAVEL_SHARE * path:
         return math.nan
     power = (push - push.mean() if centred else push) * motion
     total = float(np.trapezoid(np.abs(power), t))
     return float(np.trapezoid(power, t)) / total if total > 0 else math.nan
 
 
-def _pressures(experiment: Experiment) -> Iterator[Finding]:
+def _check_pressures(experiment: Experiment) -> Iterator[Finding]:
     """Zero points: gauge taken for absolute, or the reverse."""
     log = experiment.trajectory
     supply = experiment.conditions.get("supply.pressure")
@@ -206,15 +210,15 @@ def _pressures(experiment: Experiment) -> Iterator[Finding]:
         if name not in log:
             continue
         low, high = (float(np.nanpercentile(log[name], q)) for q in (1, 99))
-        if low < VACUUM * ATMOSPHERE:
-            told = f"{name!r} falls to {low / 1e5:.2f} bar(a), a vacuum; a gauge sensor's unit is written bar(g)"
-            yield Finding(name, told, True)
+        if low < MIN_PRESSURE_RATIO * ATMOSPHERE:
+            message = f"{name!r} falls to {low / 1e5:.2f} bar(a), a vacuum; a gauge sensor's unit is written bar(g)"
+            yield Finding(name, message, True)
         elif supply is not None and high > 1.1 * supply and name != "supply_pressure":
-            told = f"{name!r} rises to {high / 1e5:.2f} bar(a), above the supply of {supply / 1e5:.2f} bar(a)"
-            yield Finding(name, f"{told}; is an absolute sensor read as bar(g)?", True)
+            message = f"{name!r} rises to {high / 1e5:.2f} bar(a), above the supply of {supply / 1e5:.2f} bar(a)"
+            yield Finding(name, f"{message}; is an absolute sensor read as bar(g)?", True)
 
 
-def _sampling(log: Trajectory) -> Iterator[Finding]:
+def _check_sampling(log: Trajectory) -> Iterator[Finding]:
     """What blurs a log."""
     steps = np.diff(log.t)
     usual = float(np.median(steps))
@@ -226,20 +230,22 @@ def _sampling(log: Trajectory) -> Iterator[Finding]:
         levels = np.unique(y).size
         for end, which in ((y.max(initial=-np.inf), "largest"), (y.min(initial=np.inf), "smallest")):
             share = float(np.mean(y == end)) if y.size else 0.0
-            if name.startswith("pressure") and levels > 50 and share > CLIPPED:
-                told = f"{share:.0%} of the samples of {name!r} have exactly its {which} value: is the sensor clipped?"
-                yield Finding(name, told, False)
+            if name.startswith("pressure") and levels > 50 and share > CLIPPED_SHARE:
+                message = (
+                    f"{share:.0%} of the samples of {name!r} have exactly its {which} value: is the sensor clipped?"
+                )
+                yield Finding(name, message, False)
         if name in ("position", "speed") and 2 < levels < min(50, y.size // 4):
-            told = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
-            yield Finding(name, told, False)
+            message = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
+            yield Finding(name, message, False)
 
 
-def _motion(log: Trajectory) -> Array | None:
+def _motion_speed(log: Trajectory) -> Array | None:
     """The speed, as logged or from the position."""
-    return log["speed"] if "speed" in log else _slope(log) if "position" in log else None
+    return log["speed"] if "speed" in log else _position_slope(log) if "position" in log else None
 
 
-def _slope(log: Trajectory) -> Array:
+def _position_slope(log: Trajectory) -> Array:
     """Speed from the position over a window of a hundredth of the log, at least five samples."""
     half = max(2, len(log) // 200)
     t, y = log.t, log["position"]

@@ -9,18 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.logs.csv import CHANNELS, read_columns
-from pneuopt.quantities.errors import LogError, check_known, require
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import read_si, read_value
 
-__all__ = ["CHANNELS", "COMMANDS", "Experiment", "differentiate", "read_log", "resample", "split"]
+__all__ = ["CHANNELS", "COMMAND_CHANNELS", "Experiment", "differentiate", "read_log", "resample", "split"]
 
-Array = NDArray[np.float64]
 
-COMMANDS = ("valve_voltage", "speed_reference", "position_reference")
+COMMAND_CHANNELS = ("valve_voltage", "speed_reference", "position_reference")
 """Channels that a controller holds from sample to sample; the others vary in between."""
 
 
@@ -61,7 +60,7 @@ class Experiment:
 
     def __post_init__(self) -> None:
         where = self.name or "experiment"
-        check_known("channel", self.noise, self.trajectory, f"{where}: noise")
+        check_names("channel", self.noise, self.trajectory, f"{where}: noise")
         for channel, sigma in self.noise.items():
             require(
                 0 < sigma < math.inf, f"{where}: noise of {channel!r} must be positive, got {sigma:g}; leave it out"
@@ -120,7 +119,7 @@ def read_log(
     values = read_columns(path, raw, entries, where)
     trajectory = Trajectory(values.pop("time"), values)
     conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in said.get("conditions", {}).items()}
-    noise = _noise(said.get("noise", {}), trajectory, f"{side}: noise")
+    noise = _read_noise(said.get("noise", {}), trajectory, f"{side}: noise")
     return Experiment(trajectory, noise, conditions, path.stem, hashlib.sha256(raw).hexdigest())
 
 
@@ -189,7 +188,7 @@ def resample(experiment: Experiment, step: float) -> Experiment:
     grid[-1] = min(grid[-1], old.t[-1])
     # A grid point that rounding puts just before its sample still belongs to that sample.
     held = np.searchsorted(old.t, grid + 1e-9 * step, side="right") - 1
-    values = {n: c[held] if n in COMMANDS else np.interp(grid, old.t, c) for n, c in old.values.items()}
+    values = {n: c[held] if n in COMMAND_CHANNELS else np.interp(grid, old.t, c) for n, c in old.values.items()}
     return replace(experiment, trajectory=Trajectory(grid, values))
 
 
@@ -273,13 +272,13 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
         raise LogError(f"{side}: not valid TOML: {error}") from None
     other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
     require(sidecar is not None or "drive" not in said, other, LogError)
-    check_known("key", said, ("columns", "noise", "conditions"), str(side))
+    check_names("key", said, ("columns", "noise", "conditions"), str(side))
     for key, section in said.items():
         require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
     return side, said
 
 
-def _noise(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, float]:
-    check_known("channel", entries, trajectory, where)
+def _read_noise(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, float]:
+    check_names("channel", entries, trajectory, where)
     # A noise is a difference, so a pressure's takes no (a) or (g).
     return {c: read_value(v, CHANNELS[c].partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}

@@ -12,9 +12,9 @@ from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.parameters import ParameterSet
 
 DriveSet = tuple[PneumaticDrive, ParameterSet]
-CATALOGUE = "sizes as in catalogues (ISO 6432, ISO 15552), friction from published ranges; no single product"
-PAPER = "reconstructed so that Ye, Wang, Chen (IJRES 3(7), 2015) eq. (1)-(15) give eq. (16)"
-BENCHMARK = "pneuopt benchmark {}, chosen"
+CATALOGUE_SOURCE = "sizes as in catalogues (ISO 6432, ISO 15552), friction from published ranges; no single product"
+PAPER_SOURCE = "reconstructed so that Ye, Wang, Chen (IJRES 3(7), 2015) eq. (1)-(15) give eq. (16)"
+BENCHMARK_SOURCE = "pneuopt benchmark {}, chosen"
 
 
 def s25() -> DriveSet:
@@ -23,7 +23,7 @@ def s25() -> DriveSet:
     Source: sizes as in catalogues; load [0.5-5 kg], dead volume [5-30 cm^3], F_c [8-25 N], F_s [12-40 N],
     v_s [5-50 mm/s], bristles [5e3-3e5 N/m, 50-600 N s/m], viscous [20-100 N s/m], lap rounding [0.01-0.1].
     """
-    return _catalogue((0.025, 0.010, 0.2), 2.0, 12e-6, 1.38e-8, (15.0, 25.0, 0.02, 3e4, 150.0, 50.0))
+    return _catalogue_drive((0.025, 0.010, 0.2), 2.0, 12e-6, 1.38e-8, (15.0, 25.0, 0.02, 3e4, 150.0, 50.0))
 
 
 def s32() -> DriveSet:
@@ -32,7 +32,7 @@ def s32() -> DriveSet:
     Source: sizes as in catalogues; load [1-15 kg], dead volume [10-60 cm^3], F_c [12-40 N], F_s [20-65 N], viscous
     [30-120 N s/m].
     """
-    return _catalogue((0.032, 0.012, 0.3), 5.0, 25e-6, 2.75e-8, (25.0, 40.0, 0.02, 5e4, 250.0, 70.0))
+    return _catalogue_drive((0.032, 0.012, 0.3), 5.0, 25e-6, 2.75e-8, (25.0, 40.0, 0.02, 5e4, 250.0, 70.0))
 
 
 def s40() -> DriveSet:
@@ -41,7 +41,7 @@ def s40() -> DriveSet:
     Source: sizes as in catalogues; load [2-30 kg], dead volume [20-120 cm^3], F_c [20-65 N], F_s [30-100 N], viscous
     [40-180 N s/m].
     """
-    return _catalogue((0.040, 0.016, 0.5), 15.0, 60e-6, 5.5e-8, (40.0, 65.0, 0.025, 8e4, 400.0, 110.0))
+    return _catalogue_drive((0.040, 0.016, 0.5), 15.0, 60e-6, 5.5e-8, (40.0, 65.0, 0.025, 8e4, 400.0, 110.0))
 
 
 def r25(lugre: bool = False) -> DriveSet:
@@ -61,8 +61,8 @@ def r25(lugre: bool = False) -> DriveSet:
     valve = ProportionalValve(IsentropicNozzle(), Spool.RIGID)
     drive = PneumaticDrive(valve, friction, cylinder=Cylinder(stops=False))
     bristles = (25.0, 40.0, 0.02, 5e4, 300.0, 200.0)
-    values = _cylinder((0.025, 0.0, 1.0), 1.3051087903e-4) | (
-        _lugre(bristles) if lugre else {"friction.viscous": 200.0}
+    values = _cylinder_values((0.025, 0.0, 1.0), 1.3051087903e-4) | (
+        _lugre_values(bristles) if lugre else {"friction.viscous": 200.0}
     )
     values |= {
         "valve.conductance": conductance_of_area(0.7 * 1.5472759716e-2 * 1e-3),
@@ -71,7 +71,7 @@ def r25(lugre: bool = False) -> DriveSet:
         "chamber.exponent": 1.4,
         "load.mass": 12.0,
     }
-    return drive, _sourced(drive, values, PAPER)
+    return drive, _with_source(drive, values, PAPER_SOURCE)
 
 
 def b32(lugre: bool = False) -> DriveSet:
@@ -86,10 +86,14 @@ def b32(lugre: bool = False) -> DriveSet:
         LuGre friction on the same Stribeck curve.
     """
     friction: FrictionModel = LuGre() if lugre else Stribeck()
-    drive = PneumaticDrive(ProportionalValve(spool=Spool.FIRST_ORDER, smoothing=_SHARP), friction, cylinder=_OPEN)
-    values = _benchmark(0.2, None, friction) | {"valve.rounding": 0.01, "valve.leak": 0.01, "valve.span": 1.0}
+    drive = PneumaticDrive(
+        ProportionalValve(spool=Spool.FIRST_ORDER, smoothing=_SHARP_SMOOTHING),
+        friction,
+        cylinder=_CYLINDER_WITHOUT_STOPS,
+    )
+    values = _benchmark_values(0.2, None, friction) | {"valve.rounding": 0.01, "valve.leak": 0.01, "valve.span": 1.0}
     values |= {"valve.bandwidth": 50.0, **({"friction.damping_velocity": 1e3} if lugre else {})}
-    return drive, _sourced(drive, values, BENCHMARK.format("B32"))
+    return drive, _with_source(drive, values, BENCHMARK_SOURCE.format("B32"))
 
 
 def t32() -> DriveSet:
@@ -98,33 +102,37 @@ def t32() -> DriveSet:
     Source: chosen. It starts at 50 mm with 3.5 bar(a) in chamber b: ``drive.rest(parameters, pressure_b=3.5e5)``.
     """
     friction = LuGre()
-    drive = PneumaticDrive(ProportionalValve(smoothing=_SHARP), friction, cylinder=_OPEN)
-    values = _benchmark(0.5, 20e-6, friction) | {"valve.rounding": 0.002, "valve.dead_zone": 0.03, "valve.leak": 0.0}
+    drive = PneumaticDrive(ProportionalValve(smoothing=_SHARP_SMOOTHING), friction, cylinder=_CYLINDER_WITHOUT_STOPS)
+    values = _benchmark_values(0.5, 20e-6, friction) | {
+        "valve.rounding": 0.002,
+        "valve.dead_zone": 0.03,
+        "valve.leak": 0.0,
+    }
     values |= {"valve.bandwidth": 80.0, "valve.damping": 0.8, "cylinder.start": 0.1, "friction.bristle_damping": 424.0}
-    return drive, _sourced(drive, values, BENCHMARK.format("T32"))
+    return drive, _with_source(drive, values, BENCHMARK_SOURCE.format("T32"))
 
 
-_SHARP = Smoothing(corner=1e-3, zero=0.005, pressure=1.0)
-_OPEN = Cylinder(stops=False)
+_SHARP_SMOOTHING = Smoothing(corner=1e-3, zero=0.005, pressure=1.0)
+_CYLINDER_WITHOUT_STOPS = Cylinder(stops=False)
 
 
-def _catalogue(
+def _catalogue_drive(
     size: tuple[float, float, float], mass: float, dead: float, conductance: float, friction: tuple[float, ...]
 ) -> DriveSet:
     drive = PneumaticDrive(friction=LuGre())
-    values = _cylinder(size, dead) | _lugre(friction)
+    values = _cylinder_values(size, dead) | _lugre_values(friction)
     values |= {"load.mass": mass, "valve.conductance": conductance, "valve.critical_ratio": 0.3, "valve.rounding": 0.04}
     values |= {"supply.pressure": 7.013e5, "valve.bandwidth": 100.0, "valve.damping": 0.7, "chamber.exponent": 1.4}
-    return drive, _sourced(drive, values, CATALOGUE)
+    return drive, _with_source(drive, values, CATALOGUE_SOURCE)
 
 
-def _benchmark(stroke: float, dead: float | None, friction: FrictionModel) -> dict[str, float]:
+def _benchmark_values(stroke: float, dead: float | None, friction: FrictionModel) -> dict[str, float]:
     bore, rod = 0.032, 0.012
     a, b = pi / 4 * bore**2, pi / 4 * (bore**2 - rod**2)
     curve = {"coulomb": 40.0, "static": 70.0, "stribeck_velocity": 0.02, "viscous": 80.0, "smoothing": 1e-3}
     curve |= {"bristle_stiffness": 1e5, "bristle_damping": 300.0, "damping_velocity": 0.05}
     return {
-        **_cylinder((bore, rod, stroke), dead or 0.05 * stroke * a),
+        **_cylinder_values((bore, rod, stroke), dead or 0.05 * stroke * a),
         "cylinder.dead_volume_b": dead or 0.05 * stroke * b,
         "valve.conductance": 2e-8,
         "valve.critical_ratio": 0.3,
@@ -137,19 +145,19 @@ def _benchmark(stroke: float, dead: float | None, friction: FrictionModel) -> di
     }
 
 
-def _cylinder(size: tuple[float, float, float], dead: float) -> dict[str, float]:
+def _cylinder_values(size: tuple[float, float, float], dead: float) -> dict[str, float]:
     keys = ("bore", "rod", "stroke", "dead_volume_a", "dead_volume_b")
     return {f"cylinder.{n}": value for n, value in zip(keys, (*size, dead, dead), strict=True)}
 
 
-def _lugre(numbers: tuple[float, ...]) -> dict[str, float]:
+def _lugre_values(numbers: tuple[float, ...]) -> dict[str, float]:
     keys = ("coulomb", "static", "stribeck_velocity", "bristle_stiffness", "bristle_damping", "viscous")
     return {f"friction.{n}": value for n, value in zip(keys, numbers, strict=True)} | {
         "friction.damping_velocity": 0.05
     }
 
 
-def _sourced(drive: PneumaticDrive, values: Mapping[str, float], source: str) -> ParameterSet:
+def _with_source(drive: PneumaticDrive, values: Mapping[str, float], source: str) -> ParameterSet:
     given = drive.parameters.with_values(values)
     found = given | ParameterSet({n: replace(given[n], source=source) for n in values})
     drive.check(found)

@@ -1,18 +1,16 @@
 """Drives wired from parts: `ForceDrive` (pushed by a known force), `MotionDrive` (moved, its friction measured)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import casadi as ca
 
-from pneuopt.dynamics.system import System, define
+from pneuopt.dynamics.system import Symbols, System, define
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.load import Load
 from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Symbols = Mapping[str, ca.SX]
-ATMOSPHERE = 101325.0  # [Pa] standard atmosphere, ISO 2533
+STANDARD_ATMOSPHERE = 101325.0  # [Pa] standard atmosphere, ISO 2533
 POSITION = Quantity("position", "m", nominal=0.1)
 SPEED = Quantity("speed", "m/s", nominal=0.5)
 FORCE = Quantity("force", "N", nominal=100.0)
@@ -36,21 +34,23 @@ class ForceDrive:
     @property
     def parameters(self) -> ParameterSet:
         """load.*, friction.*, and ambient.pressure where friction depends on pressure."""
-        own = self.load.parameters.prefixed("load") | self.friction.parameters.prefixed("friction")
-        return own | _ambient(self.friction)
+        own = self.load.parameters.with_prefix("load") | self.friction.parameters.with_prefix("friction")
+        return own | _ambient_parameters(self.friction)
 
     def system(self) -> System:
         """Wire the parts: states position, speed and the friction's; outputs position, speed."""
-        inner = tuple(renamed(q, f"friction.{q.name}") for q in self.friction.states)
+        inner = tuple(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             v, y = x["speed"], x["position"]
-            force = self.friction.force(v, part(x, "friction"), gauge(self.friction, u, p), part(p, "friction"))
-            acceleration = self.load.acceleration(u["force"] - force.value, y, part(p, "load"))
+            force = self.friction.force(
+                v, without_prefix(x, "friction"), gauge_pressures(self.friction, u, p), without_prefix(p, "friction")
+            )
+            acceleration = self.load.acceleration(u["force"] - force.value, y, without_prefix(p, "load"))
             rates = {f"friction.{n}": rate for n, rate in force.rates.items()}
             return {"position": v, "speed": acceleration, **rates}, {"position": y, "speed": v}
 
-        inputs = (FORCE, *_pressures(self.friction))
+        inputs = (FORCE, *_pressure_inputs(self.friction))
         return define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, force_starts)
 
 
@@ -78,53 +78,60 @@ class MotionDrive:
         bias = Parameter(0.0, "1", lower=-0.5, upper=0.5)
         rig = {"rig.area": area, "rig.area_bias": bias} if self.chamber else {}
         offset = ParameterSet({**rig, "rig.force_offset": Parameter(0.0, "N", lower=-1e4, upper=1e4)})
-        ambient = AMBIENT if self.chamber else _ambient(self.friction)
-        return offset | self.friction.parameters.prefixed("friction") | ambient
+        ambient = AMBIENT_PARAMETERS if self.chamber else _ambient_parameters(self.friction)
+        return offset | self.friction.parameters.with_prefix("friction") | ambient
 
     def system(self) -> System:
         """Wire the parts: no state but the friction's; output force."""
-        inner = tuple(renamed(q, f"friction.{q.name}") for q in self.friction.states)
+        inner = tuple(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             force = self.friction.force(
-                u["speed"], part(x, "friction"), gauge(self.friction, u, p), part(p, "friction")
+                u["speed"],
+                without_prefix(x, "friction"),
+                gauge_pressures(self.friction, u, p),
+                without_prefix(p, "friction"),
             )
             push = p["rig.force_offset"] + force.value
             if self.chamber:
                 push += p["rig.area"] * (1 + p["rig.area_bias"]) * (u["pressure_a"] - p["ambient.pressure"])
             return {f"friction.{n}": rate for n, rate in force.rates.items()}, {"force": push}
 
-        pressures = _pressures(self.friction)
+        pressures = _pressure_inputs(self.friction)
         if self.chamber and "pressure_a" not in (q.name for q in pressures):
             pressures = (_PRESSURE_A, *pressures)
         return define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, motion_starts)
 
 
-AMBIENT = ParameterSet(
-    {"ambient.pressure": Parameter(ATMOSPHERE, "Pa(a)", lower=1e4, upper=2e5, source="ISO 2533 standard atmosphere")}
+AMBIENT_PARAMETERS = ParameterSet(
+    {
+        "ambient.pressure": Parameter(
+            STANDARD_ATMOSPHERE, "Pa(a)", lower=1e4, upper=2e5, source="ISO 2533 standard atmosphere"
+        )
+    }
 )
 _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 
 
-def _ambient(friction: FrictionModel) -> ParameterSet:
-    return AMBIENT if friction.inputs else ParameterSet()
+def _ambient_parameters(friction: FrictionModel) -> ParameterSet:
+    return AMBIENT_PARAMETERS if friction.inputs else ParameterSet()
 
 
-def _pressures(friction: FrictionModel) -> tuple[Quantity, ...]:
+def _pressure_inputs(friction: FrictionModel) -> tuple[Quantity, ...]:
     """The absolute pressures that a pressure-dependent friction needs as inputs."""
     return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs)
 
 
-def gauge(friction: FrictionModel, u: Symbols, p: Symbols) -> Symbols:
+def gauge_pressures(friction: FrictionModel, u: Symbols, p: Symbols) -> Symbols:
     """The gauge pressures that a friction model asks for, from the absolute ones."""
     return {q.name: u[q.name] - p["ambient.pressure"] for q in friction.inputs}
 
 
-def part(values: Symbols, prefix: str) -> Symbols:
+def without_prefix(values: Symbols, prefix: str) -> Symbols:
     """The entries ``prefix.name`` by their own name."""
     return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
 
 
-def renamed(quantity: Quantity, name: str) -> Quantity:
+def rename_quantity(quantity: Quantity, name: str) -> Quantity:
     """The same signal under another name."""
     return Quantity(name, quantity.unit, quantity.nominal, quantity.lower, quantity.upper)

@@ -4,16 +4,15 @@ Signs: the force opposes positive speed when positive. Every map is smooth; `smo
 Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import casadi as ca
 
+from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Symbols = Mapping[str, ca.SX]
 STICKING_SPEED = 1e-6  # [m/s] rounds |v| in LuGre; larger values creep visibly (PHYSICS section 3)
 
 
@@ -65,7 +64,7 @@ class Viscous:
     @property
     def parameters(self) -> ParameterSet:
         """Its one number: viscous [N*s/m]."""
-        return ParameterSet({"viscous": _VISCOUS})
+        return ParameterSet({"viscous": _VISCOUS_PARAMETER})
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
@@ -82,11 +81,13 @@ class Coulomb:
     @property
     def parameters(self) -> ParameterSet:
         """Numbers: coulomb [N], viscous [N*s/m], smoothing [m/s]."""
-        return ParameterSet({"coulomb": _COULOMB, "viscous": _VISCOUS, "smoothing": _SMOOTHING})
+        return ParameterSet(
+            {"coulomb": _COULOMB_PARAMETER, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER}
+        )
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
-        return Force(p["coulomb"] * turned(v, p) + p["viscous"] * v, {})
+        return Force(p["coulomb"] * smooth_sign(v, p) + p["viscous"] * v, {})
 
 
 @dataclass(frozen=True)
@@ -99,12 +100,12 @@ class Stribeck:
     @property
     def parameters(self) -> ParameterSet:
         """Numbers: coulomb, static [N], stribeck_velocity [m/s], viscous [N*s/m], smoothing [m/s]."""
-        return ParameterSet({**_STRIBECK, "viscous": _VISCOUS, "smoothing": _SMOOTHING})
+        return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER})
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
         g = stribeck_curve(v, p["coulomb"], p["static"], p["stribeck_velocity"])
-        return Force(g * turned(v, p) + p["viscous"] * v, {})
+        return Force(g * smooth_sign(v, p) + p["viscous"] * v, {})
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ class LuGre:
             "bristle_damping": Parameter(300.0, "N*s/m", lower=1.0, upper=1e4, log=True),
             "damping_velocity": Parameter(0.05, "m/s", lower=1e-4, upper=1e3, log=True),
         }
-        return ParameterSet({**_STRIBECK, "viscous": _VISCOUS, **bristles})
+        return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, **bristles})
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
@@ -165,13 +166,13 @@ class Asymmetric:
     def parameters(self) -> ParameterSet:
         """Those of the base, coulomb_asymmetry (static shares it), viscous_asymmetry [1], asymmetry_width [m/s]."""
         ratio = Parameter(0.0, "1", lower=-0.95, upper=0.95)
-        added = {"viscous_asymmetry": ratio, "asymmetry_width": _SMOOTHING}
+        added = {"viscous_asymmetry": ratio, "asymmetry_width": _SMOOTHING_PARAMETER}
         coulomb = {"coulomb_asymmetry": ratio} if "coulomb" in self.base.parameters else {}
         return self.base.parameters | ParameterSet({**coulomb, **added})
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""
-        side = turned(v, p, "asymmetry_width")
+        side = smooth_sign(v, p, "asymmetry_width")
         levels = {"coulomb": "coulomb_asymmetry", "static": "coulomb_asymmetry", "viscous": "viscous_asymmetry"}
         scaled = {n: p[n] * (1 + p[a] * side) for n, a in levels.items() if n in p}
         return self.base.force(v, z, u, {**p, **scaled})
@@ -228,7 +229,7 @@ def friction_ladder() -> dict[str, FrictionModel]:
     }
 
 
-def turned(v: ca.SX, p: Symbols, width: str = "smoothing") -> ca.SX:
+def smooth_sign(v: ca.SX, p: Symbols, width: str = "smoothing") -> ca.SX:
     """The sign of the speed, smooth over the parameter `width`; a `direction` among p (`Karnopp`) is taken as it is."""
     return p["direction"] if "direction" in p else ca.tanh(v / p[width])
 
@@ -262,11 +263,11 @@ def stribeck_curve(v: ca.SX, coulomb: ca.SX, static: ca.SX, stribeck_velocity: c
     return coulomb + (static - coulomb) * ca.exp(-((v / stribeck_velocity) ** 2))
 
 
-_VISCOUS = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5)
-_COULOMB = Parameter(30.0, "N", lower=0.0, upper=1e5)
-_SMOOTHING = Parameter(1e-3, "m/s", lower=1e-6, upper=1.0, log=True)
-_STRIBECK = {
-    "coulomb": _COULOMB,
+_VISCOUS_PARAMETER = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5)
+_COULOMB_PARAMETER = Parameter(30.0, "N", lower=0.0, upper=1e5)
+_SMOOTHING_PARAMETER = Parameter(1e-3, "m/s", lower=1e-6, upper=1.0, log=True)
+_STRIBECK_PARAMETERS = {
+    "coulomb": _COULOMB_PARAMETER,
     "static": Parameter(45.0, "N", lower=0.0, upper=1e5),
     "stribeck_velocity": Parameter(0.02, "m/s", lower=1e-4, upper=1.0, log=True),
 }

@@ -4,17 +4,16 @@
 locates each break-away and standstill. A solver that does not switch it sees no dry friction at all.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
 
+from pneuopt.dynamics.system import Symbols
 from pneuopt.models.friction import Force, FrictionModel
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Symbols = Mapping[str, ca.SX]
-WIDTHS = ("smoothing", "asymmetry_width")
+SMOOTHING_WIDTHS = ("smoothing", "asymmetry_width")
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Karnopp:
     @property
     def parameters(self) -> ParameterSet:
         """Those of the base but the smoothing widths, and direction [1], which only a simulation sets."""
-        kept = {n: p for n, p in self.base.parameters.items() if n not in WIDTHS}
+        kept = {n: p for n, p in self.base.parameters.items() if n not in SMOOTHING_WIDTHS}
         return ParameterSet({**kept, "direction": Parameter(0.0, "1", -1.0, 1.0, source="switched by simulate")})
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:

@@ -14,13 +14,13 @@ import casadi as ca
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, names
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.starts.linear import LinearStarts, Polynomials, Shape
-from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape
+from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
 SPEED = Quantity("speed", "m/s", nominal=0.5)
-HIGHEST_PADE_ORDER = 5
+MAX_PADE_ORDER = 5
 Dynamics = Callable[[ca.SX, Symbols, Symbols], dict[str, ca.SX]]
 
 
@@ -54,8 +54,10 @@ class FirstOrder:
             return {y: (p["plant.gain"] * u - x[y]) / p["plant.time_constant"]}
 
         own = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True)}
-        shape = Shape(("plant.time_constant",), _lag)
-        return _plant(self, (self.output,), _gain(self.input, self.output, ""), ParameterSet(own), dynamics, shape)
+        shape = ResponseShape(("plant.time_constant",), _first_order_polynomials)
+        return _assemble_plant(
+            self, (self.output,), _gain_parameter(self.input, self.output, ""), ParameterSet(own), dynamics, shape
+        )
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class SecondOrder:
             rates = {y: x["drive"], "drive": w**2 * (gain * u - x[y]) - 2 * zeta * w * x["drive"]}
             if friction is None:
                 return rates
-            force = friction.force(x[y], _without_prefix(x), {}, _without_prefix(p))
+            force = friction.force(x[y], _friction_entries(x), {}, _friction_entries(p))
             rates[y] -= gain * w / (2 * zeta) * force.value
             return rates | {f"friction.{n}": rate for n, rate in force.rates.items()}
 
@@ -120,12 +122,14 @@ class SecondOrder:
             }
         )
         if friction is not None:
-            own = own | _as_input(friction.parameters, self.input).prefixed("friction")
+            own = own | _in_input_unit(friction.parameters, self.input).with_prefix("friction")
         inner = friction.states if friction is not None else ()
-        drive = Quantity("drive", _over(self.output, "s"), 10 * self.output.nominal)
+        drive = Quantity("drive", _quotient_unit(self.output, "s"), 10 * self.output.nominal)
         states = (self.output, drive, *(replace(s, name=f"friction.{s.name}") for s in inner))
-        shape = Shape(tuple(own)[:2], _oscillation, None if friction is None else _resistance)
-        return _plant(self, states, _gain(self.input, self.output, ""), own, dynamics, shape)
+        shape = ResponseShape(
+            tuple(own)[:2], _second_order_polynomials, None if friction is None else _friction_polynomials
+        )
+        return _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), own, dynamics, shape)
 
 
 @dataclass(frozen=True)
@@ -156,14 +160,16 @@ class Integrator:
         def dynamics(u: ca.SX, _: Symbols, p: Symbols) -> dict[str, ca.SX]:
             return {y: p["plant.gain"] * u}
 
-        shape = Shape((), _integral)
-        return _plant(self, (self.output,), _gain(self.input, self.output, "*s"), ParameterSet(), dynamics, shape)
+        shape = ResponseShape((), _integrator_polynomials)
+        return _assemble_plant(
+            self, (self.output,), _gain_parameter(self.input, self.output, "*s"), ParameterSet(), dynamics, shape
+        )
 
 
 Plant = FirstOrder | SecondOrder | Integrator
 
 
-def delayed(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) -> DiscreteSystem:
+def delay_inputs(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) -> DiscreteSystem:
     """Delay inputs by whole samples: a shift register that moves at each sample's update.
 
     Parameters
@@ -191,7 +197,7 @@ def delayed(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) 
         f"a delay needs at least 1 sample, got {samples}; without a delay use the system itself",
         ModelError,
     )
-    check_known("input", inputs, names(system.inputs))
+    check_names("input", inputs, names(system.inputs))
     chosen = [q for q in system.inputs if not inputs or q.name in inputs]
     registers = tuple(replace(q, name=f"{q.name}_delay_{k}") for q in chosen for k in range(samples + 1))
     n, m = len(system.states), samples + 1
@@ -214,8 +220,13 @@ def delayed(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) 
     return replace(system, states=system.states + registers, step=step, update=update)
 
 
-def _plant(
-    plant: Plant, states: tuple[Quantity, ...], gain: Parameter, own: ParameterSet, dynamics: Dynamics, shape: Shape
+def _assemble_plant(
+    plant: Plant,
+    states: tuple[Quantity, ...],
+    gain: Parameter,
+    own: ParameterSet,
+    dynamics: Dynamics,
+    shape: ResponseShape,
 ) -> System:
     """Put the gain and the dead time around a plant's own dynamics."""
     order, source = plant.pade_order, plant.input
@@ -225,7 +236,7 @@ def _plant(
         parameters = parameters | ParameterSet({"plant.dead_time": Parameter(0.01, "s", 1e-3, 10.0, log=True)})
 
     def rhs(_: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
-        late, rates = _pade(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
+        late, rates = _pade_delay(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
         moving = dynamics(late, x, p) | {q.name: r for q, r in zip(line, rates, strict=True)}
         return moving, {plant.output.name: x[plant.output.name]}
 
@@ -235,30 +246,30 @@ def _plant(
 
 
 # A plant's polynomials are functions of the module, not lambdas: a system goes to other processes (pickle).
-def _lag(time_constant: float) -> Polynomials:
+def _first_order_polynomials(time_constant: float) -> Polynomials:
     return [1.0], [time_constant, 1.0]
 
 
-def _oscillation(w: float, damping: float) -> Polynomials:
+def _second_order_polynomials(w: float, damping: float) -> Polynomials:
     return [w**2], [1.0, 2 * damping * w, w**2]
 
 
-def _resistance(w: float, damping: float) -> Polynomials:
+def _friction_polynomials(w: float, damping: float) -> Polynomials:
     """Response to friction, of unit gain: ``w² (s / (2 damping w) + 1)`` over the plant's denominator."""
     return [w / (2 * damping), w**2], [1.0, 2 * damping * w, w**2]
 
 
-def _integral() -> Polynomials:
+def _integrator_polynomials() -> Polynomials:
     return [1.0], [1.0, 0.0]
 
 
 def _delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:
-    valid = isinstance(order, int) and 0 <= order <= HIGHEST_PADE_ORDER
-    require(valid, f"pade_order must be 0 to {HIGHEST_PADE_ORDER}, got {order}", ModelError)
+    valid = isinstance(order, int) and 0 <= order <= MAX_PADE_ORDER
+    require(valid, f"pade_order must be 0 to {MAX_PADE_ORDER}, got {order}", ModelError)
     return tuple(Quantity(f"{source.name}_delay_{k}", source.unit, 2 * source.nominal) for k in range(1, order + 1))
 
 
-def _pade(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX]]:
+def _pade_delay(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX]]:
     """Padé approximant [n/n] of a delay: the ladder that Lambert's continued fraction of tanh(s/2) stands for.
 
     ``exp(-s) = (1 - tanh(s/2)) / (1 + tanh(s/2))``: a wave u meets inductors and capacitors of 1 / (2 (2k - 1)) in
@@ -275,27 +286,27 @@ def _pade(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX
     return u - voltage, rates
 
 
-def _gain(source: Quantity, output: Quantity, per: str) -> Parameter:
-    unit = _over(output, f"({_bare(source)}{per})" if per else _bare(source))
+def _gain_parameter(source: Quantity, output: Quantity, per: str) -> Parameter:
+    unit = _quotient_unit(output, f"({_difference_unit(source)}{per})" if per else _difference_unit(source))
     return Parameter(1.0, unit)
 
 
-def _over(output: Quantity, unit: str) -> str:
-    return f"{_bare(output)}/{unit if unit.isalnum() or unit.startswith('(') else f'({unit})'}"
+def _quotient_unit(output: Quantity, unit: str) -> str:
+    return f"{_difference_unit(output)}/{unit if unit.isalnum() or unit.startswith('(') else f'({unit})'}"
 
 
-def _bare(quantity: Quantity) -> str:
+def _difference_unit(quantity: Quantity) -> str:
     """Its unit as that of a difference: a pressure level loses its mark."""
     return quantity.unit.removesuffix("(a)").removesuffix("(g)")
 
 
-def _as_input(parameters: ParameterSet, source: Quantity) -> ParameterSet:
+def _in_input_unit(parameters: ParameterSet, source: Quantity) -> ParameterSet:
     """Friction's parameters in the unit of the input instead of newtons; the defaults shrink to a hundredth."""
-    shrunk = {n: _scaled(q, _bare(source)) for n, q in parameters.items()}
+    shrunk = {n: _convert_force_unit(q, _difference_unit(source)) for n, q in parameters.items()}
     return ParameterSet({n: replace(q, value=0.0) if n == "viscous" else q for n, q in shrunk.items()})
 
 
-def _scaled(parameter: Parameter, unit: str) -> Parameter:
+def _convert_force_unit(parameter: Parameter, unit: str) -> Parameter:
     is_force = re.search(r"\bN\b", parameter.unit) is not None
     if not is_force:
         return parameter
@@ -303,5 +314,5 @@ def _scaled(parameter: Parameter, unit: str) -> Parameter:
     return replace(parameter, value=value, lower=low, upper=high, unit=re.sub(r"\bN\b", unit, parameter.unit))
 
 
-def _without_prefix(values: Symbols) -> Symbols:
+def _friction_entries(values: Symbols) -> Symbols:
     return {n.removeprefix("friction."): s for n, s in values.items() if n.startswith("friction.")}

@@ -1,14 +1,13 @@
 """The load that a drive moves: mass, a constant force, its weight on an incline, a spring."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 
 import casadi as ca
 
+from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
-Symbols = Mapping[str, ca.SX]
 GRAVITY = 9.80665  # [m/s^2] standard
 
 

@@ -19,20 +19,19 @@ from dataclasses import dataclass
 from math import pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import System
 from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import SecondOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.valve import Spool
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Array = NDArray[np.float64]
-Polynomials = tuple[Array, Array]
+PolynomialPair = tuple[Array, Array]
 KAPPA, R = 1.4, 287.05
-PRINTED = (1270.12, 17.5, 86.34)
+PRINTED_COEFFICIENTS = (1270.12, 17.5, 86.34)
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,7 @@ def constant_term(point: OperatingPoint) -> float:
     return natural_frequency(point) ** 2 + leak_rate(point) * point.k_v / point.M_L
 
 
-def second_order(point: OperatingPoint, dropped_constant: bool = False) -> Polynomials:
+def second_order(point: OperatingPoint, dropped_constant: bool = False) -> PolynomialPair:
     """Speed over spool travel, equation (15) times s, where ``K_cb = m K_ca``.
 
     Parameters
@@ -217,7 +216,7 @@ def second_order(point: OperatingPoint, dropped_constant: bool = False) -> Polyn
     return np.array([spool_gain(point) * w0**2]), np.array([1.0, 2 * damping(point) * w0, constant])
 
 
-def third_order(point: OperatingPoint) -> Polynomials:
+def third_order(point: OperatingPoint) -> PolynomialPair:
     """Speed over spool travel from equations (3), (4), (9) to (11) alone: what (12) and (13) give with P_b kept.
 
     With ``c = kappa R T_s / V_0a``, ``a = c K_ca``, ``b = c K_cb / m``, ``g = kappa p_ai A_a / V_0a``, ``r = n / m``::
@@ -294,7 +293,7 @@ def paper_plant(loop_gain: float = 1.0) -> tuple[System, ParameterSet]:
     >>> round(parameters.value("plant.gain"), 4), round(parameters.value("plant.damping"), 4)
     (14.7107, 0.9417)
     """
-    gain, rate, constant = PRINTED
+    gain, rate, constant = PRINTED_COEFFICIENTS
     system = SecondOrder(output=Quantity("speed", "V")).system()
     values = {
         "plant.gain": loop_gain * gain / constant,

@@ -12,19 +12,18 @@ from functools import partial
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.dynamics.hooks import Log, Rest, RestFinder, Start
-from pneuopt.dynamics.system import Symbols, System, define, names, stacked, vector
-from pneuopt.quantities.errors import check_known, require
+from pneuopt.dynamics.hooks import Log, Rest, RestHook, Start
+from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 Channels = tuple[str, ...]
-SHORTEST = 2e-4  # [s] of delay and lag: shorter ones are stiffer than they are visible at a kHz
-LONGEST = 0.05  # [s] of a delay that a short series still follows
-TYPICAL = 1e-3  # [s]
+MIN_SENSOR_DELAY = 2e-4  # [s] of delay and lag: shorter ones are stiffer than they are visible at a kHz
+MAX_SENSOR_DELAY = 0.05  # [s] of a delay that a short series still follows
+DEFAULT_SENSOR_DELAY = 1e-3  # [s]
 
 
 def with_sensors(
@@ -68,14 +67,16 @@ def with_sensors(
     """
     sensors = _Sensors(system, tuple(offset), tuple(delay), tuple(lag))
     for kind, channels in (("offset", offset), ("delay", delay), ("lag", lag)):
-        check_known("output", channels, names(system.outputs), f"with_sensors: {kind}")
+        check_names("output", channels, names(system.outputs), f"with_sensors: {kind}")
     own = (system.states + sensors.states, system.inputs, system.outputs, system.parameters | sensors.parameters)
-    sensed = define(*own, sensors.rates, start_finder=sensors.starts)
-    finder = partial(sensors.rest, system.rest_finder) if system.rest_finder else None
-    return replace(sensed, rest_finder=finder, checker=system.checker, guards=system.guards)
+    sensed = define(*own, sensors.rates, start_hook=sensors.starts)
+    finder = partial(sensors.rest, system.rest_hook) if system.rest_hook else None
+    return replace(
+        sensed, rest_hook=finder, hardware_check_hook=system.hardware_check_hook, validity_limits=system.validity_limits
+    )
 
 
-def coarse_delay(log: Trajectory, late: str, other: str, longest: float = LONGEST) -> float:
+def coarse_delay(log: Trajectory, late: str, other: str, longest: float = MAX_SENSOR_DELAY) -> float:
     """How much later one of two related channels comes, by cross-correlation: a start value for its delay.
 
     Parameters
@@ -101,7 +102,7 @@ def coarse_delay(log: Trajectory, late: str, other: str, longest: float = LONGES
     """
     step = float(np.median(np.diff(log.t)))
     grid = np.arange(log.t[0], log.t[-1], step)
-    a, b = (_moving(log, n, grid, wanted) for n, wanted in ((late, other), (other, late)))
+    a, b = (_resample_channel(log, n, grid, wanted) for n, wanted in ((late, other), (other, late)))
     most = min(round(longest / step), len(grid) // 4)
     inner = slice(most, len(grid) - most)
     shifts = np.arange(-most, most + 1)
@@ -133,7 +134,7 @@ class _Sensors:
     @property
     def parameters(self) -> ParameterSet:
         units = {q.name: q.unit.partition("(")[0] for q in self.plant.outputs}
-        time = Parameter(TYPICAL, "s", lower=SHORTEST, upper=LONGEST)
+        time = Parameter(DEFAULT_SENSOR_DELAY, "s", lower=MIN_SENSOR_DELAY, upper=MAX_SENSOR_DELAY)
         own = {f"sensor.{n}.offset": Parameter(0.0, units[n]) for n in self.offset}
         own |= {f"sensor.{n}.delay": time for n in self.delay} | {f"sensor.{n}.lag": time for n in self.lag}
         return ParameterSet(own)
@@ -142,7 +143,7 @@ class _Sensors:
         """The plant's, then its sensors'."""
         plant = self.plant
         xs, ps = ca.vertcat(*(x[n] for n in names(plant.states))), ca.vertcat(*(p[n] for n in plant.parameters))
-        xdot, y = plant.ode(t, xs, stacked(u), ps)
+        xdot, y = plant.ode(t, xs, stack(u), ps)
         rates = {n: xdot[k] for k, n in enumerate(names(plant.states))}
         shown = {n: y[k] for k, n in enumerate(names(plant.outputs))}
         for n in self.delay:
@@ -155,31 +156,35 @@ class _Sensors:
             shown[n] = x[f"sensor.{n}.slow"]
         return rates, shown | {n: shown[n] + p[f"sensor.{n}.offset"] for n in self.offset}
 
-    def rest(self, finder: RestFinder, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
+    def rest(self, finder: RestHook, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
         """The plant's rest, or steady motion; what the sensors show there."""
-        off = {n: self._number(parameters, n, "offset") for n in self.offset}
+        off = {n: self._parameter_value(parameters, n, "offset") for n in self.offset}
         rest = finder(parameters, {n: value - off.get(n, 0.0) for n, value in outputs.items()})
         x, u = (
             [part.get(n, 0.0) for n in names(q)]
             for part, q in ((rest.states, self.plant.states), (rest.inputs, self.plant.inputs))
         )
-        xdot, y = (np.array(a).ravel() for a in self.plant.ode(0, x, u, vector(self.plant.parameters, parameters)))
+        xdot, y = (
+            np.array(a).ravel() for a in self.plant.ode(0, x, u, parameter_vector(self.plant.parameters, parameters))
+        )
         at = {n: np.array([value]) for n, value in zip(names(self.plant.outputs), y.tolist(), strict=True)}
         moving = dict(zip(names(self.plant.states), xdot.tolist(), strict=True))
-        settled = self._settled(at, {n: np.array([moving.get(n, 0.0)]) for n in at}, parameters)
+        settled = self._steady_sensor_states(at, {n: np.array([moving.get(n, 0.0)]) for n in at}, parameters)
         return Rest({**rest.states, **{n: float(column[0]) for n, column in settled.items()}}, rest.inputs)
 
     def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """The plant's own candidates from logs put right with the given delays and offsets; the sensors settled."""
-        guessed = {name: self._guessed(log) for name, log in logs.items()}
-        plant = {name: self._put_right(log, guessed[name]) for name, log in logs.items()}
+        guessed = {name: self._guess_delays(log) for name, log in logs.items()}
+        plant = {name: self._correct_log(log, guessed[name]) for name, log in logs.items()}
         out = []
         for start in self.plant.starts(plant):
-            states = {name: self._completed(start, name, log, guessed[name]) for name, log in logs.items()}
-            out.append(replace(start, states=states, parameters={**start.parameters, **self._named(logs, guessed)}))
+            states = {name: self._complete_states(start, name, log, guessed[name]) for name, log in logs.items()}
+            out.append(
+                replace(start, states=states, parameters={**start.parameters, **self._start_parameters(logs, guessed)})
+            )
         return out
 
-    def _guessed(self, log: Log) -> dict[str, float]:
+    def _guess_delays(self, log: Log) -> dict[str, float]:
         """Free delays of a log that cross-correlation tells: position against speed, where both are logged."""
         found = {}
         for late, other in (("position", "speed"), ("speed", "position")):
@@ -190,7 +195,9 @@ class _Sensors:
                 found[name] = float(np.clip(coarse_delay(log.measured, late, other), p.lower, p.upper))
         return found
 
-    def _named(self, logs: Mapping[str, Log], guessed: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    def _start_parameters(
+        self, logs: Mapping[str, Log], guessed: Mapping[str, Mapping[str, float]]
+    ) -> dict[str, float]:
         """The guesses as a start's parameters; a shared delay takes the median."""
         out: dict[str, float] = {}
         for name in dict.fromkeys(n for own in guessed.values() for n in own):
@@ -203,20 +210,21 @@ class _Sensors:
             )
         return out
 
-    def _put_right(self, log: Log, guessed: Mapping[str, float]) -> Log:
+    def _correct_log(self, log: Log, guessed: Mapping[str, float]) -> Log:
         """The log as the plant's own start finder would like it."""
         columns, t = {}, log.measured.t
         for n in (n for n in names(self.plant.outputs) if n in log.measured):
             late = sum(
-                guessed.get(f"sensor.{n}.{kind}", self._number(log.parameters, n, kind)) for kind in ("delay", "lag")
+                guessed.get(f"sensor.{n}.{kind}", self._parameter_value(log.parameters, n, kind))
+                for kind in ("delay", "lag")
             )
             column = log.measured[n]
             known = np.isfinite(column)
             shifted = np.interp(t + late, t[known], column[known])
-            columns[n] = np.where(known, shifted, np.nan) - self._number(log.parameters, n, "offset")
+            columns[n] = np.where(known, shifted, np.nan) - self._parameter_value(log.parameters, n, "offset")
         return Log(log.measured.with_columns(columns), log.parameters.select(self.plant.parameters))
 
-    def _completed(self, start: Start, name: str, log: Log, guessed: Mapping[str, float]) -> Trajectory:
+    def _complete_states(self, start: Start, name: str, log: Log, guessed: Mapping[str, float]) -> Trajectory:
         run, p = start.states[name], log.parameters
         own = {n.removesuffix(f"[{name}]"): v for n, v in start.parameters.items()} | dict(guessed)
         own = {n: v for n, v in own.items() if n in p}
@@ -224,22 +232,28 @@ class _Sensors:
         plant = self.plant
         u, x = log.measured.matrix(names(plant.inputs)), run.matrix(names(plant.states))
         ode = plant.ode.map(len(run))
-        y = np.array(ode(run.t[None], x.T, u.T, vector(plant.parameters, p))[1])
+        y = np.array(ode(run.t[None], x.T, u.T, parameter_vector(plant.parameters, p))[1])
         true = dict(zip(names(plant.outputs), y, strict=True))
-        return run.with_columns(self._settled(true, {n: np.gradient(column, run.t) for n, column in true.items()}, p))
+        return run.with_columns(
+            self._steady_sensor_states(true, {n: np.gradient(column, run.t) for n, column in true.items()}, p)
+        )
 
-    def _settled(self, true: Mapping[str, Array], rate: Mapping[str, Array], p: ParameterSet) -> dict[str, Array]:
+    def _steady_sensor_states(
+        self, true: Mapping[str, Array], rate: Mapping[str, Array], p: ParameterSet
+    ) -> dict[str, Array]:
         """The sensors' states behind outputs that change slowly."""
         out: dict[str, Array] = {}
         for n in self.delay:
-            T = self._number(p, n, "delay")
+            T = self._parameter_value(p, n, "delay")
             out |= {f"sensor.{n}.level": true[n] - T / 2 * rate[n], f"sensor.{n}.late": T * rate[n]}
         for n in self.lag:
-            late = self._number(p, n, "lag") + (self._number(p, n, "delay") if n in self.delay else 0.0)
+            late = self._parameter_value(p, n, "lag") + (
+                self._parameter_value(p, n, "delay") if n in self.delay else 0.0
+            )
             out[f"sensor.{n}.slow"] = true[n] - late * rate[n]
         return out
 
-    def _number(self, parameters: ParameterSet, channel: str, kind: str) -> float:
+    def _parameter_value(self, parameters: ParameterSet, channel: str, kind: str) -> float:
         name = f"sensor.{channel}.{kind}"
         return (
             parameters.value(name)
@@ -250,7 +264,7 @@ class _Sensors:
         )
 
 
-def _moving(log: Trajectory, name: str, grid: Array, other: str) -> Array:
+def _resample_channel(log: Trajectory, name: str, grid: Array, other: str) -> Array:
     """A channel on an even grid; a position differentiated where the other channel is none."""
     known = np.isfinite(log[name])
     require(bool(known.any()), f"channel {name!r} holds no sample")

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SUFFIXES = ("png", "pdf", "svg")
+FIGURE_SUFFIXES = ("png", "pdf", "svg")
 GREY, BLUE, ORANGE, RED = "0.55", "#1f6fb2", "#e07b00", "#c0392b"
-SCALED = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}  # SI units are too coarse or too fine for these
-MOST_COLUMNS = 3  # that can still be read at 1000 pixels
+PLOT_UNITS = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}  # SI units are too coarse or too fine for these
+MAX_PLOT_COLUMNS = 3  # that can still be read at 1000 pixels
 
 
 def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
@@ -43,7 +43,10 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
 def check_figure_path(path: str | Path) -> None:
     """Raise `InputError` unless the file's suffix is one that a figure can be written as."""
     suffix = Path(path).suffix.lower().removeprefix(".")
-    require(suffix in SUFFIXES, f"{path}: a figure is written as {', '.join('.' + s for s in SUFFIXES)}; name it so")
+    require(
+        suffix in FIGURE_SUFFIXES,
+        f"{path}: a figure is written as {', '.join('.' + s for s in FIGURE_SUFFIXES)}; name it so",
+    )
 
 
 def axes_grid(
@@ -74,7 +77,7 @@ def legend_above(figure: "Figure", *sources: "Axes", columns: int = 4) -> None:
             handle.set(alpha=1.0, markersize=5)
 
 
-def shown_of(figure: "Figure", shown: int, available: int, what: str) -> None:
+def note_omissions(figure: "Figure", shown: int, available: int, what: str) -> None:
     """Say so where a figure leaves some out."""
     if shown < available:
         figure.text(0.995, 0.005, f"{shown} of {available} {what}", ha="right", fontsize=8, color=GREY)

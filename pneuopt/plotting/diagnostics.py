@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.identification.statistics import correlation, ljung_box
 from pneuopt.logs.experiments import CHANNELS, Experiment
-from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, SCALED, axes_grid, shown_of
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, PLOT_UNITS, RED, axes_grid, note_omissions
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -18,15 +18,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
-LAGS = 40  # samples
-MOST_CHANNELS = 4
-MOST_POINTS = 4000
-MOST_NUMBERED = 12  # parameters whose correlations have room for a figure
-BAND = 1.96  # standard deviations, 95 %
+MAX_CORRELATION_LAG = 40  # samples
+MAX_PLOT_CHANNELS = 4
+MAX_PLOT_POINTS = 4000
+MAX_NUMBERED_PARAMETERS = 12  # parameters whose correlations have room for a figure
+NORMAL_QUANTILE_95 = 1.96  # standard deviations, 95 %
 
 
-class Spread(Protocol):
+class CovarianceResult(Protocol):
     """What `plot_correlation` needs of an identification's result."""
 
     @property
@@ -53,24 +52,24 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
     pairs = list(zip(runs, experiments, strict=True))
     channels = [n for n in CHANNELS if any(n in e.trajectory and n in r for r, e in pairs)]
     require(bool(channels), "the runs and the logs have no channel in common")
-    shown = channels[:MOST_CHANNELS]
+    shown = channels[:MAX_PLOT_CHANNELS]
     figure, grid = axes_grid(len(shown), 4, [2.4] * len(shown), width=13.0)
     for (over_time, own, crossed, spread), channel in zip(grid, shown, strict=True):
-        _over_time(over_time, pairs, channel)
-        _autocorrelation(own, pairs, channel)
-        _crosscorrelation(crossed, pairs, channel)
-        _distribution(spread, pairs, channel)
+        _draw_over_time(over_time, pairs, channel)
+        _draw_autocorrelation(own, pairs, channel)
+        _draw_crosscorrelation(crossed, pairs, channel)
+        _draw_distribution(spread, pairs, channel)
     for axes, title in zip(
         grid[0], ("residuals", "autocorrelation", "correlation with inputs", "distribution"), strict=True
     ):
         axes.set_title(title, fontsize=10)
     for axes, label in zip(grid[-1], ("time [s]", "lag [samples]", "lag [samples]", ""), strict=True):
         axes.set_xlabel(label)
-    shown_of(figure, len(shown), len(channels), "channels")
+    note_omissions(figure, len(shown), len(channels), "channels")
     return figure
 
 
-def plot_correlation(result: Spread) -> "Figure":
+def plot_correlation(result: CovarianceResult) -> "Figure":
     """How the estimates hang together: a cell a pair, 1 or -1 where only a combination of both is known.
 
     Parameters
@@ -98,21 +97,21 @@ def plot_correlation(result: Spread) -> "Figure":
     axes.grid(False)
     axes.set_xticks(range(count), names, rotation=40, ha="right", fontsize=8)
     axes.set_yticks(range(count), names, fontsize=8)
-    if count <= MOST_NUMBERED:
+    if count <= MAX_NUMBERED_PARAMETERS:
         for (row, column), value in np.ndenumerate(values):
             colour = "white" if abs(value) > 0.6 else "black"
-            axes.text(column, row, _short(value), ha="center", va="center", fontsize=8, color=colour)
+            axes.text(column, row, _format_correlation(value), ha="center", va="center", fontsize=8, color=colour)
     axes.set_title("correlation of the estimates", fontsize=10)
-    shown_of(figure, count, len(covariance), "estimates have a standard deviation")
+    note_omissions(figure, count, len(covariance), "estimates have a standard deviation")
     return figure
 
 
-def _short(value: float) -> str:
+def _format_correlation(value: float) -> str:
     """Two digits, but never a 1.00 that is none."""
     return f"{value:.2f}" if abs(value) < 0.995 or abs(value) > 1 - 1e-9 else f"{math.trunc(1e4 * value) / 1e4:.4f}"
 
 
-def _residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> list[tuple[Trajectory, Array]]:
+def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> list[tuple[Trajectory, Array]]:
     return [
         (e.trajectory, e.trajectory[channel] - run[channel])
         for run, e in pairs
@@ -120,10 +119,10 @@ def _residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> 
     ]
 
 
-def _over_time(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    factor, unit = SCALED.get(CHANNELS[channel], (1.0, CHANNELS[channel]))
-    found = _residuals(pairs, channel)
-    every = max(1, sum(len(log) for log, _ in found) // MOST_POINTS)
+def _draw_over_time(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    factor, unit = PLOT_UNITS.get(CHANNELS[channel], (1.0, CHANNELS[channel]))
+    found = _channel_residuals(pairs, channel)
+    every = max(1, sum(len(log) for log, _ in found) // MAX_PLOT_POINTS)
     for number, (log, e) in enumerate(found):
         colour = (BLUE, ORANGE)[number % 2] if len(found) <= 4 else BLUE
         axes.plot(log.t[::every], factor * e[::every], ".", color=colour, ms=1.5)
@@ -131,38 +130,38 @@ def _over_time(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], cha
     axes.set_ylabel(f"{channel} [{unit}]")
 
 
-def _autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    found = [e for _, e in _residuals(pairs, channel)]
-    rho = _mean([_correlogram(e, e) for e in found])
+def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    found = [e for _, e in _channel_residuals(pairs, channel)]
+    rho = _mean_correlogram([_correlogram(e, e) for e in found])
     axes.vlines(range(1, len(rho)), 0, rho[1:], color=BLUE, lw=1.4)
-    _band(axes, found)
+    _draw_band(axes, found)
     p = [ljung_box(e)[1] for e in found]
     known = [q for q in p if math.isfinite(q)]
-    told = (
-        f"Ljung-Box p {_probability(min(known))}" + (f" (least of {len(known)})" if len(known) > 1 else "")
+    message = (
+        f"Ljung-Box p {_format_probability(min(known))}" + (f" (least of {len(known)})" if len(known) > 1 else "")
         if known
         else ""
     )
-    axes.text(0.98, 0.03, told, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
-    _scale(axes, rho[1:])
+    axes.text(0.98, 0.03, message, transform=axes.transAxes, ha="right", va="bottom", fontsize=8)
+    _set_symmetric_limits(axes, rho[1:])
 
 
-def _crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    found = _residuals(pairs, channel)
+def _draw_crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+    found = _channel_residuals(pairs, channel)
     outputs = {n for run, _ in pairs for n in run}
     inputs = [n for n in CHANNELS if n not in outputs and any(n in log for log, _ in found)]
     every = []
     for name, colour in zip(inputs, (BLUE, ORANGE, RED), strict=False):
-        rho = _mean([_correlogram(e, log[name]) for log, e in found if name in log])
+        rho = _mean_correlogram([_correlogram(e, log[name]) for log, e in found if name in log])
         axes.plot(range(len(rho)), rho, color=colour, lw=1.2, label=name)
         every.append(rho)
-    _band(axes, [e for _, e in found])
+    _draw_band(axes, [e for _, e in found])
     if inputs:
         axes.legend(fontsize=8, frameon=False, loc="upper right")
-        _scale(axes, np.concatenate(every))
+        _set_symmetric_limits(axes, np.concatenate(every))
 
 
-def _distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
+def _draw_distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
     """Residuals over their noise, beside the normal distribution that they should have."""
     scaled = np.concatenate(
         [
@@ -173,7 +172,7 @@ def _distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], 
     )
     label = "residual / noise"
     if not np.isfinite(scaled).any():  # no noise is declared: the residuals' own deviation
-        scaled = np.concatenate([e for _, e in _residuals(pairs, channel)])
+        scaled = np.concatenate([e for _, e in _channel_residuals(pairs, channel)])
         scaled, label = scaled / np.nanstd(scaled), "residual / its deviation"
     scaled = scaled[np.isfinite(scaled)]
     edge = max(4.0, float(np.quantile(np.abs(scaled), 0.999)))
@@ -185,30 +184,30 @@ def _distribution(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], 
 
 
 def _correlogram(e: Array, other: Array) -> Array:
-    """Correlation of residuals with what another column was 0 to `LAGS` samples before; NaN where nothing varies."""
+    """Correlation of residuals with another column 0 to `MAX_CORRELATION_LAG` samples before; NaN if constant."""
     known = np.isfinite(e) & np.isfinite(other)
     a, b = (np.where(known, v - np.mean(v[known]), 0.0) if known.any() else np.zeros(len(v)) for v in (e, other))
     size = math.sqrt(float(a @ a) * float(b @ b))
-    lags = min(LAGS, len(e) - 2) + 1
+    lags = min(MAX_CORRELATION_LAG, len(e) - 2) + 1
     return np.array([a[k:] @ b[: len(b) - k] for k in range(lags)]) / size if size > 0 else np.full(lags, np.nan)
 
 
-def _mean(rows: Sequence[Array]) -> Array:
+def _mean_correlogram(rows: Sequence[Array]) -> Array:
     n = min(len(row) for row in rows)
     finite = [row[:n] for row in rows if np.isfinite(row[:n]).all()]
     return np.mean(finite, axis=0) if finite else np.zeros(n)
 
 
-def _band(axes: "Axes", residuals: Sequence[Array]) -> None:
-    width = BAND / math.sqrt(sum(int(np.isfinite(e).sum()) for e in residuals))
+def _draw_band(axes: "Axes", residuals: Sequence[Array]) -> None:
+    width = NORMAL_QUANTILE_95 / math.sqrt(sum(int(np.isfinite(e).sum()) for e in residuals))
     axes.axhspan(-width, width, color=GREY, alpha=0.25, lw=0)
     axes.axhline(0, color=GREY, lw=0.8)
 
 
-def _scale(axes: "Axes", rho: Array) -> None:
+def _set_symmetric_limits(axes: "Axes", rho: Array) -> None:
     edge = min(1.05, max(0.2, 1.3 * float(np.max(np.abs(rho), initial=0.0))))
     axes.set_ylim(-edge, edge)
 
 
-def _probability(p: float) -> str:
+def _format_probability(p: float) -> str:
     return f"{p:.2g}" if p >= 1e-4 else "< 1e-4"

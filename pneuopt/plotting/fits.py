@@ -4,10 +4,18 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.logs.experiments import CHANNELS, Experiment
-from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, SCALED, axes_grid, legend_above, shown_of
+from pneuopt.plotting.canvas import (
+    BLUE,
+    GREY,
+    MAX_PLOT_COLUMNS,
+    ORANGE,
+    PLOT_UNITS,
+    axes_grid,
+    legend_above,
+    note_omissions,
+)
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -17,12 +25,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 Pairs = Sequence[tuple[Trajectory, Trajectory]]
-MOST_POINTS = 4000  # of a measured line or cloud
+MAX_PLOT_POINTS = 4000  # of a measured line or cloud
 
 
-class Fitted(Protocol):
+class PlottableFit(Protocol):
     """What a figure needs of an identification's result."""
 
     @property
@@ -46,7 +53,7 @@ class Fitted(Protocol):
         ...
 
 
-def plot_fit(result: Fitted, experiments: Sequence[Experiment]) -> "Figure":
+def plot_fit(result: PlottableFit, experiments: Sequence[Experiment]) -> "Figure":
     """Measured beside fitted, and the residuals, a column a log.
 
     Parameters
@@ -79,8 +86,8 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
     Figure
     """
     require(len(runs) == len(experiments) > 0, f"{len(runs)} runs do not match {len(experiments)} experiments")
-    logs = _by_log(runs, experiments)
-    shown = [list(logs)[k] for k in sorted({round(k) for k in np.linspace(0, len(logs) - 1, MOST_COLUMNS)})]
+    logs = _group_by_log(runs, experiments)
+    shown = [list(logs)[k] for k in sorted({round(k) for k in np.linspace(0, len(logs) - 1, MAX_PLOT_COLUMNS)})]
     channels = [
         n for n in CHANNELS if any(n in e.trajectory and n in r for r, e in zip(runs, experiments, strict=True))
     ]
@@ -88,18 +95,18 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
     figure, grid = axes_grid(2 * len(channels), len(shown), [2.2, 1.0] * len(channels), sharex="col")
     for column, name in enumerate(shown):
         for row, channel in enumerate(channels):
-            _compare(grid[2 * row][column], grid[2 * row + 1][column], logs[name], channel, label)
+            _draw_comparison(grid[2 * row][column], grid[2 * row + 1][column], logs[name], channel, label)
         grid[0][column].set_title(name, fontsize=9)
         grid[-1][column].set_xlabel("time [s]")
     for lines in grid:
         for axes in lines[1:]:
             axes.set_ylabel("")
     legend_above(figure, grid[0][0])
-    shown_of(figure, len(shown), len(logs), "logs")
+    note_omissions(figure, len(shown), len(logs), "logs")
     return figure
 
 
-def _by_log(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Mapping[str, Pairs]:
+def _group_by_log(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Mapping[str, Pairs]:
     """Pairs of measured and computed, by log; windows "name@0", "name@1" belong to "name"."""
     logs: dict[str, list[tuple[Trajectory, Trajectory]]] = {}
     for number, (run, experiment) in enumerate(zip(runs, experiments, strict=True), 1):
@@ -108,13 +115,13 @@ def _by_log(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Ma
     return logs
 
 
-def _compare(top: "Axes", bottom: "Axes", pairs: Pairs, channel: str, label: str) -> None:
-    factor, unit = SCALED.get(CHANNELS[channel], (1.0, CHANNELS[channel]))
+def _draw_comparison(top: "Axes", bottom: "Axes", pairs: Pairs, channel: str, label: str) -> None:
+    factor, unit = PLOT_UNITS.get(CHANNELS[channel], (1.0, CHANNELS[channel]))
     for number, (measured, run) in enumerate(pairs):
         if channel not in measured or channel not in run:
             continue
         first = number == 0
-        every = max(1, len(measured) * len(pairs) // MOST_POINTS)
+        every = max(1, len(measured) * len(pairs) // MAX_PLOT_POINTS)
         t, y = measured.t[::every], factor * measured[channel][::every]
         top.plot(t, y, ".", color=GREY, ms=3, label="measured" if first else None)
         top.plot(run.t, factor * run[channel], color=BLUE, lw=1.2, label=label if first else None)

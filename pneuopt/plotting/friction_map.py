@@ -6,13 +6,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.dynamics.system import System, names, vector
-from pneuopt.identification.propagation import propagated
+from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.identification.propagation import propagate_deviations
 from pneuopt.logs.experiments import Experiment, differentiate
 from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
-from pneuopt.plotting.fits import MOST_POINTS, Fitted
+from pneuopt.plotting.fits import MAX_PLOT_POINTS, PlottableFit
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -21,13 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
-BAND = 1.96  # standard deviations, 95 %
+NORMAL_QUANTILE_95 = 1.96  # standard deviations, 95 %
 SLOPE_SAMPLES = 20  # of a local derivative
-INERTIA = "load.mass"
+LOAD_MASS = "load.mass"
 
 
-def plot_friction(system: System, result: Fitted, experiments: Sequence[Experiment]) -> "Figure":
+def plot_friction(system: System, result: PlottableFit, experiments: Sequence[Experiment]) -> "Figure":
     """The friction force that the logs imply against speed, with the fitted curve and its 95 % band on top.
 
     For a `MotionDrive` the force as measured, offset and pressure and all. For a drive with a mass what pushes it (the
@@ -55,17 +54,17 @@ def plot_friction(system: System, result: Fitted, experiments: Sequence[Experime
     imposed = not system.states
     figure, ((axes,),) = axes_grid(1, 1, [4.2], width=7.0)
     clouds = [
-        _imposed(e) if imposed else _implied(system, result, e, name)
+        _rig_points(e) if imposed else _drive_points(system, result, e, name)
         for name, e in zip(result.trajectories, experiments, strict=True)
     ]
     speed, force = (np.concatenate(part) for part in zip(*clouds, strict=True))
-    every = max(1, len(speed) // MOST_POINTS)
+    every = max(1, len(speed) // MAX_PLOT_POINTS)
     axes.plot(speed[::every], force[::every], ".", color=GREY, ms=2.5, alpha=0.6, label="from the logs")
     if imposed:
         fitted = np.concatenate([run["force"] for run in result.trajectories.values()])
         axes.plot(speed[::every], fitted[::every], ".", color=BLUE, ms=2.5, label="fitted")
     else:
-        _curve(axes, system, result, _speeds(speed))
+        _draw_curve(axes, system, result, _speed_grid(speed))
     low, high = np.nanpercentile(force, [0.5, 99.5])
     axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
     axes.set(xlabel="speed [m/s]", ylabel="force [N]" if imposed else "friction force [N]")
@@ -77,7 +76,7 @@ def has_friction_map(system: System) -> bool:
     """Whether `plot_friction` can draw it: speed in and force out, or a mass that moves."""
     states, inputs = names(system.states), names(system.inputs)
     imposed = not states and "speed" in inputs and names(system.outputs) == ("force",)
-    return imposed or ({"position", "speed"} <= set(states) and INERTIA in system.parameters)
+    return imposed or ({"position", "speed"} <= set(states) and LOAD_MASS in system.parameters)
 
 
 def friction_force(system: System, run: Trajectory, parameters: ParameterSet) -> Array:
@@ -94,31 +93,31 @@ def friction_force(system: System, run: Trajectory, parameters: ParameterSet) ->
     seen = {n: run[n] for n in names(system.states)}
     idle = {n: np.zeros(len(run)) for n in seen if n == "speed" or n.startswith("friction.")}
     inputs = {n: run[n] for n in names(system.inputs)}
-    moves, free = (_rates(system, parameters, x, inputs)["speed"] for x in (seen, {**seen, **idle}))
-    return np.asarray(parameters.value(INERTIA) * (free - moves))
+    moves, free = (_state_rates(system, parameters, x, inputs)["speed"] for x in (seen, {**seen, **idle}))
+    return np.asarray(parameters.value(LOAD_MASS) * (free - moves))
 
 
-def _imposed(experiment: Experiment) -> tuple[Array, Array]:
+def _rig_points(experiment: Experiment) -> tuple[Array, Array]:
     return experiment.trajectory["speed"], experiment.trajectory["force"]
 
 
-def _implied(system: System, result: Fitted, experiment: Experiment, name: str) -> tuple[Array, Array]:
+def _drive_points(system: System, result: PlottableFit, experiment: Experiment, name: str) -> tuple[Array, Array]:
     """Speed, and what pushes the mass without accelerating it."""
     log, run = experiment.trajectory, result.trajectories[name]
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
     own = {n.partition("[")[0]: v for n, v in found.items() if n.endswith(f"[{name}]")}
     known = {n: v for n, v in experiment.conditions.items() if n in result.parameters}
     parameters = result.parameters.with_values({**own, **known})
-    speed = log["speed"] if "speed" in log else _slope(log.t, log["position"])
+    speed = log["speed"] if "speed" in log else _smooth_derivative(log.t, log["position"])
     seen = {n: log[n] if n in log else run[n] for n in names(system.states)}
     idle = {n: np.zeros(len(log)) for n in seen if n == "speed" or n.startswith("friction.")}
-    pushed = _rates(system, parameters, {**seen, **idle}, {q: log[q] for q in names(system.inputs)})["speed"]
-    force = parameters.value(INERTIA) * (pushed - _slope(log.t, speed))
+    pushed = _state_rates(system, parameters, {**seen, **idle}, {q: log[q] for q in names(system.inputs)})["speed"]
+    force = parameters.value(LOAD_MASS) * (pushed - _smooth_derivative(log.t, speed))
     reverses = np.convolve(np.abs(np.diff(np.sign(speed), prepend=np.nan)) > 0, np.ones(2 * SLOPE_SAMPLES), "same")
     return speed, np.where(reverses > 0, np.nan, force)
 
 
-def _curve(axes: "Axes", system: System, result: Fitted, grid: Array) -> None:
+def _draw_curve(axes: "Axes", system: System, result: PlottableFit, grid: Array) -> None:
     """The fitted curve, and how far the estimates' covariance lets it move; no band where it does not say."""
     shared = [n for n in result.covariance.index if n in result.parameters]
     usual = {
@@ -130,9 +129,9 @@ def _curve(axes: "Axes", system: System, result: Fitted, grid: Array) -> None:
         moved = {n: replace(result.parameters[n], value=values[n], lower=-math.inf, upper=math.inf) for n in shared}
         return _steady_friction(system, result.parameters | ParameterSet(moved), usual, grid)
 
-    force, spread = propagated(result, friction)
+    force, spread = propagate_deviations(result, friction)
     if np.isfinite(spread).all():
-        low, high = force - BAND * spread, force + BAND * spread
+        low, high = force - NORMAL_QUANTILE_95 * spread, force + NORMAL_QUANTILE_95 * spread
         axes.fill_between(grid, low, high, color=BLUE, alpha=0.3, lw=0, label="95 % band")
     axes.plot(grid, force, color=BLUE, lw=1.2, label="fitted")
 
@@ -147,30 +146,30 @@ def _steady_friction(system: System, parameters: ParameterSet, usual: Mapping[st
     bristles = {s.name: s.nominal for s in system.states if s.name.startswith("friction.")}
     still |= {n: np.zeros(len(speeds)) for n in bristles}
     moving, bent = {**still, "speed": speeds}, {n: np.full(len(speeds), size) for n, size in bristles.items()}
-    straight = _rates(system, parameters, moving, inputs)
-    other = _rates(system, parameters, {**moving, **bent}, inputs)
+    straight = _state_rates(system, parameters, moving, inputs)
+    other = _state_rates(system, parameters, {**moving, **bent}, inputs)
     ends = {n: size * straight[n] / (straight[n] - other[n]) for n, size in bristles.items()}
-    rest, steady = (_rates(system, parameters, x, inputs)["speed"] for x in (still, {**moving, **ends}))
-    return np.asarray(parameters.value(INERTIA) * (rest - steady))
+    rest, steady = (_state_rates(system, parameters, x, inputs)["speed"] for x in (still, {**moving, **ends}))
+    return np.asarray(parameters.value(LOAD_MASS) * (rest - steady))
 
 
-def _rates(
+def _state_rates(
     system: System, parameters: ParameterSet, x: Mapping[str, Array], u: Mapping[str, Array]
 ) -> dict[str, Array]:
     """The states' rates at many points at once."""
     count = len(next(iter(x.values())))
     given = [np.array([part[q.name] for q in group]) for part, group in ((x, system.states), (u, system.inputs))]
-    p = np.tile(vector(system.parameters, parameters)[:, None], (1, count))
+    p = np.tile(parameter_vector(system.parameters, parameters)[:, None], (1, count))
     found = system.ode.map(count)(np.zeros((1, count)), *given, p)[0].full()
     return dict(zip(names(system.states), np.asarray(found), strict=True))
 
 
-def _slope(t: Array, y: Array) -> Array:
+def _smooth_derivative(t: Array, y: Array) -> Array:
     window = SLOPE_SAMPLES * float(np.median(np.diff(t)))
     return differentiate(Experiment(Trajectory(t, {"position": y})), window=window).trajectory["speed"]
 
 
-def _speeds(speed: Array) -> Array:
+def _speed_grid(speed: Array) -> Array:
     """A grid over the range, dense around zero."""
     low, high = float(np.nanmin(speed)), float(np.nanmax(speed))
     near = np.geomspace(1e-4, 1.0, 120) * max(-low, high)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from pneuopt.plotting.canvas import BLUE, RED, axes_grid, legend_above
-from pneuopt.quantities.errors import check_known, require
+from pneuopt.quantities.errors import check_names, require
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,17 +31,17 @@ def plot_front(table: "pd.DataFrame", requirements: Mapping[str, str]) -> "Figur
         If these are not two columns of the table.
     """
     require(len(requirements) == 2, f"a front has two requirements, got {', '.join(requirements) or 'none'}")
-    check_known("column", [*requirements, "limit", "error"], [str(c) for c in table])
+    check_names("column", [*requirements, "limit", "error"], [str(c) for c in table])
     (first, up), (second, along) = requirements.items()
     figure, ((axes,),) = axes_grid(1, 1, (3.4,), width=6.5)
     axes.plot(table[second].to_numpy(), table[first].to_numpy(), "o-", color=BLUE, ms=5, label="certified designs")
     failed = table.loc[table["error"] != "", "limit"].dropna()
     for k, limit in enumerate(failed):
         axes.axvline(float(limit), color=RED, lw=1.0, ls=":", label=None if k else "no design certified")
-    axes.set(xlabel=_labelled(second, along), ylabel=_labelled(first, up))
+    axes.set(xlabel=_axis_label(second, along), ylabel=_axis_label(first, up))
     legend_above(figure, axes)
     return figure
 
 
-def _labelled(name: str, unit: str) -> str:
+def _axis_label(name: str, unit: str) -> str:
     return name if unit in ("", "1") else f"{name} [{unit}]"

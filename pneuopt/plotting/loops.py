@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pneuopt.control.reference import Step
-from pneuopt.plotting.canvas import BLUE, GREY, MOST_COLUMNS, ORANGE, axes_grid, legend_above, shown_of
+from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_COLUMNS, ORANGE, axes_grid, legend_above, note_omissions
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -16,8 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
-INSIDE = {"valve.spool": ("valve [%]", 100.0), "friction.force": ("friction [N]", 1.0)}
+DRIVE_SIGNALS = {"valve.spool": ("valve [%]", 100.0), "friction.force": ("friction [N]", 1.0)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,26 +61,26 @@ def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure"
     Figure
     """
     require(len(responses) > 0, "no response to plot")
-    shown = responses[:MOST_COLUMNS]
-    inside = [n for n in INSIDE if all(n in response.run for response in shown)]
+    shown = responses[:MAX_PLOT_COLUMNS]
+    inside = [n for n in DRIVE_SIGNALS if all(n in response.run for response in shown)]
     figure, grid = axes_grid(2 + len(inside), len(shown), [2.6, 1.4, *(1.2 for _ in inside)], sharex="col")
     for (top, *others), response in zip(zip(*grid, strict=True), shown, strict=True):
-        _follow(top, response, band)
-        _draw(others[0], response, "control", f"command [{response.units[1]}]", 1.0)
+        _draw_tracking(top, response, band)
+        _draw_signal(others[0], response, "control", f"command [{response.units[1]}]", 1.0)
         for axes, name in zip(others[1:], inside, strict=True):
-            _draw(axes, response, name, *INSIDE[name])
+            _draw_signal(axes, response, name, *DRIVE_SIGNALS[name])
         others[-1].set_xlabel("time [s]")
     for row in grid:
         for axes in row[1:]:
             axes.set_ylabel("")
     legend_above(figure, grid[0][0])
-    shown_of(figure, len(shown), len(responses), "steps")
+    note_omissions(figure, len(shown), len(responses), "steps")
     return figure
 
 
-def _follow(axes: "Axes", response: Response, band: float) -> None:
+def _draw_tracking(axes: "Axes", response: Response, band: float) -> None:
     run, reference, unit = response.run, response.reference, response.units[0]
-    width = band * abs(reference.whole)
+    width = band * abs(reference.nominal_size)
     end = float(run.t[-1])
     axes.fill_between(
         [reference.at, end],
@@ -95,18 +95,18 @@ def _follow(axes: "Axes", response: Response, band: float) -> None:
     axes.plot([0, reference.at, reference.at, end], steps, color=ORANGE, lw=1.0, label="reference")
     signal, before = run[response.measured], response.before
     if before is not None:
-        axes.plot(*_averaged(before.t, before[response.measured], response), color=GREY, lw=1.0, label="before")
+        axes.plot(*_dither_mean(before.t, before[response.measured], response), color=GREY, lw=1.0, label="before")
     if response.dither_period is not None:
         axes.plot(run.t, signal, color=BLUE, lw=0.6, alpha=0.35)
     label = ("simulated" if before is None else "tuned") + ("" if response.dither_period is None else ", averaged")
-    axes.plot(*_averaged(run.t, signal, response), color=BLUE, lw=1.5, label=label)
+    axes.plot(*_dither_mean(run.t, signal, response), color=BLUE, lw=1.5, label=label)
     axes.set(ylabel=f"{response.measured} [{unit}]", xlim=(0, end))
     axes.set_title(f"{reference.initial:g} to {reference.final:g} {unit}", fontsize=9)
     ends = [reference.initial, reference.final]
-    _keep_in_view(axes, signal, ends, ends if before is None else before[response.measured])
+    _set_view_limits(axes, signal, ends, ends if before is None else before[response.measured])
 
 
-def _draw(axes: "Axes", response: Response, name: str, label: str, factor: float) -> None:
+def _draw_signal(axes: "Axes", response: Response, name: str, label: str, factor: float) -> None:
     """One more signal, with what it was before."""
     now, before = factor * response.run[name], response.before
     was = factor * before[name] if before is not None and name in before else None
@@ -114,10 +114,10 @@ def _draw(axes: "Axes", response: Response, name: str, label: str, factor: float
         axes.plot(before.t, was, color=GREY, lw=0.8)
     axes.plot(response.run.t, now, color=BLUE, lw=1.0)
     axes.set_ylabel(label)
-    _keep_in_view(axes, now, [0.0], [0.0] if was is None else was)
+    _set_view_limits(axes, now, [0.0], [0.0] if was is None else was)
 
 
-def _averaged(t: Array, y: Array, response: Response) -> tuple[Array, Array]:
+def _dither_mean(t: Array, y: Array, response: Response) -> tuple[Array, Array]:
     """The centred mean over the dither's period, of samples on an even grid."""
     n = 0 if response.dither_period is None else round(response.dither_period / (t[1] - t[0]))
     if n < 2 or n >= len(t):
@@ -126,7 +126,7 @@ def _averaged(t: Array, y: Array, response: Response) -> tuple[Array, Array]:
     return t[: len(mean)] + (n - 1) / 2 * (t[1] - t[0]), mean
 
 
-def _keep_in_view(axes: "Axes", y: Array, others: Sequence[float], before: ArrayLike) -> None:
+def _set_view_limits(axes: "Axes", y: Array, others: Sequence[float], before: ArrayLike) -> None:
     """Scale to what counts: an unstable "before" may stretch it by half, but not flatten it."""
     low, high = min(float(y.min()), *others), max(float(y.max()), *others)
     span = high - low or 1.0

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.plotting.canvas import BLUE, MOST_COLUMNS, RED, axes_grid, shown_of
-from pneuopt.quantities.errors import check_known, require
-from pneuopt.studies.sweep import INTERRUPTED
+from pneuopt.plotting.canvas import BLUE, MAX_PLOT_COLUMNS, RED, axes_grid, note_omissions
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import check_names, require
+from pneuopt.studies.sweep import INTERRUPTED_CASE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -16,10 +17,9 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
-MOST_LABELLED = 12  # cells along an axis that have room for their number
-FEW_LABELS = 6  # of an axis that has more
-COLOURS = "viridis_r"
+MAX_NUMBERED_CELLS = 12  # cells along an axis that have room for their number
+LABELS_PER_LONG_AXIS = 6  # of an axis that has more
+COLOUR_MAP = "viridis_r"
 
 
 def plot_map(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> "Figure":
@@ -45,23 +45,23 @@ def plot_map(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[st
     """
     require(len(axes) in (1, 2), f"a study is drawn over one or two axes, this has {len(axes)}: {', '.join(axes)}")
     require(len(metrics) > 0, "no metric to draw")
-    check_known("column", [*axes, *metrics, "error"], [str(c) for c in table])
-    shown = dict(list(metrics.items())[:MOST_COLUMNS])
+    check_names("column", [*axes, *metrics, "error"], [str(c) for c in table])
+    shown = dict(list(metrics.items())[:MAX_PLOT_COLUMNS])
     width = min(10.0, 1.5 + 4.0 * len(shown))
     figure, (row,) = axes_grid(1, len(shown), [3.4], width=width)
-    labels = [_labelled(name, unit) for name, unit in axes.items()]
-    draw = _lines if len(axes) == 1 else _map
+    labels = [_axis_label(name, unit) for name, unit in axes.items()]
+    draw = _draw_lines if len(axes) == 1 else _draw_map
     for panel, (metric, unit) in zip(row, shown.items(), strict=True):
         draw(panel, table, axes, metric)
-        panel.set_title(_labelled(metric, unit), fontsize=10)
+        panel.set_title(_axis_label(metric, unit), fontsize=10)
         panel.set_xlabel(labels[0])
     if len(axes) == 2:
         row[0].set_ylabel(labels[1])
-    shown_of(figure, len(shown), len(metrics), "metrics")
+    note_omissions(figure, len(shown), len(metrics), "metrics")
     return figure
 
 
-def _lines(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric: str) -> None:
+def _draw_lines(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric: str) -> None:
     (name,) = axes
     ordered = table.sort_values(name)
     x, y = (ordered[column].to_numpy(dtype=float) for column in (name, metric))
@@ -72,7 +72,7 @@ def _lines(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric
         panel.text(
             at,
             0.5,
-            _word(metric, error),
+            _failure_word(metric, error),
             transform=panel.get_xaxis_transform(),
             color=RED,
             rotation=90,
@@ -81,39 +81,39 @@ def _lines(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric
         )
 
 
-def _map(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric: str) -> None:
+def _draw_map(panel: "Axes", table: "pd.DataFrame", axes: Mapping[str, str], metric: str) -> None:
     x, y = (np.unique(table[name].to_numpy(dtype=float)) for name in axes)
     values, errors = np.full((len(y), len(x)), np.nan), np.full((len(y), len(x)), "", dtype=object)
     place = [np.searchsorted(v, table[name].to_numpy(dtype=float)) for v, name in zip((x, y), axes, strict=True)]
     values[place[1], place[0]] = table[metric].to_numpy(dtype=float)
     errors[place[1], place[0]] = table["error"].to_numpy()
     panel.set_facecolor("0.92")
-    mesh = panel.pcolormesh(np.ma.masked_invalid(values), cmap=COLOURS)
+    mesh = panel.pcolormesh(np.ma.masked_invalid(values), cmap=COLOUR_MAP)
     panel.figure.colorbar(mesh, ax=panel, pad=0.02)
     panel.grid(False)
     for ticks, at in ((panel.set_xticks, x), (panel.set_yticks, y)):
-        every = 1 if len(at) <= MOST_LABELLED else -(-len(at) // FEW_LABELS)
+        every = 1 if len(at) <= MAX_NUMBERED_CELLS else -(-len(at) // LABELS_PER_LONG_AXIS)
         ticks(np.arange(0, len(at), every) + 0.5, [f"{v:.3g}" for v in at[::every]])
-    if max(len(x), len(y)) <= MOST_LABELLED:
-        _number(panel, mesh, values, errors, metric)
+    if max(len(x), len(y)) <= MAX_NUMBERED_CELLS:
+        _number_cells(panel, mesh, values, errors, metric)
 
 
-def _number(panel: "Axes", mesh: "QuadMesh", values: Array, errors: NDArray[np.object_], metric: str) -> None:
+def _number_cells(panel: "Axes", mesh: "QuadMesh", values: Array, errors: NDArray[np.object_], metric: str) -> None:
     """Each cell's figure, or what became of it, in black or white as the cell is light or dark."""
     for (j, i), value in np.ndenumerate(values):
         known = bool(np.isfinite(value))
-        text = f"{value:.3g}" if known else _word(metric, str(errors[j, i]))
+        text = f"{value:.3g}" if known else _failure_word(metric, str(errors[j, i]))
         red, green, blue, _ = mesh.to_rgba(np.array([value]))[0]
         light = 0.3 * red + 0.59 * green + 0.11 * blue > 0.5
         colour = RED if not known else "black" if light else "white"
         panel.text(i + 0.5, j + 0.5, text, ha="center", va="center", fontsize=8, color=colour)
 
 
-def _word(metric: str, error: str) -> str:
+def _failure_word(metric: str, error: str) -> str:
     if error:
-        return "failed" if error != INTERRUPTED else error
+        return "failed" if error != INTERRUPTED_CASE else error
     return "never" if metric == "SettlingTime" else "none"
 
 
-def _labelled(name: str, unit: str) -> str:
+def _axis_label(name: str, unit: str) -> str:
     return name if unit in ("", "1") else f"{name} [{unit}]"

@@ -72,7 +72,7 @@ def require(condition: bool, message: str, error: type[PneuoptError] = InputErro
         raise error(message)
 
 
-def check_known(kind: str, names: Iterable[str], known: Iterable[str], where: str = "") -> None:
+def check_names(kind: str, names: Iterable[str], known: Iterable[str], where: str = "") -> None:
     """Raise `UnknownNameError` for the first of `names` that is not in `known`."""
     known = set(known)
     for name in names:

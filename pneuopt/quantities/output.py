@@ -64,7 +64,7 @@ def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
     frame : DataFrame
         An index that is more than a count goes into each record, as "name" if it has no name of its own.
     """
-    write_text(path, _dumped(records(frame)))
+    write_text(path, _to_json(records(frame)))
 
 
 def write_json(path: str | Path, document: Mapping[str, Any]) -> None:
@@ -75,7 +75,7 @@ def write_json(path: str | Path, document: Mapping[str, Any]) -> None:
     path : str or Path
     document : mapping
     """
-    write_text(path, _dumped(plain(document)))
+    write_text(path, _to_json(plain_value(document)))
 
 
 def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
@@ -88,10 +88,10 @@ def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
         table = frame.reset_index()
     else:
         table = frame.reset_index(names=str(frame.index.name or "name"))
-    return [{str(k): plain(v) for k, v in record.items()} for record in table.to_dict(orient="records")]
+    return [{str(k): plain_value(v) for k, v in record.items()} for record in table.to_dict(orient="records")]
 
 
-def plain(value: Any) -> Any:
+def plain_value(value: Any) -> Any:
     """What TOML and JSON can hold: NumPy's scalars as Python's, nothing for None, text for what is neither.
 
     Examples
@@ -100,14 +100,14 @@ def plain(value: Any) -> Any:
     {'a': [1, 'b']}
     """
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items() if v is not None}
+        return {str(k): plain_value(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value if v is not None]
+        return [plain_value(v) for v in value if v is not None]
     value = value.item() if hasattr(value, "item") else value
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
+def check_output_paths(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
     """Refuse outputs that could not be written after minutes of work, or that would overwrite an input.
 
     Parameters
@@ -133,13 +133,13 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
         taken.add(place)
 
 
-def _dumped(value: Any) -> str:
-    return json.dumps(_finite(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+def _to_json(value: Any) -> str:
+    return json.dumps(_null_nonfinite(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _finite(value: Any) -> Any:
+def _null_nonfinite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: _null_nonfinite(v) for k, v in value.items()}
     if isinstance(value, list):
-        return [_finite(v) for v in value]
+        return [_null_nonfinite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from pneuopt.quantities.errors import InputError, UnknownNameError, check_known, require
+from pneuopt.quantities.errors import InputError, UnknownNameError, check_names, require
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -120,7 +120,7 @@ class ParameterSet(Mapping[str, Parameter]):
 
     def __repr__(self) -> str:
         width = max((len(n) for n in self), default=0)
-        return "\n".join(f"{n:<{width}}  {_describe(p)}" for n, p in self.items())
+        return "\n".join(f"{n:<{width}}  {_describe_parameter(p)}" for n, p in self.items())
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -131,7 +131,7 @@ class ParameterSet(Mapping[str, Parameter]):
         """The value of one parameter [its unit]."""
         return self[name].value
 
-    def matching(self, *patterns: str) -> tuple[str, ...]:
+    def match_names(self, *patterns: str) -> tuple[str, ...]:
         """Names that match any of the shell patterns; a pattern without a match is an error."""
         names: list[str] = []
         for pattern in patterns:
@@ -143,29 +143,29 @@ class ParameterSet(Mapping[str, Parameter]):
 
     def freed(self, *patterns: str) -> "ParameterSet":
         """Mark the matching parameters as free, by copy."""
-        return self._edited({n: replace(self[n], free=True) for n in self.matching(*patterns)})
+        return self._with_parameters({n: replace(self[n], free=True) for n in self.match_names(*patterns)})
 
     def fixed(self, *patterns: str) -> "ParameterSet":
         """Mark the matching parameters as fixed, by copy."""
-        return self._edited({n: replace(self[n], free=False) for n in self.matching(*patterns)})
+        return self._with_parameters({n: replace(self[n], free=False) for n in self.match_names(*patterns)})
 
     def per_log(self, *patterns: str) -> "ParameterSet":
         """Give each experiment its own value of the matching parameters, by copy."""
-        return self._edited({n: replace(self[n], per_log=True) for n in self.matching(*patterns)})
+        return self._with_parameters({n: replace(self[n], per_log=True) for n in self.match_names(*patterns)})
 
     def with_values(self, values: Mapping[str, float]) -> "ParameterSet":
         """Give the named parameters new values, by copy; one outside its bounds is an error that names it."""
-        return self._edited({n: self._replaced(n, value=float(v)) for n, v in values.items()})
+        return self._with_parameters({n: self._replace_fields(n, value=float(v)) for n, v in values.items()})
 
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> "ParameterSet":
         """Give the named parameters new bounds, by copy."""
-        return self._edited({n: self._replaced(n, lower=lo, upper=up) for n, (lo, up) in bounds.items()})
+        return self._with_parameters({n: self._replace_fields(n, lower=lo, upper=up) for n, (lo, up) in bounds.items()})
 
     def select(self, names: Iterable[str]) -> "ParameterSet":
         """Keep the named parameters, in that order."""
         return ParameterSet({n: self[n] for n in names})
 
-    def prefixed(self, prefix: str) -> "ParameterSet":
+    def with_prefix(self, prefix: str) -> "ParameterSet":
         """Put `prefix.` before every name."""
         return ParameterSet({f"{prefix}.{n}": p for n, p in self.items()})
 
@@ -177,7 +177,7 @@ class ParameterSet(Mapping[str, Parameter]):
         rows = {n: [getattr(p, f) for f in fields] for n, p in self.items()}
         return pd.DataFrame.from_dict(rows, orient="index", columns=fields)
 
-    def _replaced(self, name: str, **fields: float) -> Parameter:
+    def _replace_fields(self, name: str, **fields: float) -> Parameter:
         try:
             return replace(self[name], **fields)  # type: ignore[arg-type]
         except InputError as error:
@@ -185,12 +185,12 @@ class ParameterSet(Mapping[str, Parameter]):
                 raise
             raise InputError(f"{name}: {error}") from None
 
-    def _edited(self, edits: Mapping[str, Parameter]) -> "ParameterSet":
-        check_known("parameter", edits, self)
+    def _with_parameters(self, edits: Mapping[str, Parameter]) -> "ParameterSet":
+        check_names("parameter", edits, self)
         return ParameterSet({**self._parameters, **edits})
 
 
-def _describe(parameter: Parameter) -> str:
+def _describe_parameter(parameter: Parameter) -> str:
     marks = [m for m in ("free", "log", "per_log") if getattr(parameter, m)]
     finite = math.isfinite(parameter.lower) or math.isfinite(parameter.upper)
     bounds = f" in [{parameter.lower:g}, {parameter.upper:g}]" if finite else ""

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import UnknownNameError, require
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +36,13 @@ class Trajectory:
     values: Mapping[str, Array]
 
     def __init__(self, t: ArrayLike, values: Mapping[str, ArrayLike]) -> None:
-        grid = _frozen(t)
+        grid = _read_only_copy(t)
         require(grid.ndim == 1 and grid.size > 0, f"a trajectory needs a time grid of shape (n,), got {grid.shape}")
         require(bool(np.isfinite(grid).all()), "a trajectory's time must be finite")
         back = np.flatnonzero(np.diff(grid) <= 0)
         where = f"sample {back[0] + 1} at {grid[back[0] + 1]:g} s follows {grid[back[0]]:g} s" if back.size else ""
         require(not back.size, f"a trajectory's time must increase strictly; {where}")
-        columns = {name: _frozen(column) for name, column in values.items()}
+        columns = {name: _read_only_copy(column) for name, column in values.items()}
         for name, column in columns.items():
             require(column.shape == grid.shape, f"column {name!r} has shape {column.shape}, time has {grid.shape}")
         object.__setattr__(self, "t", grid)
@@ -91,7 +90,7 @@ class Trajectory:
         """Keep the samples `start:stop`."""
         return Trajectory(self.t[start:stop], {n: c[start:stop] for n, c in self.values.items()})
 
-    def at(self, t: ArrayLike) -> "Trajectory":
+    def interpolate(self, t: ArrayLike) -> "Trajectory":
         """Interpolate linearly onto another grid; before the first and after the last sample, their values stay."""
         grid = np.asarray(t, dtype=float)
         return Trajectory(grid, {n: np.interp(grid, self.t, c) for n, c in self.values.items()})
@@ -103,7 +102,7 @@ class Trajectory:
         return pd.DataFrame(dict(self.values), index=pd.Index(self.t, name="time"))
 
 
-def _frozen(values: ArrayLike) -> Array:
+def _read_only_copy(values: ArrayLike) -> Array:
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array

@@ -17,7 +17,7 @@ ATMOSPHERE = 101325.0
 """Standard atmosphere [Pa], which gauge pressures count from (ISO 2533)."""
 
 # The whole vocabulary; a short one of our own keeps surprises out ("Ns" as "newtons", "pt" as a pint) and loads fast.
-_DEFINITIONS = """
+_UNIT_DEFINITIONS = """
 nano- = 1e-9 = n-
 micro- = 1e-6 = µ- = μ- = u-
 milli- = 1e-3 = m-
@@ -67,14 +67,16 @@ newton_meter = newton * meter = Nm
 newton_second = newton * second = Ns
 volt_second = volt * second = Vs
 """
-_COMMON = """
+_COMMON_UNITS = """
 m mm um cm km in s ms us min h kg g t N kN Nm V mV A mA K degC Hz kHz rad deg rad/s rpm m/s mm/s m/s^2 m^2 m^3 mm^2
 cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count newton volt meter Pa kPa MPa bar mbar psi
 Pa(a) Pa(g) kPa(a) kPa(g) MPa(a) MPa(g) bar(a) bar(g) mbar(a) mbar(g) psi(a) psi(g)
 """
-_NUMBER = re.compile(r"\s*([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?|inf(?![a-z])))\s*(.*?)\s*", re.DOTALL)
-_LEVEL = re.compile(r"(.+?)\s*\(([ag])\)")
-_READABLE = {
+_NUMBER_WITH_UNIT = re.compile(
+    r"\s*([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?|inf(?![a-z])))\s*(.*?)\s*", re.DOTALL
+)
+_PRESSURE_LEVEL = re.compile(r"(.+?)\s*\(([ag])\)")
+_READABLE_UNITS = {
     "m": (("um", 1e-4), ("mm", 1.0)),
     "s": (("us", 1e-4), ("ms", 1.0)),
     "m/s": (("mm/s", 0.1),),
@@ -111,13 +113,13 @@ def read_value(text: str | float, unit: str, *, where: str = "") -> float:
     >>> read_value("32 mm", "m"), read_value("6 bar(g)", "Pa(a)"), read_value("30 %", "1")
     (0.032, 701325.0, 0.3)
     """
-    number, unit_text = _parts(text, where)
+    number, unit_text = _split_number(text, where)
     if not unit_text:
-        free = _parsed(_split_level(unit)[0]).dimension == ()
-        require(free, f'{_at(where)}{text!r} has no unit; write "{number} {_example(unit)}"', UnitError)
+        free = _parse_unit(_split_level(unit)[0]).dimension == ()
+        require(free, f'{_place_prefix(where)}{text!r} has no unit; write "{number} {_example_unit(unit)}"', UnitError)
         unit_text = "1"
-    factor, offset = _conversion(unit_text, unit, where)
-    value = _scaled(number, factor, offset)
+    factor, offset = _exact_conversion(unit_text, unit, where)
+    value = _convert(number, factor, offset)
     _check_vacuum(value, _split_level(unit)[1], text, where)
     return value
 
@@ -146,14 +148,14 @@ def read_si(text: str | float, *, where: str = "") -> float:
     >>> read_si("5000 g"), read_si("6.3 bar(g)"), read_si(0.3)
     (5.0, 731325.0, 0.3)
     """
-    unit_text = _parts(text, where)[1]
+    unit_text = _split_number(text, where)[1]
     base = _split_level(unit_text or "1")[0]
-    if _parsed(base, where).dimension == _parsed("Pa").dimension:
+    if _parse_unit(base, where).dimension == _parse_unit("Pa").dimension:
         return read_value(text, "Pa(a)", where=where)
     return read_value(text, _base_unit(base), where=where)
 
 
-def scale_of(unit_text: str, unit: str, *, where: str = "") -> tuple[float, float]:
+def si_conversion(unit_text: str, unit: str, *, where: str = "") -> tuple[float, float]:
     """Find the factor and offset that bring a column of raw numbers to SI: ``si = factor * raw + offset``.
 
     Parameters
@@ -179,11 +181,11 @@ def scale_of(unit_text: str, unit: str, *, where: str = "") -> tuple[float, floa
     >>> scale_of("mm", "m"), scale_of("bar(g)", "Pa(a)")
     ((0.001, 0.0), (100000.0, 101325.0))
     """
-    factor, offset = _conversion(unit_text, unit, where)
+    factor, offset = _exact_conversion(unit_text, unit, where)
     return float(factor), float(offset)
 
 
-def unit_of(text: str | float, unit: str) -> str:
+def read_unit(text: str | float, unit: str) -> str:
     """The unit in which a value is written; `unit` where it stands alone.
 
     Examples
@@ -191,7 +193,7 @@ def unit_of(text: str | float, unit: str) -> str:
     >>> unit_of("6 bar(g)", "Pa(a)"), unit_of(0.3, "1")
     ('bar(g)', '1')
     """
-    return _parts(text, "")[1] or unit
+    return _split_number(text, "")[1] or unit
 
 
 def write_value(value: float, unit: str, digits: int = 6) -> str:
@@ -216,14 +218,14 @@ def write_value(value: float, unit: str, digits: int = 6) -> str:
     ('32 mm', '7.01325 bar(a)', '0.3')
     """
     require(not math.isnan(value), f"a value of NaN {unit} cannot be written")
-    readable = _READABLE.get(unit, ()) if math.isfinite(value) else ()
+    readable = _READABLE_UNITS.get(unit, ()) if math.isfinite(value) else ()
     shown = next((name for name, below in readable if 0 < abs(value) < below), unit)
-    factor, offset = _conversion(shown, unit, "")
+    factor, offset = _exact_conversion(shown, unit, "")
     number = float((Fraction(value) - offset) / factor) if math.isfinite(value) else value
     return f"{number:.{digits}g}" + ("" if unit == "1" else f" {shown}")
 
 
-class _Scale(NamedTuple):
+class _UnitScale(NamedTuple):
     """How a unit converts to the SI base unit of its dimension, exactly."""
 
     factor: Fraction
@@ -231,72 +233,79 @@ class _Scale(NamedTuple):
     dimension: tuple[tuple[str, Fraction], ...]
 
 
-def _parts(text: str | float, where: str) -> tuple[str, str]:
+def _split_number(text: str | float, where: str) -> tuple[str, str]:
     shown = text if isinstance(text, str) else repr(text)
-    match = _NUMBER.fullmatch(shown)
+    match = _NUMBER_WITH_UNIT.fullmatch(shown)
     if match is None or isinstance(text, bool):
-        raise UnitError(f'{_at(where)}{text!r} is not a number with a unit; write for instance "32 mm"')
+        raise UnitError(f'{_place_prefix(where)}{text!r} is not a number with a unit; write for instance "32 mm"')
     number, unit = match.groups()
     comma = re.fullmatch(r",(\d+)\s*([^\d.,]*)", unit)
     if comma and "." not in number:
         mended = f"{number}.{comma[1]} {comma[2]}".strip()
-        raise UnitError(f'{_at(where)}{text!r} has a decimal comma; write "{mended}"')
+        raise UnitError(f'{_place_prefix(where)}{text!r} has a decimal comma; write "{mended}"')
     if re.match(r"[\d.,+_'-]", unit) and not unit.startswith("1/"):
-        raise UnitError(f"{_at(where)}{text!r} is not one number with a unit; write digits without separators")
+        raise UnitError(
+            f"{_place_prefix(where)}{text!r} is not one number with a unit; write digits without separators"
+        )
     return number, unit
 
 
-def _conversion(unit_text: str, unit: str, where: str) -> tuple[Fraction, Fraction]:
+def _exact_conversion(unit_text: str, unit: str, where: str) -> tuple[Fraction, Fraction]:
     (base, level), (target, target_level) = _split_level(unit_text), _split_level(unit)
-    source, goal = _parsed(base, where), _parsed(target, where)
+    source, goal = _parse_unit(base, where), _parse_unit(target, where)
     if source.dimension != goal.dimension:
-        raise UnitError(f"{_at(where)}unit {unit_text!r} does not measure {unit!r}; {_remedy(source, goal, unit)}")
+        raise UnitError(
+            f"{_place_prefix(where)}unit {unit_text!r} does not measure {unit!r}; {_remedy(source, goal, unit)}"
+        )
     if target_level and not level:
         raise UnitError(
-            f"{_at(where)}a pressure level in {unit_text!r} may be absolute or gauge; "
+            f"{_place_prefix(where)}a pressure level in {unit_text!r} may be absolute or gauge; "
             f'write "{base}(a)" or "{base}(g)" (gauge counts from {ATMOSPHERE:g} Pa)'
         )
     if level and not target_level:
         raise UnitError(
-            f"{_at(where)}{unit_text!r}: (a) and (g) mark a pressure level, which is not meant here; write {base!r}"
+            f"{_place_prefix(where)}{unit_text!r}: (a) and (g) mark a pressure level, which is not meant here; "
+            f"write {base!r}"
         )
     shift = Fraction(ATMOSPHERE) * ((level == "g") - (target_level == "g"))
     return source.factor / goal.factor, (source.offset - goal.offset + shift) / goal.factor
 
 
-def _scaled(number: str, factor: Fraction, offset: Fraction) -> float:
+def _convert(number: str, factor: Fraction, offset: Fraction) -> float:
     return float(number) if "inf" in number else float(Fraction(number) * factor + offset)
 
 
 def _split_level(unit_text: str) -> tuple[str, str]:
-    match = _LEVEL.fullmatch(unit_text)
+    match = _PRESSURE_LEVEL.fullmatch(unit_text)
     return (match[1], match[2]) if match else (unit_text, "")
 
 
 def _check_vacuum(value: float, level: str, text: str | float, where: str) -> None:
     floor = {"a": 0.0, "g": -ATMOSPHERE}.get(level, -math.inf)
     require(
-        value >= floor or value == -math.inf, f"{_at(where)}{text!r} lies below vacuum; check (a) and (g)", UnitError
+        value >= floor or value == -math.inf,
+        f"{_place_prefix(where)}{text!r} lies below vacuum; check (a) and (g)",
+        UnitError,
     )
 
 
-def _parsed(unit_text: str, where: str = "") -> _Scale:
+def _parse_unit(unit_text: str, where: str = "") -> _UnitScale:
     _registry()
     try:
-        return _scale(unit_text)
+        return _parse_with_pint(unit_text)
     except Exception:  # whatever pint raises on a text, the text is not a unit
-        raise UnitError(f"{_at(where)}unknown unit {unit_text!r}; {_nearest(unit_text)}") from None
+        raise UnitError(f"{_place_prefix(where)}unknown unit {unit_text!r}; {_suggest_unit(unit_text)}") from None
 
 
 @cache
-def _scale(unit_text: str) -> _Scale:
+def _parse_with_pint(unit_text: str) -> _UnitScale:
     require(not re.search(r"\d{3}", unit_text), "a power this high would take for ever")
     require("%%" not in unit_text.replace(" ", ""), "a percentage of a percentage is a slip of the finger")
     unit = _registry().parse_units(unit_text)
     zero, one = (_registry().Quantity(Fraction(k), unit).to_base_units() for k in range(2))
     # Base units, not the unit's dimensionality: an angle counts as a dimension here.
     dimension = tuple(sorted((name, Fraction(power)) for name, power in one.unit_items()))
-    return _Scale(one.magnitude - zero.magnitude, zero.magnitude, dimension)
+    return _UnitScale(one.magnitude - zero.magnitude, zero.magnitude, dimension)
 
 
 @cache
@@ -304,31 +313,31 @@ def _registry() -> Any:
     import pint
 
     registry: Any = pint.UnitRegistry(None, non_int_type=Fraction, autoconvert_offset_to_baseunit=True)
-    registry.load_definitions(_DEFINITIONS.strip().splitlines())
+    registry.load_definitions(_UNIT_DEFINITIONS.strip().splitlines())
     return registry
 
 
 def _base_unit(unit_text: str) -> str:
-    powers = _parsed(unit_text).dimension
+    powers = _parse_unit(unit_text).dimension
     return "*".join(f"{name}**({power})" for name, power in powers) or "1"
 
 
-def _remedy(source: _Scale, goal: _Scale, unit: str) -> str:
-    rates = [_parsed(rate).dimension for rate in ("Hz", "rad/s", "1/s")]
+def _remedy(source: _UnitScale, goal: _UnitScale, unit: str) -> str:
+    rates = [_parse_unit(rate).dimension for rate in ("Hz", "rad/s", "1/s")]
     if source.dimension in rates and goal.dimension in rates:
         return f"write it in {unit} (1 Hz is 2 pi rad/s; pneuopt does not choose for you)"
-    return f'write for instance "{_example(unit)}"'
+    return f'write for instance "{_example_unit(unit)}"'
 
 
-def _example(unit: str) -> str:
+def _example_unit(unit: str) -> str:
     return {"Pa(a)": "bar(a)", "Pa(g)": "bar(g)", "1": "%"}.get(unit, unit)
 
 
-def _nearest(unit_text: str) -> str:
-    known = {key.casefold(): unit for unit in _COMMON.split() for key in (unit, re.sub(r"[()]", "", unit))}
+def _suggest_unit(unit_text: str) -> str:
+    known = {key.casefold(): unit for unit in _COMMON_UNITS.split() for key in (unit, re.sub(r"[()]", "", unit))}
     near = difflib.get_close_matches(unit_text.casefold(), known, n=1, cutoff=0.6)
     return f"did you mean {known[near[0]]!r}?" if near else "write for instance mm, m/s, N, bar(g), V, ms or %"
 
 
-def _at(where: str) -> str:
+def _place_prefix(where: str) -> str:
     return f"{where}: " if where else ""

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.intp]
-RANK = 1e-12  # of the eigenvalues of a matrix of unit diagonal
-ROUNDING = 1e-14  # relative errors of a Schur complement, from long chains of tight gaps: 1 to 5e-16 measured
-STATE_FLOOR = 1e-6  # on D's diagonal (scaled states): a state that no data reach stays put, the optimum does not move
+from pneuopt.quantities.arrays import Array, Indices, Mask
+
+RANK_TOLERANCE = 1e-12  # of the eigenvalues of a matrix of unit diagonal
+SCHUR_ROUNDING = 1e-14  # relative errors of a Schur complement, from long chains of tight gaps: 1 to 5e-16 measured
+STATE_REGULARISATION = (
+    1e-6  # on D's diagonal (scaled states): a state that no data reach stays put, the optimum does not move
+)
 
 
-class Step(NamedTuple):
+class GaussNewtonStep(NamedTuple):
     """A Gauss-Newton step: nodes (m, n) scaled, parameters (k,)."""
 
     nodes: Array
@@ -27,14 +27,14 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
+class ReducedEquations:
     """The normal equations with the nodes eliminated.
 
     Attributes
     ----------
     nodes : ndarray, shape (m, n)
         The nodes' own step, with the parameters at rest: - D^-1 g_s.
-    eliminated : ndarray, shape (m, n, k)
+    node_sensitivity : ndarray, shape (m, n, k)
         D^-1 B: what the nodes do when the parameters move, with the opposite sign.
     schur : ndarray, shape (k, k)
     gradient : ndarray, shape (k,)
@@ -42,27 +42,27 @@ class Reduced:
     """
 
     nodes: Array
-    eliminated: Array
+    node_sensitivity: Array
     schur: Array
     gradient: Array
 
-    def step(self, keep: Mask) -> Step | None:
+    def step(self, keep: Mask) -> GaussNewtonStep | None:
         """Gauss-Newton step of the parameters that may move, shape (k,); None if those are not positive definite."""
         moved = np.zeros(len(keep))
         try:
             if keep.any():
-                moved[keep] = _solve_scaled(self.schur[np.ix_(keep, keep)], -self.gradient[keep])
+                moved[keep] = _solve_positive_definite(self.schur[np.ix_(keep, keep)], -self.gradient[keep])
         except LinAlgError:
             return None
-        return Step(self.following(moved), moved)
+        return GaussNewtonStep(self.back_substitute(moved), moved)
 
-    def following(self, moved: Array) -> Array:
+    def back_substitute(self, moved: Array) -> Array:
         """The nodes' step when the parameters move by `moved`, shape (k,)."""
-        return np.asarray(self.nodes - self.eliminated @ moved)
+        return np.asarray(self.nodes - self.node_sensitivity @ moved)
 
 
 @dataclass(frozen=True, eq=False)
-class Arrow:
+class ArrowEquations:
     """Normal equations of m nodes with n states each, and k parameters.
 
     Attributes
@@ -83,7 +83,7 @@ class Arrow:
     node_gradient: Array
     gradient: Array
 
-    def eliminate(self, damping: float) -> Reduced | None:
+    def eliminate(self, damping: float) -> ReducedEquations | None:
         """Solve for the nodes, with Marquardt's multiplicative damping of the diagonal.
 
         Parameters
@@ -104,22 +104,22 @@ class Arrow:
             return None
         corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-300)
         eliminated, node_part = solved[:, :k], solved[:, k]
-        return Reduced(
+        return ReducedEquations(
             -node_part.reshape(m, n),
             eliminated.reshape(m, n, k),
             corner - flat.T @ eliminated,
             self.gradient - flat.T @ node_part,
         )
 
-    def descent(self, step: Step) -> float:
+    def descent_rate(self, step: GaussNewtonStep) -> float:
         """Rate at which the cost falls along a step."""
         return -float(np.sum(self.node_gradient * step.nodes) + self.gradient @ step.parameters)
 
     def _solve_nodes(self, right: Array, damping: float) -> Array:
-        factor = cholesky_banded(self._banded(damping), overwrite_ab=True, check_finite=False)
+        factor = cholesky_banded(self._band_storage(damping), overwrite_ab=True, check_finite=False)
         return np.asarray(cho_solve_banded((factor, False), right, check_finite=False))
 
-    def _banded(self, damping: float) -> Array:
+    def _band_storage(self, damping: float) -> Array:
         """Upper banded storage of D for LAPACK's pbtrf."""
         m, n, _ = self.diagonal.shape
         upper = 2 * n - 1
@@ -130,23 +130,23 @@ class Arrow:
             for b in range(n):
                 banded[upper + a - n - b, n + b :: n] = self.coupling[:-1, a, b]
         banded[upper] *= 1 + damping
-        banded[upper] += STATE_FLOOR
+        banded[upper] += STATE_REGULARISATION
         return banded
 
 
-def _solve_scaled(matrix: Array, right: Array) -> Array:
+def _solve_positive_definite(matrix: Array, right: Array) -> Array:
     scaled, scale = _unit_diagonal(matrix)
     factor = cho_factor(scaled, check_finite=False)
     return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
 
 
-def scaled_inverse(matrix: Array) -> Array:
+def positive_definite_inverse(matrix: Array) -> Array:
     """Inverse of a positive definite matrix, whatever the units of its rows."""
     scaled, scale = _unit_diagonal(matrix)
     return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))
 
 
-def indistinct(schur: Array, corner: Array) -> Indices:
+def indistinguishable_parameters(schur: Array, corner: Array) -> Indices:
     """Positions of parameters that only count together: the weakest direction, if it is no more than rounding.
 
     Parameters
@@ -162,15 +162,15 @@ def indistinct(schur: Array, corner: Array) -> Indices:
     if not schur.size:
         return np.arange(0)
     left = np.diag(schur) / np.maximum(np.diag(corner), 1e-300)
-    lost = np.flatnonzero(~(left > ROUNDING))
+    lost = np.flatnonzero(~(left > SCHUR_ROUNDING))
     if lost.size or not np.isfinite(schur).all():
         return lost if lost.size else np.arange(len(schur))
     values, vectors = np.linalg.eigh(_unit_diagonal(schur)[0])
-    if values[0] > max(RANK, ROUNDING / float(left.min())):
+    if values[0] > max(RANK_TOLERANCE, SCHUR_ROUNDING / float(left.min())):
         return np.arange(0)
     weakest = np.abs(vectors[:, 0])
     members = np.flatnonzero(weakest > 0.1 * weakest.max())
-    blame = weakest.round(6) if values[0] <= RANK else 1 / left
+    blame = weakest.round(6) if values[0] <= RANK_TOLERANCE else 1 / left
     return members[np.argsort(blame[members], kind="stable")]
 
 

@@ -4,20 +4,23 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
-from pneuopt.shooting.arrow import ROUNDING, Arrow, Reduced, indistinct, scaled_inverse
-from pneuopt.shooting.segments import Correction, Segments
+from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.shooting.arrow import (
+    SCHUR_ROUNDING,
+    ArrowEquations,
+    ReducedEquations,
+    indistinguishable_parameters,
+    positive_definite_inverse,
+)
+from pneuopt.shooting.segments import IntegrationCorrection, Segments
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.intp]
-FAR = 1e3  # standard deviations of the data, were all else known
+FLAT_PRIOR_WIDTH = 1e3  # standard deviations of the data, were all else known
 
 
 @dataclass(frozen=True, eq=False)
-class Slopes:
+class SegmentLinearisation:
     """Data and gaps at an iterate with their derivatives, before anything says how much a gap weighs.
 
     Attributes
@@ -27,7 +30,7 @@ class Slopes:
         last the residuals themselves.
     squares : ndarray, shape (m, n_outputs)
         Squared data residuals.
-    ends : ndarray, shape (m, n, n + c)
+    end_sensitivities : ndarray, shape (m, n, n + c)
         Sensitivity of each segment's end, in nominal sizes.
     y : ndarray, shape (m, n_samples, n_outputs)
         The outputs, without the correction.
@@ -41,22 +44,22 @@ class Slopes:
 
     grams: Array
     squares: Array
-    ends: Array
+    end_sensitivities: Array
     y: Array
     x_end: Array
     gaps: Array
-    off: Array
+    start_errors: Array
     chain: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Equations:
+class NormalEquations:
     """The problem linearised at an iterate.
 
     Attributes
     ----------
     segments : Segments
-    slopes : Slopes
+    linearisation : Slopes
     arrow : Arrow
         Of data and gaps together.
     chi_square, cost : float
@@ -64,15 +67,15 @@ class Equations:
     """
 
     segments: Segments
-    slopes: Slopes
-    arrow: Arrow
+    linearisation: SegmentLinearisation
+    arrow: ArrowEquations
     chi_square: float
     cost: float
 
     @property
     def gaps(self) -> Array:
         """Gap behind each segment in nominal sizes; zero where nothing follows."""
-        return self.slopes.gaps
+        return self.linearisation.gaps
 
     @property
     def largest_gap(self) -> float:
@@ -92,12 +95,12 @@ class Equations:
     @property
     def misfit(self) -> Array:
         """Root mean square of each output's residuals, in noise standard deviations; 0 where nothing was measured."""
-        return np.asarray(np.sqrt(self.slopes.squares.sum(axis=0) / np.maximum(self.segments.counts, 1)))
+        return np.asarray(np.sqrt(self.linearisation.squares.sum(axis=0) / np.maximum(self.segments.counts, 1)))
 
-    def undetermined(self, reduced: Reduced, keep: Mask) -> Indices:
+    def unidentifiable_parameters(self, reduced: ReducedEquations, keep: Mask) -> Indices:
         """Positions, among the kept parameters, of those that the data do not tell apart; empty if they do."""
         square = np.ix_(keep, keep)
-        return indistinct(reduced.schur[square], self.arrow.corner[square])
+        return indistinguishable_parameters(reduced.schur[square], self.arrow.corner[square])
 
     def covariance(self, keep: Mask, *, noisy_gaps: bool = False) -> Array | None:
         """Covariance of the parameters (own units, unit noise): the sandwich over true data noise only.
@@ -107,15 +110,15 @@ class Equations:
         determine the kept ones.
         """
         reduced = self.arrow.eliminate(0.0)
-        if reduced is None or self.undetermined(reduced, keep).size:
+        if reduced is None or self.unidentifiable_parameters(reduced, keep).size:
             return None
-        bread = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
+        bread = positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])
         out = np.full((len(keep), len(keep)), np.nan)
-        spread = bread if noisy_gaps else bread @ self._meat(reduced)[np.ix_(keep, keep)] @ bread
+        spread = bread if noisy_gaps else bread @ self._sandwich_meat(reduced)[np.ix_(keep, keep)] @ bread
         out[np.ix_(keep, keep)] = spread
-        return np.asarray(out * np.outer(self.slopes.chain, self.slopes.chain))
+        return np.asarray(out * np.outer(self.linearisation.chain, self.linearisation.chain))
 
-    def borrowed(self, keep: Mask, held: Mask, prior: Array) -> Array | None:
+    def prior_covariance(self, keep: Mask, held: Mask, prior: Array) -> Array | None:
         """Covariance (own units) that the kept parameters take over from a prior of the held ones.
 
         Parameters
@@ -130,25 +133,25 @@ class Equations:
             None where the data do not determine the kept ones.
         """
         reduced = self.arrow.eliminate(0.0)
-        if reduced is None or self.undetermined(reduced, keep).size:
+        if reduced is None or self.unidentifiable_parameters(reduced, keep).size:
             return None
         out = np.zeros((len(keep), len(keep)))
-        left = np.maximum(np.diag(reduced.schur), ROUNDING * np.diag(self.arrow.corner))
+        left = np.maximum(np.diag(reduced.schur), SCHUR_ROUNDING * np.diag(self.arrow.corner))
         alone = 1 / np.sqrt(np.maximum(left[held], 1e-300))
-        spread = np.where(np.isfinite(prior[held]), prior[held], FAR * alone)
-        bread = scaled_inverse(reduced.schur[np.ix_(keep, keep)])
-        moved = self.slopes.chain[keep, None] * (bread @ reduced.schur[np.ix_(keep, held)]) * spread
+        spread = np.where(np.isfinite(prior[held]), prior[held], FLAT_PRIOR_WIDTH * alone)
+        bread = positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])
+        moved = self.linearisation.chain[keep, None] * (bread @ reduced.schur[np.ix_(keep, held)]) * spread
         out[np.ix_(keep, keep)] = moved @ moved.T
         return out
 
-    def _meat(self, reduced: Reduced) -> Array:
+    def _sandwich_meat(self, reduced: ReducedEquations) -> Array:
         """The data's own Gram matrix of the parameters, with the nodes following them. Shape (k, k)."""
         n, meat = self.gaps.shape[1], np.zeros_like(reduced.schur)
         for rows, columns, unknowns in self.segments.blocks:
-            E = np.zeros((rows.stop - rows.start, self.slopes.ends.shape[2], len(meat)))
-            E[:, :n] = -reduced.eliminated[rows]
-            E[:, n + columns, unknowns] = self.slopes.chain[unknowns]
-            meat += np.tensordot(E, self.slopes.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
+            E = np.zeros((rows.stop - rows.start, self.linearisation.end_sensitivities.shape[2], len(meat)))
+            E[:, :n] = -reduced.node_sensitivity[rows]
+            E[:, n + columns, unknowns] = self.linearisation.chain[unknowns]
+            meat += np.tensordot(E, self.linearisation.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
         return meat
 
 
@@ -159,8 +162,8 @@ def normal_equations(
     chain: Array,
     sigma: Array,
     substeps: int,
-    correction: Correction | None = None,
-) -> Equations:
+    correction: IntegrationCorrection | None = None,
+) -> NormalEquations:
     """Run all segments with sensitivities and assemble data and gap residuals.
 
     Parameters
@@ -181,29 +184,31 @@ def normal_equations(
     scale = np.concatenate([segments.nominal, np.ones(run.grams.shape[1] - nodes.shape[1])])
     ends = run.dx_end * (scale[:-1] / segments.nominal[:, None])
     off = np.where(np.isfinite(segments.fixed_start), nodes - segments.fixed_start, 0.0) / segments.nominal
-    gaps = gaps_of(segments, nodes, run.x_end if correction is None else run.x_end + correction.x_end)
-    slopes = Slopes(run.grams * np.outer(scale, scale), run.squares, ends, run.y, run.x_end, gaps, off, chain)
-    return weighed(segments, slopes, sigma)
+    gaps = segment_gaps(segments, nodes, run.x_end if correction is None else run.x_end + correction.x_end)
+    slopes = SegmentLinearisation(
+        run.grams * np.outer(scale, scale), run.squares, ends, run.y, run.x_end, gaps, off, chain
+    )
+    return weigh_gaps(segments, slopes, sigma)
 
 
-def weighed(segments: Segments, slopes: Slopes, sigma: Array) -> Equations:
+def weigh_gaps(segments: Segments, slopes: SegmentLinearisation, sigma: Array) -> NormalEquations:
     """The normal equations with gaps of standard deviation `sigma`, shape (n,), in nominal sizes."""
     chi_square = float(np.sum(slopes.squares))
     with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
-        squares = chi_square + float(np.sum((slopes.gaps / sigma) ** 2) + np.sum((slopes.off / sigma) ** 2))
-        arrow = _assembled(segments, slopes, 1 / sigma)
+        squares = chi_square + float(np.sum((slopes.gaps / sigma) ** 2) + np.sum((slopes.start_errors / sigma) ** 2))
+        arrow = _assemble(segments, slopes, 1 / sigma)
     finite = math.isfinite(squares) and bool(np.isfinite(slopes.grams).all())
-    return Equations(segments, slopes, arrow, chi_square, 0.5 * squares if finite else math.inf)
+    return NormalEquations(segments, slopes, arrow, chi_square, 0.5 * squares if finite else math.inf)
 
 
-def gaps_of(segments: Segments, nodes: Array, x_end: Array) -> Array:
+def segment_gaps(segments: Segments, nodes: Array, x_end: Array) -> Array:
     """Gap behind each segment in nominal sizes, shape (m, n); zero where nothing follows."""
     gaps = np.zeros_like(nodes)
     gaps[:-1] = np.where(segments.linked[:-1, None], (x_end[:-1] - nodes[1:]) / segments.nominal, 0.0)
     return gaps
 
 
-def reconnected(equations: Equations, step: Array, moved: Array, nodes: Array, gaps: Array) -> Array:
+def second_order_correction(equations: NormalEquations, step: Array, moved: Array, nodes: Array, gaps: Array) -> Array:
     """Second-order correction of a step: shift the nodes so that the gaps become what the linear model promised.
 
     Parameters
@@ -218,19 +223,19 @@ def reconnected(equations: Equations, step: Array, moved: Array, nodes: Array, g
     -------
     ndarray, shape (m, n)
     """
-    segments, slopes, n = equations.segments, equations.slopes, nodes.shape[1]
-    change = np.zeros(slopes.ends.shape[::2])
+    segments, slopes, n = equations.segments, equations.linearisation, nodes.shape[1]
+    change = np.zeros(slopes.end_sensitivities.shape[::2])
     change[:, :n] = step
     for rows, columns, unknowns in segments.blocks:
         change[rows, n + columns] = (slopes.chain * moved)[unknowns]
-    promised = slopes.gaps + (slopes.ends @ change[..., None])[..., 0]
+    promised = slopes.gaps + (slopes.end_sensitivities @ change[..., None])[..., 0]
     promised[:-1] -= step[1:]
     excess = np.where(segments.linked[:, None], gaps - promised, 0.0)
-    shift = _carried(np.where(segments.linked[:, None, None], slopes.ends[:, :, :n], 0.0), excess)
+    shift = _propagate_shifts(np.where(segments.linked[:, None, None], slopes.end_sensitivities[:, :, :n], 0.0), excess)
     return np.asarray(nodes + shift * segments.nominal)
 
 
-def unexplained(equations: Equations, level: float, *, jumps: bool) -> str:
+def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: bool) -> str:
     """In words, what the model leaves beyond `level` (squared residuals, in noise variances); empty if nothing.
 
     With `jumps` the gaps stand for noise of the states.
@@ -238,7 +243,7 @@ def unexplained(equations: Equations, level: float, *, jumps: bool) -> str:
     segments = equations.segments
     lead = "; the model does not explain the log to its noise: "
     tail = ", and the intervals count that as noise: they do not hold the bias of a wrong model"
-    if jumps:
+    if noisy_gaps:
         sizes = np.sqrt(np.mean(equations.gaps[segments.linked] ** 2, axis=0))
         state = segments.system.states[int(np.argmax(sizes))]
         size = f"{np.max(sizes) * state.nominal:.2g} {state.unit}"
@@ -251,7 +256,7 @@ def unexplained(equations: Equations, level: float, *, jumps: bool) -> str:
     return f"{lead}residuals are {misfit[worst]:.2g} times the noise of {output}{tail}"
 
 
-def _carried(own: Array, excess: Array) -> Array:
+def _propagate_shifts(own: Array, excess: Array) -> Array:
     """Shifts s of the nodes with s[0] = 0 and s[i + 1] = own[i] s[i] + excess[i], as one banded triangle."""
     m, n, _ = own.shape
     band = np.zeros((2 * n, m * n))
@@ -262,10 +267,10 @@ def _carried(own: Array, excess: Array) -> Array:
     return np.asarray(dtbtrs(band, right[:, None], uplo="L", diag="U")[0]).reshape(m, n)
 
 
-def _assembled(segments: Segments, slopes: Slopes, weight: Array) -> Arrow:
+def _assemble(segments: Segments, slopes: SegmentLinearisation, weight: Array) -> ArrowEquations:
     """Data, the gaps between linked segments, and the distances from known starts, as one arrow."""
     (m, n), k = slopes.gaps.shape, len(slopes.chain)
-    W = np.concatenate([slopes.ends, slopes.gaps[..., None]], axis=2)
+    W = np.concatenate([slopes.end_sensitivities, slopes.gaps[..., None]], axis=2)
     W *= np.tile(weight[:, None], W.shape[2])
     W[~segments.linked] = 0.0
     G = slopes.grams + np.swapaxes(W, 1, 2) @ W
@@ -274,7 +279,7 @@ def _assembled(segments: Segments, slopes: Slopes, weight: Array) -> Arrow:
     is_next = np.append(False, segments.linked[:-1])[:, None]
     diagonal[:, range(n), range(n)] += (is_next + 1.0 * np.isfinite(segments.fixed_start)) * weight**2
     node_gradient[1:] -= weight * W[:-1, :, -1]
-    node_gradient += slopes.off * weight**2
+    node_gradient += slopes.start_errors * weight**2
     between = G[:, :n, n:-1]
     between[1:] -= weight[:, None] * W[:-1, :, n:-1]
     border, corner, gradient = np.zeros((m, n, k)), np.zeros((k, k)), np.zeros(k)
@@ -284,4 +289,4 @@ def _assembled(segments: Segments, slopes: Slopes, weight: Array) -> Arrow:
         total = G[rows].sum(axis=0)
         corner[np.ix_(unknowns, unknowns)] += total[np.ix_(own, own)] * np.outer(chain, chain)
         gradient[unknowns] += total[own, -1] * chain
-    return Arrow(diagonal, coupling, border, corner, node_gradient, gradient)
+    return ArrowEquations(diagonal, coupling, border, corner, node_gradient, gradient)

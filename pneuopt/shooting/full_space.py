@@ -1,6 +1,7 @@
 """Full-space multiple shooting with IPOPT: every node's state is an unknown, derivatives are exact. The reference path.
 
-`prepare` makes the graph and its derivatives once; `solve_from` solves it from any start, `follow` along a path.
+`prepare_full_space` makes the graph and its derivatives once; `solve_from` solves it from any start, `follow_path`
+along a path.
 """
 
 import math
@@ -11,21 +12,32 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import names
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.graph import Graph, Rows, flatten, node_guesses, scale, to_unknowns, to_values, variable_bounds
-from pneuopt.shooting.solution import Code, Solution, Status
+from pneuopt.shooting.graph import (
+    ConstraintRows,
+    Graph,
+    flatten,
+    node_guesses,
+    parameter_scale,
+    to_unknowns,
+    to_values,
+    variable_bounds,
+)
+from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Transcription
 
-Array = NDArray[np.float64]
-EXPANDED = 200_000  # scalar operations up to which flattening the whole graph to scalars pays
-NEAR = 1e-5  # barrier and distances from bounds with which a solution's neighbour is begun: 9 iterations where 18 were
-FARTHEST = 1.5  # of a path's last step, how far its direction is trusted
-_PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
+MAX_EXPANDED_OPERATIONS = 200_000  # scalar operations up to which flattening the whole graph to scalars pays
+WARM_START_BARRIER = (
+    1e-5  # barrier and distances from bounds with which a solution's neighbour is begun: 9 iterations where 18 were
+)
+MAX_EXTRAPOLATION = 1.5  # of a path's last step, how far its direction is trusted
+_PUSH_OPTIONS = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 
 
 @dataclass(frozen=True)
@@ -59,12 +71,12 @@ class FullSpace:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class FullSpaceProblem:
     """A graph and the solver made from it; another that starts from a neighbour's solution, where it was asked for."""
 
     graph: Graph
     solver: ca.Function
-    warm: ca.Function | None = None
+    warm_solver: ca.Function | None = None
 
 
 def solve_full_space(transcription: Transcription, method: FullSpace | None = None) -> Solution:
@@ -82,19 +94,21 @@ def solve_full_space(transcription: Transcription, method: FullSpace | None = No
     Solution
         Its status says in words whether it converged; where not, it names the limit, the state or the equation.
     """
-    return solve_from(prepare(transcription, method), transcription.parameters)
+    return solve_from(prepare_full_space(transcription, method), transcription.parameters)
 
 
-def prepare(transcription: Transcription, method: FullSpace | None = None, *, follows: bool = False) -> Problem:
-    """Flatten a problem and differentiate it, once for any number of starts; `follows`: for `follow`, too."""
+def prepare_full_space(
+    transcription: Transcription, method: FullSpace | None = None, *, warm_start: bool = False
+) -> FullSpaceProblem:
+    """Flatten a problem and differentiate it, once for any number of starts; `follows`: for `follow_path`, too."""
     graph, method = flatten(transcription), method or FullSpace()
-    cold = _solver(graph, method, {"mu_init": method.first_barrier})
-    pushes = {f"warm_start_{n}": NEAR for n in _PUSHES}
-    near = {"mu_init": NEAR, "warm_start_init_point": "yes", **pushes}
-    return Problem(graph, cold, _solver(graph, method, near) if follows else None)
+    cold = _ipopt_solver(graph, method, {"mu_init": method.first_barrier})
+    pushes = {f"warm_start_{n}": WARM_START_BARRIER for n in _PUSH_OPTIONS}
+    near = {"mu_init": WARM_START_BARRIER, "warm_start_init_point": "yes", **pushes}
+    return FullSpaceProblem(graph, cold, _ipopt_solver(graph, method, near) if warm_start else None)
 
 
-def _solver(graph: Graph, method: FullSpace, own: Mapping[str, Any]) -> ca.Function:
+def _ipopt_solver(graph: Graph, method: FullSpace, own: Mapping[str, Any]) -> ca.Function:
     ipopt = {
         "print_level": 5 if method.verbose else 0,
         "sb": "yes",
@@ -104,17 +118,17 @@ def _solver(graph: Graph, method: FullSpace, own: Mapping[str, Any]) -> ca.Funct
         "max_wall_time": method.max_seconds,
         **own,
     }
-    nlp: Any = {"x": graph.w, "p": graph.q, "f": ca.sum1(graph.parts), "g": graph.g}
+    nlp: Any = {"x": graph.w, "p": graph.q, "f": ca.sum1(graph.terms), "g": graph.g}
     options: Any = {
         "print_time": False,
         "show_eval_warnings": False,
-        "expand": _operations(graph.transcription) <= EXPANDED,
+        "expand": _operation_count(graph.transcription) <= MAX_EXPANDED_OPERATIONS,
         "ipopt": ipopt,
     }
     return ca.nlpsol("full_space", "ipopt", nlp, options)
 
 
-def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | None] = ()) -> Solution:
+def solve_from(problem: FullSpaceProblem, start: ParameterSet, guesses: Sequence[Array | None] = ()) -> Solution:
     """Solve a prepared problem from the given parameters.
 
     Parameters
@@ -138,10 +152,10 @@ def solve_from(problem: Problem, start: ParameterSet, guesses: Sequence[Array | 
     fault = _find_nan(problem, w, q)
     if fault:
         return _solution(problem, w, q, Status(Code.DIVERGED, f"at the start {fault}; start elsewhere"), {}, {})
-    return _solved(problem, w, q)[0]
+    return _run_solver(problem, w, q)[0]
 
 
-def follow(problem: Problem, start: ParameterSet, path: Sequence[Mapping[str, float]]) -> list[Solution]:
+def follow_path(problem: FullSpaceProblem, start: ParameterSet, path: Sequence[Mapping[str, float]]) -> list[Solution]:
     """Solve along a path of fixed parameters, each problem from its neighbours' solutions, carried on along the path.
 
     Parameters
@@ -158,40 +172,41 @@ def follow(problem: Problem, start: ParameterSet, path: Sequence[Mapping[str, fl
     list of Solution
         One a step; a step that fails starts the next one from the last that did not.
     """
-    if problem.warm is None:
+    if problem.warm_solver is None:
         raise ModelError("the problem was not prepared to be followed: prepare(..., follows=True)")
-    transcription, warm = problem.graph.transcription, replace(problem, solver=problem.warm)
+    transcription, warm = problem.graph.transcription, replace(problem, solver=problem.warm_solver)
     (low, up), found, done = variable_bounds(transcription), list[Solution](), list[tuple[Array, dict[str, Array]]]()
     for step in path:
         q = np.array([p.value for p in start.with_values(step).values()])
         if not done:
             w = np.clip(np.concatenate([to_unknowns(transcription, q), *node_guesses(transcription, q, ())]), low, up)
-            solution, raw = _solved(problem, w, q)
+            solution, raw = _run_solver(problem, w, q)
         else:
             last = done[-1][1]
-            w = np.clip(_ahead(done[-2:], q), low, up)
-            solution, raw = _solved(warm, w, q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
+            w = np.clip(_extrapolate(done[-2:], q), low, up)
+            solution, raw = _run_solver(warm, w, q, {"lam_x0": last["lam_x"], "lam_g0": last["lam_g"]})
         done += [(q, raw)] if solution.status.converged else []
         found.append(solution)
     return found
 
 
-def _ahead(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) -> Array:
+def _extrapolate(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) -> Array:
     """The unknowns at q from up to two solutions: the last one, carried on as far as q is along their difference."""
     (before, x), (last, y) = ((known, raw["x"]) for known, raw in (done[0], done[-1]))
     step = last - before
     length = float(step @ step)
-    share = min(max(float(step @ (q - last)) / length, 0.0), FARTHEST) if length else 0.0
+    share = min(max(float(step @ (q - last)) / length, 0.0), MAX_EXTRAPOLATION) if length else 0.0
     return np.asarray(y + share * (y - x))
 
 
-def _solved(
-    problem: Problem, w: Array, q: Array, multipliers: Mapping[str, Array] | None = None
+def _run_solver(
+    problem: FullSpaceProblem, w: Array, q: Array, multipliers: Mapping[str, Array] | None = None
 ) -> tuple[Solution, dict[str, Array]]:
     """The solution, and what the solver returned."""
     begun, (low, up) = time.perf_counter(), variable_bounds(problem.graph.transcription)
     low_g, up_g = (
-        np.concatenate([np.zeros(0), *(getattr(r, s) for r in problem.graph.table)]) for s in ("lower", "upper")
+        np.concatenate([np.zeros(0), *(getattr(r, s) for r in problem.graph.constraint_rows)])
+        for s in ("lower", "upper")
     )
     raw = problem.solver(x0=w, p=q, lbx=low, ubx=up, lbg=low_g, ubg=up_g, **(multipliers or {}))
     found = {k: np.array(v).ravel() for k, v in raw.items()}
@@ -200,14 +215,14 @@ def _solved(
         "iterations": float(stats.get("iter_count", 0)),
         "seconds": time.perf_counter() - begun,
         "cost": float(found["f"][0]),
-        "largest_gap": _violation(problem, found["g"], continuity=True),
-        "largest_violation": _violation(problem, found["g"], continuity=False),
+        "largest_gap": _largest_violation(problem, found["g"], continuity=True),
+        "largest_violation": _largest_violation(problem, found["g"], continuity=False),
     }
-    status = _status(problem, str(stats["return_status"]), found, q, figures)
+    status = _solver_status(problem, str(stats["return_status"]), found, q, figures)
     return _solution(problem, found["x"], q, status, figures, _multipliers(problem, found, low, up)), found
 
 
-def _operations(transcription: Transcription) -> int:
+def _operation_count(transcription: Transcription) -> int:
     """About how many scalar operations one evaluation takes."""
     samples = sum(phase.n for phase in transcription.phases)
     return int(samples * transcription.system.substeps * transcription.system.step.n_instructions())
@@ -216,8 +231,10 @@ def _operations(transcription: Transcription) -> int:
 # What the solver found, in words.
 
 
-def _status(problem: Problem, ended: str, found: Mapping[str, Array], q: Array, figures: Mapping[str, float]) -> Status:
-    worst = _worst(problem, found["g"])
+def _solver_status(
+    problem: FullSpaceProblem, ended: str, found: Mapping[str, Array], q: Array, figures: Mapping[str, float]
+) -> Status:
+    worst = _describe_worst_row(problem, found["g"])
     taken = f"after {figures['iterations']:.0f} iterations and {figures['seconds']:.2f} s"
     if ended == "Solve_Succeeded" and bool(np.all(np.isfinite(found["x"]))):
         return Status(Code.CONVERGED, f"{taken}, largest gap {figures['largest_gap']:.1e} of the states' nominal size")
@@ -233,64 +250,69 @@ def _status(problem: Problem, ended: str, found: Mapping[str, Array], q: Array, 
     return Status(Code.NOT_CONVERGED, f"IPOPT says {ended} {taken}, {worst}; rescale or start elsewhere")
 
 
-def _excess(rows: Rows, g: Array) -> Array:
+def _row_violation(rows: ConstraintRows, g: Array) -> Array:
     values = g[rows.rows]
     return np.maximum(np.maximum(rows.lower - values, values - rows.upper), 0.0)
 
 
-def _violation(problem: Problem, g: Array, continuity: bool) -> float:
-    pieces = [float(np.max(_excess(r, g), initial=0.0)) for r in problem.graph.table if r.continuity is continuity]
+def _largest_violation(problem: FullSpaceProblem, g: Array, continuity: bool) -> float:
+    pieces = [
+        float(np.max(_row_violation(r, g), initial=0.0))
+        for r in problem.graph.constraint_rows
+        if r.continuity is continuity
+    ]
     return max(pieces, default=0.0)
 
 
-def _worst(problem: Problem, g: Array) -> str:
+def _describe_worst_row(problem: FullSpaceProblem, g: Array) -> str:
     """The piece that is violated most, relative to the size of its bound."""
-    table = [r for r in problem.graph.table if r.rows.stop > r.rows.start]
+    table = [r for r in problem.graph.constraint_rows if r.rows.stop > r.rows.start]
     if not table:
         return "there are no limits"
-    relative = [float(np.max(_excess(r, g) / _size(r))) for r in table]
+    relative = [float(np.max(_row_violation(r, g) / _limit_size(r))) for r in table]
     rows = table[int(np.argmax(relative))]
     if max(relative) < 1e-6:
         return "no limit is violated"
-    k = int(np.argmax(_excess(rows, g)))
-    return f"worst is {_title(problem, rows, k)}: {g[rows.rows][k]:.6g}, allowed {_range(rows.lower[k], rows.upper[k])}"
+    k = int(np.argmax(_row_violation(rows, g)))
+    allowed = _format_range(rows.lower[k], rows.upper[k])
+    return f"worst is {_row_title(problem, rows, k)}: {g[rows.rows][k]:.6g}, allowed {allowed}"
 
 
-def _size(rows: Rows) -> Array:
+def _limit_size(rows: ConstraintRows) -> Array:
     finite = [np.where(np.isfinite(side), np.abs(side), 0.0) for side in (rows.lower, rows.upper)]
     return np.maximum(*finite) + 1e-3
 
 
-def _range(lower: float, upper: float) -> str:
+def _format_range(lower: float, upper: float) -> str:
     return f"{lower:.6g}" if lower == upper else f"{lower:.6g} to {upper:.6g}"
 
 
-def _title(problem: Problem, rows: Rows, k: int) -> str:
+def _row_title(problem: FullSpaceProblem, rows: ConstraintRows, k: int) -> str:
     if not rows.continuity:
         return f"limit {rows.name!r}" + (f" in phase {rows.phase!r}" if rows.phase else "")
     states = problem.graph.transcription.system.states
     return f"the continuity of state {states[k % len(states)].name!r} in phase {rows.phase!r}"
 
 
-def _find_nan(problem: Problem, w: Array, q: Array) -> str:
+def _find_nan(problem: FullSpaceProblem, w: Array, q: Array) -> str:
     """Name the equation that is not a number; empty if all are finite."""
     f, g = (np.array(v).ravel() for v in problem.graph.evaluate(w, q))
-    for name, value in zip(problem.graph.costs, f, strict=False):
+    for name, value in zip(problem.graph.term_names, f, strict=False):
         if not math.isfinite(value):
             return f"{name} is {value}"
     jacobian = np.array(problem.solver.get_function("nlp_jac_g")(w, q)[1])
-    for rows in problem.graph.table:
+    for rows in problem.graph.constraint_rows:
         bad = ~np.isfinite(g[rows.rows]) | ~np.isfinite(jacobian[rows.rows]).all(axis=1)
         if bad.any():
-            return f"{_title(problem, rows, int(np.argmax(bad)))} or its derivative is not a number"
+            return f"{_row_title(problem, rows, int(np.argmax(bad)))} or its derivative is not a number"
     return ""
 
 
-def _multipliers(problem: Problem, found: Mapping[str, Array], low: Array, up: Array) -> dict[str, float]:
+def _multipliers(problem: FullSpaceProblem, found: Mapping[str, Array], low: Array, up: Array) -> dict[str, float]:
     """Of what is active: its multiplier exceeds its slack."""
     transcription, active = problem.graph.transcription, dict[str, float]()
 
-    def note(name: str, multiplier: Array, slack: Array, unit: float = 1.0) -> None:
+    def keep_active(name: str, multiplier: Array, slack: Array, unit: float = 1.0) -> None:
         held = np.abs(multiplier) > np.maximum(slack, 1e-8)
         if held.any():
             active[name] = max(active.get(name, 0.0), float(np.max(np.abs(multiplier[held]))) / unit)
@@ -299,20 +321,25 @@ def _multipliers(problem: Problem, found: Mapping[str, Array], low: Array, up: A
     values = to_values(transcription, found["x"])
     for k, (name, value) in enumerate(values.items()):
         parameter = transcription.parameters[name]
-        note(name, multiplier[[k]], slack[[k]], value if parameter.log else scale(parameter))
+        keep_active(name, multiplier[[k]], slack[[k]], value if parameter.log else parameter_scale(parameter))
     n_states = len(transcription.system.states)
     for j, state in enumerate(transcription.system.states):
         nodes = slice(len(values) + j, None, n_states)
-        note(state.name, multiplier[nodes], slack[nodes], state.nominal)
-    for rows in problem.graph.table:
+        keep_active(state.name, multiplier[nodes], slack[nodes], state.nominal)
+    for rows in problem.graph.constraint_rows:
         if not rows.continuity:
             room = np.minimum(found["g"][rows.rows] - rows.lower, rows.upper - found["g"][rows.rows])
-            note(rows.name, found["lam_g"][rows.rows], room)
+            keep_active(rows.name, found["lam_g"][rows.rows], room)
     return active
 
 
 def _solution(
-    problem: Problem, w: Array, q: Array, status: Status, figures: Mapping[str, float], multipliers: Mapping[str, float]
+    problem: FullSpaceProblem,
+    w: Array,
+    q: Array,
+    status: Status,
+    figures: Mapping[str, float],
+    multipliers: Mapping[str, float],
 ) -> Solution:
     transcription = problem.graph.transcription
     columns = (*names(transcription.system.states), *names(transcription.system.outputs))

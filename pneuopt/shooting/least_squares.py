@@ -6,37 +6,34 @@ record's length. The gaps are tightened in stages, so that a bad start is never 
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.dynamics.compiled.rollout import Run
-from pneuopt.shooting.arrow import Reduced, Step
-from pneuopt.shooting.convergence import MOST_GAP_SHARE, NOISE_LEVEL, Judgement, judged
-from pneuopt.shooting.equations import Equations, normal_equations, reconnected, weighed
-from pneuopt.shooting.scaling import Space
-from pneuopt.shooting.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
-from pneuopt.shooting.solution import Code, Solution, Status
+from pneuopt.dynamics.compiled.rollout import RolloutResult
+from pneuopt.quantities.arrays import Array, Mask
+from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, ConvergenceTest, assess_convergence
+from pneuopt.shooting.equations import NormalEquations, normal_equations, second_order_correction, weigh_gaps
+from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, segment, stable_substeps, start_nodes
+from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Transcription
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Progress = Callable[[str], None]
-FIRST_DAMPING = 1e-3  # with loose gaps
-LEAST_GAIN = 0.5  # of the promised decrease, below which a step is corrected
-ENOUGH = 1e-3  # a stage ends where the promised decrease is this part of the cost
-STILL = 5e-7  # likewise the last, in noise variances: half of (0.1 % of a standard deviation)^2
-LEAST_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
-REFINEMENTS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
-STABLE = 2.0  # h |lambda| of a search's steps; RK4 is stable below 2.78
-CRAWLING = 2e-3  # of the cost an iteration, below which a search that goes on gets nowhere
-TORN = Status(Code.NOT_CONVERGED, "the gaps between segments take up what the model cannot")
-MOVED = 0.03  # a parameter's relative change that has the stiffness judged anew
-STIFFEST = 200  # integration steps a sample beyond which a search would take hours
-MOST_REFINED = 8  # how far a stage may refine the start's integration steps
+INITIAL_DAMPING = 1e-3  # with loose gaps
+MIN_GAIN_RATIO = 0.5  # of the promised decrease, below which a step is corrected
+STAGE_COST_TOLERANCE = 1e-3  # a stage ends where the promised decrease is this part of the cost
+FINAL_COST_TOLERANCE = 5e-7  # likewise the last, in noise variances: half of (0.1 % of a standard deviation)^2
+MIN_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
+MAX_STEP_HALVINGS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
+RK4_MAX_H_LAMBDA = 2.0  # h |lambda| of a search's steps; RK4 is stable below 2.78
+STALL_COST_DECREASE = 2e-3  # of the cost an iteration, below which a search that goes on gets nowhere
+GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, "the gaps between segments take up what the model cannot")
+STIFFNESS_UPDATE_CHANGE = 0.03  # a parameter's relative change that has the stiffness judged anew
+MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample beyond which a search would take hours
+MAX_STAGE_REFINEMENT = 8  # how far a stage may refine the start's integration steps
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ class LeastSquares:
     substeps: int | None = None
     tolerance: float = 0.1
     kinematic: float = 0.01
-    progress: Progress | None = field(default=None, repr=False, compare=False)
+    progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +108,9 @@ class Fit:
         Without those that were held, by equal bounds.
     jumps : ndarray, shape (m, n_states), or None
         Where the gaps had to stand for noise of the states: the gap behind each linked segment, in nominal sizes.
-    silent : tuple of str
+    unidentifiable : tuple of str
         The parameters that the data do not tell here; hold them, and ask again.
-    borrowed : ndarray, shape (k, k), or None
+    prior_covariance : ndarray, shape (k, k), or None
         What a weak prior of those held adds to the covariance (`Equations.borrowed`); None where nothing is held.
     """
 
@@ -123,8 +120,8 @@ class Fit:
     count: int
     at_bound: Mask
     jumps: Array | None = None
-    silent: tuple[str, ...] = ()
-    borrowed: Array | None = None
+    unidentifiable: tuple[str, ...] = ()
+    prior_covariance: Array | None = None
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
@@ -141,7 +138,7 @@ def solve_least_squares(transcription: Transcription, method: LeastSquares | Non
     Fit
         Whatever its status; an interruption (Ctrl-C) returns the best iterate so far, marked.
     """
-    return _Search(segment(transcription), method or LeastSquares()).solve()
+    return _LevenbergMarquardt(segment(transcription), method or LeastSquares()).solve()
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,14 +147,14 @@ class _Iterate:
 
     nodes: Array
     z: Array
-    equations: Equations
+    equations: NormalEquations
 
     @property
     def cost(self) -> float:
         return self.equations.cost
 
 
-class _End(NamedTuple):
+class _StageEnd(NamedTuple):
     """Where a stage ended."""
 
     nodes: Array
@@ -165,22 +162,24 @@ class _End(NamedTuple):
     cost: float
 
 
-class _Search:
+class _LevenbergMarquardt:
     """Levenberg-Marquardt on the nodes and the free parameters of one transcription."""
 
     def __init__(self, segments: Segments, method: LeastSquares) -> None:
         self.segments, self.method = segments, method
-        self.space = Space(segments.transcription)
-        self.tightness = tightness(segments, method.kinematic)
+        self.scaling = ParameterScaling(segments.transcription)
+        self.gap_scales = gap_scales(segments, method.kinematic)
         self.iterations, self.stage = 0, method.stages[0]
-        self.correction: Correction | None
-        self.is_loose, self.is_resting, self.ends = False, False, list[_End]()
+        self.correction: IntegrationCorrection | None
+        self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[_StageEnd]()
         nodes = start_nodes(segments)
-        self.judged = self.space.values(self.space.start)
-        self.needed = method.substeps or substeps_for(segments, nodes, self.judged, STABLE)
-        self.substeps = self.coarsest = method.substeps or min(self.needed, STIFFEST)
-        self.finest, self.correction, self.change = self.substeps, None, math.nan
-        self.current = self._evaluate(nodes, self.space.start)
+        self.stiffness_parameters = self.scaling.values(self.scaling.start)
+        self.required_substeps = method.substeps or stable_substeps(
+            segments, nodes, self.stiffness_parameters, RK4_MAX_H_LAMBDA
+        )
+        self.substeps = self.min_substeps = method.substeps or min(self.required_substeps, MAX_SEARCH_SUBSTEPS)
+        self.output_substeps, self.correction, self.integration_change = self.substeps, None, math.nan
+        self.current = self._evaluate(nodes, self.scaling.start)
 
     def solve(self) -> Fit:
         began = time.perf_counter()
@@ -191,105 +190,110 @@ class _Search:
         return self._fit(status, time.perf_counter() - began)
 
     def _run_stages(self) -> Status:
-        if self.needed > self.coarsest:
-            told = f"the model is so stiff that a sample takes {self.needed} integration steps; smooth its "
+        if self.required_substeps > self.min_substeps:
+            message = (
+                f"the model is so stiff that a sample takes {self.required_substeps} integration steps; smooth its "
+            )
             remedy = "sharpest term (friction.smoothing to 1e-4 m/s), or give LeastSquares(substeps=)"
-            return Status(Code.NOT_CONVERGED, told + remedy)
+            return Status(Code.NOT_CONVERGED, message + remedy)
         last, allowed = self.method.stages[-1], None
         for stage in self.method.stages:
-            if stage is last and self._is_stuck():
-                allowed = self._loosened()
+            if stage is last and self._gaps_absorb_misfit():
+                allowed = self._allow_state_noise()
                 if allowed.converged:
-                    return self._refine(allowed)
-            self._enter(stage, self.current.nodes, self.current.z)
+                    return self._refine_steps(allowed)
+            self._enter_stage(stage, self.current.nodes, self.current.z)
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, "the model is not finite at the start; check values and units")
-            self.is_resting = self._run_stage()
-            self.ends.append(_End(self.current.nodes, self.current.z, self.current.cost))
-        status = self._judge(self.current)
+            self.has_stalled = self._run_stage()
+            self.stage_ends.append(_StageEnd(self.current.nodes, self.current.z, self.current.cost))
+        status = self._convergence_status(self.current)
         # gaps that take up what the model cannot: the answer hangs on their weight
-        is_torn = self.current.equations.gap_share > MOST_GAP_SHARE and allowed is None
-        return self._refine(self._loosened(status) if is_torn else status)
+        is_torn = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
+        return self._refine_steps(self._allow_state_noise(status) if is_torn else status)
 
-    def _is_stuck(self) -> bool:
+    def _gaps_absorb_misfit(self) -> bool:
         """Whether the gaps take up what the model cannot, in an optimum beyond the noise: tighter ones cost more."""
-        torn, equations = self.current.equations.gap_share > MOST_GAP_SHARE, self.current.equations
-        return self.is_resting and torn and 2 * self.current.cost > NOISE_LEVEL * equations.count
+        torn, equations = self.current.equations.gap_share > MAX_GAP_SHARE, self.current.equations
+        return self.has_stalled and torn and 2 * self.current.cost > MAX_CHI_SQUARE_RATIO * equations.count
 
-    def _loosened(self, status: Status = TORN) -> Status:
+    def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
         """Allow what a wrong model leaves as noise of its states: the tightest gaps with which all residuals agree."""
         last = self.method.stages[-1]
-        for stage, end in reversed(list(zip(self.method.stages[:-1], self.ends, strict=False))):
-            if 2 * end.cost <= NOISE_LEVEL * self.current.equations.count:
-                tight = self.stage, self.current, self.correction, self.substeps, self.finest
-                self.is_loose = True
-                self._enter(replace(stage, iterations=last.iterations, refine=last.refine), end.nodes, end.z)
+        for stage, end in reversed(list(zip(self.method.stages[:-1], self.stage_ends, strict=False))):
+            if 2 * end.cost <= MAX_CHI_SQUARE_RATIO * self.current.equations.count:
+                tight = self.stage, self.current, self.correction, self.substeps, self.output_substeps
+                self.noisy_gaps = True
+                self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), end.nodes, end.z)
                 self._run_stage()
-                found = self._judge(self.current)
+                found = self._convergence_status(self.current)
                 if found.converged:
                     return found
-                self.stage, self.current, self.correction, self.substeps, self.finest = tight
-                self.is_loose = False
+                self.stage, self.current, self.correction, self.substeps, self.output_substeps = tight
+                self.noisy_gaps = False
                 break
         return status
 
-    def _enter(self, stage: Stage, nodes: Array, z: Array) -> None:
+    def _enter_stage(self, stage: Stage, nodes: Array, z: Array) -> None:
         """Weigh the gaps as the stage does, with steps from the stiffness there, for the start may mislead."""
-        steps, q = self.substeps, self.space.values(z)
-        if not self.method.substeps and not np.allclose(q, self.judged, rtol=MOVED):
-            needed, self.judged = substeps_for(self.segments, nodes, q, STABLE), q
-            steps = min(max(needed, self.coarsest), MOST_REFINED * self.coarsest)
+        steps, q = self.substeps, self.scaling.values(z)
+        if not self.method.substeps and not np.allclose(q, self.stiffness_parameters, rtol=STIFFNESS_UPDATE_CHANGE):
+            needed, self.stiffness_parameters = stable_substeps(self.segments, nodes, q, RK4_MAX_H_LAMBDA), q
+            steps = min(max(needed, self.min_substeps), MAX_STAGE_REFINEMENT * self.min_substeps)
         is_known = steps == self.substeps and self.correction is None and nodes is self.current.nodes
-        self.stage, self.substeps, self.finest, self.correction = stage, steps, steps, None
+        self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
         if is_known:
-            slopes = self.current.equations.slopes
-            self.current = _Iterate(nodes, z, weighed(self.segments, slopes, stage.gap * self.tightness))
+            slopes = self.current.equations.linearisation
+            self.current = _Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
         else:
             self.current = self._evaluate(nodes, z)
         if stage.refine > 1:
-            self._correct(stage.refine * steps)
+            self._apply_finer_steps(stage.refine * steps)
 
-    def _correct(self, steps: int) -> float:
+    def _apply_finer_steps(self, steps: int) -> float:
         """Let the current outputs and ends be those of finer steps; by how much that moves y, at most [deviations].
 
         Derivatives need no finer steps but where residuals exceed the noise: their product with those then counts.
         """
         nodes, z, before = self.current.nodes, self.current.z, self._outputs()
-        if self.is_loose or 2 * self.current.cost > NOISE_LEVEL * self.current.equations.count:
-            self.substeps, self.finest, self.correction = steps, steps, None
+        if self.noisy_gaps or 2 * self.current.cost > MAX_CHI_SQUARE_RATIO * self.current.equations.count:
+            self.substeps, self.output_substeps, self.correction = steps, steps, None
         else:
-            slopes, fine = self.current.equations.slopes, self._run(steps)
-            self.finest, self.correction = steps, Correction(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
+            slopes, fine = self.current.equations.linearisation, self._run(steps)
+            self.output_substeps, self.correction = (
+                steps,
+                IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine),
+            )
         self.current = self._evaluate(nodes, z)
-        return self._largest(self._outputs() - before)
+        return self._largest_change(self._outputs() - before)
 
     def _outputs(self) -> Array:
         """The model's outputs as the search sees them, shape (m, n, n_outputs)."""
-        y = self.current.equations.slopes.y
+        y = self.current.equations.linearisation.y
         return y if self.correction is None else y + self.correction.y
 
-    def _refine(self, status: Status) -> Status:
+    def _refine_steps(self, status: Status) -> Status:
         """Halve the integration steps until that moves no estimate; steps that were given stay."""
-        for _ in range(REFINEMENTS):
+        for _ in range(MAX_STEP_HALVINGS):
             if not status.converged:
                 break
-            before = self.current, self.correction, self.substeps, self.finest
-            change = self._correct(self.finest if self.method.substeps else 2 * self.finest)
+            before = self.current, self.correction, self.substeps, self.output_substeps
+            change = self._apply_finer_steps(self.output_substeps if self.method.substeps else 2 * self.output_substeps)
             if not math.isfinite(self.current.cost):
-                self.current, self.correction, self.substeps, self.finest = before
+                self.current, self.correction, self.substeps, self.output_substeps = before
                 break
-            if self._judge(self.current).converged:
-                self.change = math.nan if self.method.substeps else change
-                if self.is_loose:
+            if self._convergence_status(self.current).converged:
+                self.integration_change = math.nan if self.method.substeps else change
+                if self.noisy_gaps:
                     self._run_stage()  # the finer steps have moved its optimum a little
                 break
             self._run_stage()
-            status = self._judge(self.current)
+            status = self._convergence_status(self.current)
         return status
 
     def _run_stage(self) -> bool:
         """Whether it came to rest, or was only crawling when its iterations were used up."""
-        damping, before = min(FIRST_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
+        damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         for _ in range(self.stage.iterations):
             trial, damping = self._step(self.current, damping)
             if trial is None:
@@ -297,104 +301,114 @@ class _Search:
             self.iterations += 1
             before, self.current = self.current.cost, trial
             self._report()
-        return before - self.current.cost < CRAWLING * before
+        return before - self.current.cost < STALL_COST_DECREASE * before
 
     def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
         """Shorten the step until the cost falls; None where ten tries do not help, or it would hardly fall."""
         raise_by = 10.0
         for k in range(10):
             reduced = current.equations.arrow.eliminate(damping)
-            step = None if reduced is None else reduced.step(self.space.movable(current.z, current.equations, reduced))
-            if reduced and step and np.max(np.abs(step.parameters[self.space.log]), initial=0.0) <= 2:
-                if k == 0 and damping <= FIRST_DAMPING and self._is_still(current, step):
+            step = (
+                None if reduced is None else reduced.step(self.scaling.movable(current.z, current.equations, reduced))
+            )
+            if reduced and step and np.max(np.abs(step.parameters[self.scaling.log]), initial=0.0) <= 2:
+                if k == 0 and damping <= INITIAL_DAMPING and self._is_negligible_step(current, step):
                     break
                 trial = self._trial(current, reduced, step)
                 if trial.cost < current.cost:
-                    return trial, damping * 0.1 if damping > LEAST_DAMPING else 0.0
-            damping, raise_by = max(damping, LEAST_DAMPING) * raise_by, 3 * raise_by
+                    return trial, damping * 0.1 if damping > MIN_DAMPING else 0.0
+            damping, raise_by = max(damping, MIN_DAMPING) * raise_by, 3 * raise_by
         return None, damping
 
-    def _is_still(self, current: _Iterate, step: Step) -> bool:
+    def _is_negligible_step(self, current: _Iterate, step: GaussNewtonStep) -> bool:
         """Whether a step promises next to nothing: in the last stage, no direction moves by 0.1 % of its deviation."""
-        if self.is_loose or self.stage is self.method.stages[-1]:
-            enough = STILL * max(1.0, 2 * current.cost / max(1, current.equations.count))
+        if self.noisy_gaps or self.stage is self.method.stages[-1]:
+            enough = FINAL_COST_TOLERANCE * max(1.0, 2 * current.cost / max(1, current.equations.count))
         else:
-            enough = ENOUGH * current.cost
-        return 0.5 * current.equations.arrow.descent(step) < enough
+            enough = STAGE_COST_TOLERANCE * current.cost
+        return 0.5 * current.equations.arrow.descent_rate(step) < enough
 
-    def _trial(self, current: _Iterate, reduced: Reduced, step: Step) -> _Iterate:
+    def _trial(self, current: _Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> _Iterate:
         """The step as it is; where it disappoints, also with its gaps corrected to second order (curved valleys)."""
-        z = self.space.within(current.z + step.parameters)
+        z = self.scaling.project_to_bounds(current.z + step.parameters)
         moved = z - current.z
-        shift = reduced.following(moved)  # a bound may have cut the parameters' step short
+        shift = reduced.back_substitute(moved)  # a bound may have cut the parameters' step short
         trial = self._evaluate(current.nodes + shift * self.segments.nominal, z)
-        promised = 0.5 * current.equations.arrow.descent(Step(shift, moved))
-        if current.cost - trial.cost >= LEAST_GAIN * promised or not np.isfinite(trial.equations.gaps).all():
+        promised = 0.5 * current.equations.arrow.descent_rate(GaussNewtonStep(shift, moved))
+        if current.cost - trial.cost >= MIN_GAIN_RATIO * promised or not np.isfinite(trial.equations.gaps).all():
             return trial
         with np.errstate(all="ignore"):
-            nodes = reconnected(current.equations, shift, moved, trial.nodes, trial.equations.gaps)
+            nodes = second_order_correction(current.equations, shift, moved, trial.nodes, trial.equations.gaps)
         corrected = self._evaluate(nodes, z) if np.isfinite(nodes).all() else trial
         return corrected if corrected.cost < trial.cost else trial
 
     def _evaluate(self, nodes: Array, z: Array) -> _Iterate:
-        sigma = self.stage.gap * self.tightness
+        sigma = self.stage.gap * self.gap_scales
         with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
-            given = (nodes, self.space.values(z), self.space.chain(z), sigma, self.substeps, self.correction)
+            given = (nodes, self.scaling.values(z), self.scaling.chain(z), sigma, self.substeps, self.correction)
             equations = normal_equations(self.segments, *given)
         return _Iterate(nodes, z, equations)
 
-    def _judge(self, current: _Iterate) -> Status:
-        return self._judgement(current).status
+    def _convergence_status(self, current: _Iterate) -> Status:
+        return self._assess(current).status
 
-    def _judgement(self, current: _Iterate) -> Judgement:
-        told, tolerance = f"{self.iterations} iterations", self.method.tolerance
-        return judged(current.equations, self.space, current.z, tolerance, told, is_loose=self.is_loose)
+    def _assess(self, current: _Iterate) -> ConvergenceTest:
+        message, tolerance = f"{self.iterations} iterations", self.method.tolerance
+        return assess_convergence(
+            current.equations, self.scaling, current.z, tolerance, message, noisy_gaps=self.noisy_gaps
+        )
 
     def _fit(self, status: Status, seconds: float) -> Fit:
         transcription, current, equations = self.segments.transcription, self.current, self.current.equations
-        q = self.space.values(current.z)
+        q = self.scaling.values(current.z)
         free = transcription.parameters.free_names
         values = dict(zip(free, q[transcription.free].tolist(), strict=True))
-        is_run = self.correction is not None and math.isfinite(self.change)  # at these very nodes
-        run = self.correction.fine if is_run and self.correction else self._run(self.finest)
+        is_run = self.correction is not None and math.isfinite(self.integration_change)  # at these very nodes
+        run = self.correction.fine_run if is_run and self.correction else self._run(self.output_substeps)
         stats = {
             "iterations": float(self.iterations),
             "seconds": seconds,
             "cost": equations.cost,
-            "substeps": float(self.finest),
+            "substeps": float(self.output_substeps),
             "largest_gap": equations.largest_gap,
             "gap_share": equations.gap_share,
             "gap_deviation": self.stage.gap,
             "integration_error": self._integration_error(run),
         }
-        at_bound, held = self.space.at_bound(current.z) & ~self.space.held, self.space.held
-        keep = self.space.felt(equations) & ~at_bound & ~held
+        at_bound, held = self.scaling.at_bound(current.z) & ~self.scaling.held, self.scaling.held
+        keep = self.scaling.has_effect(equations) & ~at_bound & ~held
         covariance, borrowed, silent = None, None, tuple[str, ...]()
         if math.isfinite(equations.cost):
-            covariance = equations.covariance(keep, noisy_gaps=self.is_loose)
-            borrowed = equations.borrowed(keep, held, self.space.weak_prior(current.z)) if held.any() else None
-            silent = tuple(free[i] for i in self._judgement(current).silent)
+            covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
+            borrowed = (
+                equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
+            )
+            silent = tuple(free[i] for i in self._assess(current).unidentifiable)
         found = transcription.parameters.with_values(values)
         solution = Solution(self.segments.trajectories(run), found, status, stats)
-        jumps = equations.gaps[self.segments.linked] if self.is_loose else None
+        jumps = equations.gaps[self.segments.linked] if self.noisy_gaps else None
         return Fit(solution, covariance, equations.chi_square, equations.count, at_bound, jumps, silent, borrowed)
 
-    def _integration_error(self, run: Run) -> float:
+    def _integration_error(self, run: RolloutResult) -> float:
         """Largest change of an output when the steps are halved [noise standard deviations]."""
-        return self.change if math.isfinite(self.change) else self._largest(self._run(2 * self.finest).y - run.y)
+        return (
+            self.integration_change
+            if math.isfinite(self.integration_change)
+            else self._largest_change(self._run(2 * self.output_substeps).y - run.y)
+        )
 
-    def _largest(self, change: Array) -> float:
+    def _largest_change(self, change: Array) -> float:
         weighted = np.abs(change) * self.segments.weights
         return float(np.max(weighted, where=np.isfinite(self.segments.measured), initial=0.0))
 
-    def _run(self, steps: int) -> Run:
-        return self.segments.run(self.current.nodes, self.space.values(self.current.z), steps, states=True)
+    def _run(self, steps: int) -> RolloutResult:
+        return self.segments.run(self.current.nodes, self.scaling.values(self.current.z), steps, states=True)
 
     def _report(self) -> None:
         if self.method.progress is not None:
             current, gap = self.current, self.current.equations.largest_gap
             stages = self.method.stages
-            number = "loosened" if self.is_loose else f"stage {stages.index(self.stage) + 1}/{len(stages)}"
+            number = "loosened" if self.noisy_gaps else f"stage {stages.index(self.stage) + 1}/{len(stages)}"
             self.method.progress(
                 f"{number}  iteration {self.iterations}  cost {current.cost:.6g}  largest gap {gap:.1e}"
             )

@@ -3,19 +3,19 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.shooting.arrow import Reduced
-from pneuopt.shooting.equations import Equations
+from pneuopt.quantities.arrays import Array, Mask
+from pneuopt.shooting.arrow import ReducedEquations
+from pneuopt.shooting.equations import NormalEquations
 from pneuopt.shooting.transcription import Transcription
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-DECADE = math.log(10)  # standard deviation of a weak prior, in e-folds
-UNFELT = 1e-6  # squared residuals that an e-fold change of a log parameter has to move, or it stays where it is
+WEAK_PRIOR_DEVIATION = math.log(10)  # standard deviation of a weak prior, in e-folds
+MIN_LOG_INFORMATION = (
+    1e-6  # squared residuals that an e-fold change of a log parameter has to move, or it stays where it is
+)
 
 
-class Space:
+class ParameterScaling:
     """Free parameters as searched (z, shape (k,)), and all the problem's values at them.
 
     Attributes
@@ -35,12 +35,12 @@ class Space:
         self._given = np.array([p.value for p in transcription.parameters.values()])
         self.log = np.array([p.log for p in self._free], dtype=bool)
         self.lower, self.upper = (
-            self._searched(np.array([getattr(p, b) for p in self._free])) for b in ("lower", "upper")
+            self._to_search_units(np.array([getattr(p, b) for p in self._free])) for b in ("lower", "upper")
         )
         self.held = np.array([p.lower == p.upper for p in self._free], dtype=bool)
-        self.start = self.within(self._searched(self._given[self._positions]))
+        self.start = self.project_to_bounds(self._to_search_units(self._given[self._positions]))
 
-    def within(self, z: Array) -> Array:
+    def project_to_bounds(self, z: Array) -> Array:
         """The nearest point within the bounds."""
         return np.asarray(np.clip(z, self.lower, self.upper))
 
@@ -65,18 +65,18 @@ class Space:
     def weak_prior(self, z: Array) -> Array:
         """Standard deviation of a prior that hardly says anything: a factor, or for linear ones a multiple, of ten."""
         size = np.abs(np.where(self.log, 0.0, z))
-        return np.where(self.log, DECADE, np.where(size > 0, 10 * size, np.inf))
+        return np.where(self.log, WEAK_PRIOR_DEVIATION, np.where(size > 0, 10 * size, np.inf))
 
-    def felt(self, equations: Equations) -> Mask:
+    def has_effect(self, equations: NormalEquations) -> Mask:
         """Which have an effect on the residuals here."""
-        return np.asarray(np.diag(equations.arrow.corner) > np.where(self.log, UNFELT, 0.0))
+        return np.asarray(np.diag(equations.arrow.corner) > np.where(self.log, MIN_LOG_INFORMATION, 0.0))
 
-    def movable(self, z: Array, equations: Equations, reduced: Reduced) -> Mask:
+    def movable(self, z: Array, equations: NormalEquations, reduced: ReducedEquations) -> Mask:
         """Which are neither pressed against a bound nor without any effect on the residuals here."""
         below, above = (z <= self.lower) & (reduced.gradient > 0), (z >= self.upper) & (reduced.gradient < 0)
-        return self.felt(equations) & ~(below | above)
+        return self.has_effect(equations) & ~(below | above)
 
-    def _searched(self, values: Array) -> Array:
+    def _to_search_units(self, values: Array) -> Array:
         """Logarithms where the parameter asks for it; a bound that is not positive is no bound there."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.log, np.where(values > 0, np.log(values), -np.inf), values)

@@ -10,17 +10,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.dynamics.compiled.rollout import Gram, Rollout, Run
+from pneuopt.dynamics.compiled.rollout import Gram, Rollout, RolloutResult
 from pneuopt.dynamics.system import DiscreteSystem, names
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-MOST_SUBSTEPS = 1000
-JUDGED = 100  # nodes whose stiffness is judged
+SUBSTEPS_CAP = 1000
+MAX_STIFFNESS_NODES = 100  # nodes whose stiffness is judged
 
 
 class Block(NamedTuple):
@@ -32,20 +30,20 @@ class Block(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Correction:
+class IntegrationCorrection:
     """What finer integration steps add to a run.
 
     Attributes
     ----------
     y : ndarray, shape (m, n, n_outputs)
     x_end : ndarray, shape (m, n_states)
-    fine : Run
+    fine_run : Run
         The run with the finer steps.
     """
 
     y: Array
     x_end: Array
-    fine: Run
+    fine_run: RolloutResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +57,7 @@ class Segments:
     inputs : ndarray, shape (m, n, n_inputs)
     measured, noise : ndarray, shape (m, n, n_outputs)
         NaN where nothing was measured.
-    gather : ndarray of int, shape (m, n_system_parameters)
+    parameter_positions : ndarray of int, shape (m, n_system_parameters)
         Positions of each segment's parameter vector among the problem's parameters.
     linked : ndarray of bool, shape (m,)
         Whether the next segment continues this one.
@@ -76,7 +74,7 @@ class Segments:
     inputs: Array
     measured: Array
     noise: Array
-    gather: Indices
+    parameter_positions: Indices
     linked: Mask
     fixed_start: Array
     phase: Indices
@@ -100,7 +98,7 @@ class Segments:
     @cached_property
     def columns(self) -> Indices:
         """Positions, in the system's parameter vector, of those that are free in some segment."""
-        free = np.isin(self.gather, self.transcription.free)
+        free = np.isin(self.parameter_positions, self.transcription.free)
         return np.flatnonzero(free.any(axis=0)).astype(np.intp)
 
     @cached_property
@@ -108,7 +106,7 @@ class Segments:
         """For each segment and column, which free parameter it is; -1 where it is fixed. Shape (m, n_columns)."""
         index = np.full(len(self.transcription.parameters), -1, dtype=np.intp)
         index[self.transcription.free] = np.arange(len(self.transcription.free))
-        return np.asarray(index[self.gather[:, self.columns]])
+        return np.asarray(index[self.parameter_positions[:, self.columns]])
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -133,7 +131,7 @@ class Segments:
     @cached_property
     def jacobian(self) -> ca.Function:
         """Of the states' rates: ``(t, x, u, p) -> d(xdot)/dx``, shape (n_states, n_states)."""
-        slope, s = _slope(self.system)
+        slope, s = _state_rate(self.system)
         return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
 
     @cached_property
@@ -142,22 +140,26 @@ class Segments:
         return Rollout(self.system.pieces, wrt=self.columns.tolist(), start=True)
 
     @cached_property
-    def plain(self) -> Rollout:
+    def plain_rollout(self) -> Rollout:
         """The compiled run without sensitivities."""
         return Rollout(self.system.pieces)
 
-    def run(self, nodes: Array, q: Array, substeps: int, *, sensitivities: bool = False, states: bool = False) -> Run:
+    def run(
+        self, nodes: Array, q: Array, substeps: int, *, sensitivities: bool = False, states: bool = False
+    ) -> RolloutResult:
         """Integrate all segments from their nodes, shape (m, n_states), at the problem's parameter values q."""
-        rollout = self.sensitivities if sensitivities else self.plain
-        return rollout.run(nodes, self.inputs, q[self.gather], self.t, self.h, substeps=substeps, states=states)
+        rollout = self.sensitivities if sensitivities else self.plain_rollout
+        return rollout.run(
+            nodes, self.inputs, q[self.parameter_positions], self.t, self.h, substeps=substeps, states=states
+        )
 
-    def gram(self, nodes: Array, q: Array, substeps: int, correction: Correction | None = None) -> Gram:
+    def gram(self, nodes: Array, q: Array, substeps: int, correction: IntegrationCorrection | None = None) -> Gram:
         """The same with sensitivities, and the Gram matrices of the residuals, which alone are corrected."""
         measured = self.measured if correction is None else self.measured - correction.y
-        given = (nodes, self.inputs, q[self.gather], self.t, self.h, measured, self.weights)
+        given = (nodes, self.inputs, q[self.parameter_positions], self.t, self.h, measured, self.weights)
         return self.sensitivities.gram(*given, substeps=substeps)
 
-    def trajectories(self, run: Run) -> tuple[Trajectory, ...]:
+    def trajectories(self, run: RolloutResult) -> tuple[Trajectory, ...]:
         """States and outputs at every sample of a run with states, one trajectory a phase."""
         assert run.x is not None
         real = np.arange(self.t.shape[1]) < self.lengths[:, None]
@@ -181,18 +183,18 @@ def segment(transcription: Transcription) -> Segments:
     """
     system = transcription.system
     length = max(int(np.diff(np.append(p.nodes, p.n)).max()) for p in transcription.phases)
-    measured = {r.phase: _data(r, system, transcription.phases[r.phase]) for r in transcription.residuals}
+    measured = {r.phase: _measurements(r, system, transcription.phases[r.phase]) for r in transcription.residuals}
     parts = []
     for i, phase in enumerate(transcription.phases):
         require(phase.duration is None, f"{phase.name}: a free duration needs another method", ModelError)
         blank = np.full((phase.n, len(system.outputs)), np.nan)
         data = measured.get(i, (blank, np.ones_like(blank)))
-        parts.append(_cut(i, phase, length, data, transcription))
+        parts.append(_cut_phase(i, phase, length, data, transcription))
     joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
     t, h, inputs, y, noise, gather, linked, start, index, lengths = joined
     for i, phase in enumerate(transcription.phases[1:], 1):
         linked[np.flatnonzero(index == i)[0] - 1] = phase.follows
-    _anchor(transcription, start, np.flatnonzero(np.append(True, ~linked[:-1])), index)
+    _fix_unobservable_states(transcription, start, np.flatnonzero(np.append(True, ~linked[:-1])), index)
     return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
 
 
@@ -207,57 +209,58 @@ def start_nodes(segments: Segments) -> Array:
     return np.where(np.isfinite(segments.fixed_start), segments.fixed_start, nodes)
 
 
-def tightness(segments: Segments, kinematic: float) -> Array:
+def gap_scales(segments: Segments, kinematic: float) -> Array:
     """How much tighter each state's gaps are kept: `kinematic` where its rate holds no free parameter, else 1."""
-    slope, symbols = _slope(segments.system)
+    slope, symbols = _state_rate(segments.system)
     free = symbols["p"][segments.columns.tolist()]
     depends = [any(ca.which_depends(slope[i], free, 1, True)) for i in range(slope.numel())]
     return np.where(depends, 1.0, kinematic)
 
 
-def substeps_for(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
+def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
     """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
 
-    Judged at nodes all along it and at the extremes of every state and input; no more than `MOST_SUBSTEPS`, for a start
+    Judged at nodes all along it and at the extremes of every state and input; no more than `SUBSTEPS_CAP`, for a start
     may be absurd.
     """
     m, n = nodes.shape
     if not n:
         return 1
     given = np.concatenate([nodes, segments.inputs[:, 0]], axis=1)
-    even = np.linspace(0, m - 1, min(m, JUDGED)).astype(int)
+    even = np.linspace(0, m - 1, min(m, MAX_STIFFNESS_NODES)).astype(int)
     rows = np.unique(np.concatenate([even, given.argmin(axis=0), given.argmax(axis=0)]))
     # the regularised friction is stiffest at rest, which a node may just miss
     points = np.concatenate([nodes[rows], nodes[rows] * 0])
     p, u, t = (
-        np.concatenate([a, a]) for a in (q[segments.gather[rows]], segments.inputs[rows, 0], segments.t[rows, 0])
+        np.concatenate([a, a])
+        for a in (q[segments.parameter_positions[rows]], segments.inputs[rows, 0], segments.t[rows, 0])
     )
     J = np.array(segments.jacobian.map(len(t))(t[None], points.T, u.T, p.T)).reshape(n, -1, n).transpose(1, 0, 2)
     stiffness = np.abs(np.linalg.eigvals(J[np.isfinite(J).all(axis=(1, 2))])).max(initial=0.0)
-    return min(max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step)), MOST_SUBSTEPS)
+    return min(max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step)), SUBSTEPS_CAP)
 
 
-def _slope(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
+def _state_rate(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
     """The rate f(t, x, u, p) behind a step: d(x_next)/dh at h = 0, exact and with f's own sparsity; and its symbols."""
     symbols = {n: ca.SX.sym(n, system.step.size1_in(i)) for i, n in enumerate(("t", "h", "x", "u", "p"))}
     x_next = system.step(*symbols.values())[0]
     return ca.substitute(ca.jacobian(x_next, symbols["h"]), symbols["h"], ca.SX(0)), symbols
 
 
-def _anchor(transcription: Transcription, start: Array, heads: Indices, index: Indices) -> None:
+def _fix_unobservable_states(transcription: Transcription, start: Array, heads: Indices, index: Indices) -> None:
     """Hold what the data do not reach to its guess, at the head of each run of linked segments (changes `start`)."""
     for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):
         guess = transcription.phases[index[head]].guess
         measured = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
-        idle = ~_felt(transcription.system, measured) & np.isnan(start[head])
+        idle = ~_observable_states(transcription.system, measured) & np.isnan(start[head])
         start[head, idle] = 0.0 if guess is None else guess[0, idle]
 
 
-def _felt(system: DiscreteSystem, outputs: set[str]) -> Mask:
+def _observable_states(system: DiscreteSystem, outputs: set[str]) -> Mask:
     """The states on which these outputs depend, directly or through other states' rates. Shape (n_states,)."""
     if system.update is not None or not system.states:
         return np.ones(len(system.states), dtype=bool)
-    slope, s = _slope(system)
+    slope, s = _state_rate(system)
     rows = [i for i, name in enumerate(names(system.outputs)) if name in outputs]
     seen = system.step(*s.values())[1][rows]
     reads, felt = (np.array(ca.DM(ca.jacobian_sparsity(f, s["x"]), 1)) > 0 for f in (slope, seen))
@@ -267,7 +270,7 @@ def _felt(system: DiscreteSystem, outputs: set[str]) -> Mask:
     return np.asarray(felt)
 
 
-def _data(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[Array, Array]:
+def _measurements(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[Array, Array]:
     measured = np.full((phase.n, len(system.outputs)), np.nan)
     noise = np.ones_like(measured)
     position = {n: i for i, n in enumerate(names(system.outputs))}
@@ -277,7 +280,7 @@ def _data(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[A
     return measured, noise
 
 
-def _cut(
+def _cut_phase(
     index: int, phase: Phase, length: int, data: tuple[Array, Array], transcription: Transcription
 ) -> tuple[NDArray[Any], ...]:
     """One phase's segments, in the order of the fields of `Segments`."""
@@ -296,7 +299,7 @@ def _cut(
         phase.inputs[rows],
         np.where(real[:, :, None], measured[rows], np.nan),
         noise[rows],
-        np.tile(transcription.gather(phase), (m, 1)),
+        np.tile(transcription.parameter_positions(phase), (m, 1)),
         np.arange(m) < m - 1,
         start,
         np.full(m, index),

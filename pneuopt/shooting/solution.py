@@ -1,52 +1,16 @@
-"""How a solver ended, in words that name the remedy, and what it hands back."""
+"""What every solver of `shooting` hands back."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
-
-
-class Code(Enum):
-    """Why a solver stopped."""
-
-    CONVERGED = "converged"
-    NOT_CONVERGED = "not converged"
-    ITERATION_LIMIT = "iteration limit reached"
-    INFEASIBLE = "the limits contradict each other"
-    DIVERGED = "the iteration left the region where the model is defined"
-    NOT_CERTIFIED = "the independent simulation does not confirm the claim"
-    INTERRUPTED = "interrupted"
-
-
-@dataclass(frozen=True)
-class Status:
-    """A typed end state.
-
-    Attributes
-    ----------
-    code : Code
-    message : str
-        One sentence with figures; where it did not converge it names the worst residual and the remedy.
-    """
-
-    code: Code
-    message: str = ""
-
-    @property
-    def converged(self) -> bool:
-        """Whether the answer may be trusted."""
-        return self.code is Code.CONVERGED
-
-    def __str__(self) -> str:
-        lead = "converged" if self.converged else f"NOT converged ({self.code.value})"
-        return f"{lead}: {self.message}" if self.message else lead
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What every solver of `nlp` returns.
+    """What every solver returns.
 
     Attributes
     ----------

@@ -11,14 +11,11 @@ from enum import Enum
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import DiscreteSystem, names
-from pneuopt.quantities.errors import ModelError, check_known, require
+from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 class Where(Enum):
@@ -172,14 +169,14 @@ class Transcription:
     def __post_init__(self) -> None:
         require(len(self.phases) > 0, "a problem needs at least one phase", ModelError)
         require(not self.phases[0].follows, "the first phase cannot follow another", ModelError)
-        check_known("parameter", self.system.parameters, self.parameters)
+        check_names("parameter", self.system.parameters, self.parameters)
         for phase in self.phases:
             if phase.duration is not None:
-                check_known("parameter", [phase.duration], self.parameters, phase.name)
+                check_names("parameter", [phase.duration], self.parameters, phase.name)
         for residual in self.residuals:
-            check_known("output", residual.outputs, names(self.system.outputs), self.phases[residual.phase].name)
+            check_names("output", residual.outputs, names(self.system.outputs), self.phases[residual.phase].name)
 
-    def gather(self, phase: Phase) -> Indices:
+    def parameter_positions(self, phase: Phase) -> Indices:
         """Positions, among the problem's parameters, of the system's parameter vector in this phase."""
         position = {n: i for i, n in enumerate(self.parameters)}
         return np.array(
@@ -192,7 +189,7 @@ class Transcription:
         return np.array([i for i, p in enumerate(self.parameters.values()) if p.free], dtype=np.intp)
 
 
-def every(n: int, samples: int) -> Indices:
+def regular_nodes(n: int, samples: int) -> Indices:
     """Nodes at every `samples`-th of n samples; the last segment takes the rest.
 
     Examples

@@ -22,24 +22,24 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.quantities.errors import InputError, PneuoptError, check_known, require
+from pneuopt.quantities.errors import InputError, PneuoptError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import ProgressCallback
 from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Function = Callable[[ParameterSet], Any]
-Case = ParameterSet | Mapping[str, float]
-Tell = Callable[[str], None]
+CaseFunction = Callable[[ParameterSet], Any]
+CaseValues = ParameterSet | Mapping[str, float]
 Outcomes = Generator[tuple[str, "_Outcome"], None, None]
-INTERRUPTED = "interrupted"
+INTERRUPTED_CASE = "interrupted"
 """The `error` of a case that was not reached, or not finished, when the study was interrupted."""
 
-_OWN = ("case", "seconds", "error")
-_MOST_PROCESSES = 60  # Windows waits for 63 at once
-_IN_THREADS = "in this process, executor=ThreadPoolExecutor()"
-_GUARD = 'a script must call the study under `if __name__ == "__main__":`'
+_STUDY_COLUMNS = ("case", "seconds", "error")
+_MAX_PROCESSES = 60  # Windows waits for 63 at once
+_THREADS_REMEDY = "in this process, executor=ThreadPoolExecutor()"
+_MAIN_GUARD_REMEDY = 'a script must call the study under `if __name__ == "__main__":`'
 
 
 def grid(parameters: ParameterSet, axes: Mapping[str, Iterable[float]]) -> dict[str, dict[str, float]]:
@@ -70,8 +70,8 @@ def grid(parameters: ParameterSet, axes: Mapping[str, Iterable[float]]) -> dict[
     {'load.mass': 8.0, 'stroke': 0.1}
     """
     require(len(axes) > 0, "a grid needs an axis: a parameter and its values")
-    check_known("parameter", axes, parameters, "axis")
-    columns = [_axis(parameters, name, list(map(float, values))) for name, values in axes.items()]
+    check_names("parameter", axes, parameters, "axis")
+    columns = [_label_axis(parameters, name, list(map(float, values))) for name, values in axes.items()]
     return {
         ", ".join(label for label, _ in point): dict(zip(axes, (value for _, value in point), strict=True))
         for point in itertools.product(*columns)
@@ -79,12 +79,12 @@ def grid(parameters: ParameterSet, axes: Mapping[str, Iterable[float]]) -> dict[
 
 
 def sweep(
-    fn: Function,
+    fn: CaseFunction,
     parameters: ParameterSet,
-    cases: Mapping[str, Case],
+    cases: Mapping[str, CaseValues],
     *,
     executor: Executor | None = None,
-    progress: Tell | None = None,
+    progress: ProgressCallback | None = None,
 ) -> "pd.DataFrame":
     """Evaluate a function of a `ParameterSet` for each case.
 
@@ -126,17 +126,17 @@ def sweep(
     ([5.0, nan], 'ZeroDivisionError')
     """
     require(len(cases) > 0, "a study needs a case")
-    runs = {str(name): _applied(parameters, case, str(name)) for name, case in cases.items()}
-    outcomes = _in_processes(fn, runs) if executor is None else _in_executor(executor, fn, runs)
+    runs = {str(name): _case_parameters(parameters, case, str(name)) for name, case in cases.items()}
+    outcomes = _run_in_processes(fn, runs) if executor is None else _run_in_executor(executor, fn, runs)
     found: dict[str, _Outcome] = {}
     with closing(outcomes), suppress(KeyboardInterrupt):
         for name, outcome in outcomes:
-            if outcome.error == INTERRUPTED:
+            if outcome.error == INTERRUPTED_CASE:
                 break
             found[name] = outcome
             if progress is not None:
-                progress(_news(found, len(runs)))
-    return _table(parameters, runs, found)
+                progress(_progress_text(found, len(runs)))
+    return _study_table(parameters, runs, found)
 
 
 @dataclass(frozen=True)
@@ -148,44 +148,44 @@ class _Outcome:
     error: str = ""
 
 
-def _axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
+def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
     """The values with their labels; more digits only where six do not tell them apart."""
     require(len(values) > 0, f"axis {name}: no values")
     require(len(set(values)) == len(values), f"axis {name}: a value is there twice; leave one out")
     for value in values:
-        _applied(parameters, {name: value}, "axis")
+        _case_parameters(parameters, {name: value}, "axis")
     short, full = ([write_value(v, parameters[name].unit, digits) for v in values] for digits in (6, 17))
     labels = short if len(set(short)) == len(values) else full
     return [(f"{name} = {label}", value) for label, value in zip(labels, values, strict=True)]
 
 
-def _applied(parameters: ParameterSet, case: Case, name: str) -> ParameterSet:
+def _case_parameters(parameters: ParameterSet, case: CaseValues, name: str) -> ParameterSet:
     if isinstance(case, ParameterSet):
         return case
-    check_known("parameter", case, parameters, name)
+    check_names("parameter", case, parameters, name)
     try:
         return parameters.with_values(case)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
 
 
-def _in_processes(fn: Function, runs: Mapping[str, ParameterSet]) -> Outcomes:
+def _run_in_processes(fn: CaseFunction, runs: Mapping[str, ParameterSet]) -> Outcomes:
     """Outcomes as they come; a worker has one case at a time, so a process that dies takes only its own with it."""
-    packed, waiting, crew, began = _packed(fn), deque(runs.items()), list[_Worker](), False
+    packed, waiting, crew, began = _pickle_function(fn), deque(runs.items()), list[_Worker](), False
     try:
-        for _ in range(min(len(runs), os.cpu_count() or 1, _MOST_PROCESSES)):
+        for _ in range(min(len(runs), os.cpu_count() or 1, _MAX_PROCESSES)):
             crew.append(_Worker(packed))
         while crew and (waiting or any(worker.case is not None for worker in crew)):
             heard = wait([worker.pipe for worker in crew])
             for worker in [worker for worker in crew if worker.pipe in heard]:
                 done = worker.receive()
-                require(began or not worker.refusal, worker.refusal)
+                require(began or not worker.start_error, worker.start_error)
                 began = True
                 if not worker.is_alive:
                     crew.remove(worker)
-                    crew += [_Worker(packed)] if waiting and not worker.refusal else []
+                    crew += [_Worker(packed)] if waiting and not worker.start_error else []
                 elif waiting:
-                    worker.give(*waiting.popleft())
+                    worker.send_case(*waiting.popleft())
                 if done is not None:
                     yield done
     finally:
@@ -193,16 +193,16 @@ def _in_processes(fn: Function, runs: Mapping[str, ParameterSet]) -> Outcomes:
             worker.stop()
 
 
-def _in_executor(executor: Executor, fn: Function, runs: Mapping[str, ParameterSet]) -> Outcomes:
+def _run_in_executor(executor: Executor, fn: CaseFunction, runs: Mapping[str, ParameterSet]) -> Outcomes:
     """Outcomes as they come, of somebody else's threads, processes or machines."""
     if isinstance(executor, ProcessPoolExecutor):
-        _packed(fn)
+        _pickle_function(fn)
     futures: dict[Future[_Outcome], str] = {}
     try:
         for name, values in runs.items():
-            futures[executor.submit(_attempt, fn, values)] = name
+            futures[executor.submit(_evaluate_case, fn, values)] = name
         for future in as_completed(futures):
-            yield futures[future], _received(future)
+            yield futures[future], _future_outcome(future)
     finally:
         for future in futures:
             future.cancel()
@@ -214,20 +214,20 @@ class _Worker:
     def __init__(self, packed: bytes) -> None:
         context = get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, packed))
+        self._process = context.Process(target=_serve_worker, args=(theirs, packed))
         self._process.start()
         theirs.close()  # or its end would never be noticed
         self.case: str | None = None
-        self.is_alive, self.refusal, self._is_ready = True, "", False
+        self.is_alive, self.start_error, self._is_ready = True, "", False
 
-    def give(self, case: str, values: ParameterSet) -> None:
+    def send_case(self, case: str, values: ParameterSet) -> None:
         """Let it evaluate a case."""
         self.case = case
         with suppress(OSError):  # it has died: `receive` will say so
             self.pipe.send(values)
 
     def receive(self) -> tuple[str, _Outcome] | None:
-        """What it gave; None where it has only started, or has refused to (`refusal`)."""
+        """What it gave; None where it has only started, or has refused to (`start_error`)."""
         case, self.case = self.case, None
         try:
             answer = self.pipe.recv()
@@ -236,10 +236,10 @@ class _Worker:
             self.is_alive = False
             if case is not None:
                 return case, _Outcome(error=f"its process died (exit code {self._process.exitcode})")
-            answer = f"the processes of a study cannot start; {_GUARD}, or compute {_IN_THREADS}"
+            answer = f"the processes of a study cannot start; {_MAIN_GUARD_REMEDY}, or compute {_THREADS_REMEDY}"
         if case is not None:
             return case, answer
-        self.refusal, self._is_ready, self.is_alive = answer, not answer, not answer
+        self.start_error, self._is_ready, self.is_alive = answer, not answer, not answer
         return None
 
     def stop(self) -> None:
@@ -250,7 +250,7 @@ class _Worker:
         self._process.join()
 
 
-def _serve(pipe: Connection, packed: bytes) -> None:
+def _serve_worker(pipe: Connection, packed: bytes) -> None:
     """Evaluate one set of parameters after the other, until the other end hangs up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the first one decides
     try:
@@ -258,37 +258,37 @@ def _serve(pipe: Connection, packed: bytes) -> None:
     except Exception as error:
         where = "define it in a module that can be imported"
         pipe.send(
-            f"the function cannot be loaded by other processes: {_reason(error)}; {where}, or compute {_IN_THREADS}"
+            f"the function cannot be loaded by other processes: {_reason(error)}; {where}, or compute {_THREADS_REMEDY}"
         )
         return
     pipe.send("")
     with suppress(EOFError, OSError):
         while True:
-            pipe.send(_attempt(fn, pipe.recv()))
+            pipe.send(_evaluate_case(fn, pipe.recv()))
 
 
-def _packed(fn: Function) -> bytes:
+def _pickle_function(fn: CaseFunction) -> bytes:
     try:
         return pickle.dumps(fn)
     except Exception as error:  # pickle raises what it likes
         raise InputError(
             f"the function cannot go to other processes ({error}); give a function of a module, or "
-            f"functools.partial of one with what it needs, or compute {_IN_THREADS}"
+            f"functools.partial of one with what it needs, or compute {_THREADS_REMEDY}"
         ) from None
 
 
-def _attempt(fn: Function, values: ParameterSet) -> _Outcome:
+def _evaluate_case(fn: CaseFunction, values: ParameterSet) -> _Outcome:
     begun = time.perf_counter()
     try:
         result, seconds = fn(values), time.perf_counter() - begun
-        return _Outcome(_named(result), seconds)
+        return _Outcome(_plain_results(result), seconds)
     except KeyboardInterrupt:
-        return _Outcome(error=INTERRUPTED)
+        return _Outcome(error=INTERRUPTED_CASE)
     except (Exception, SystemExit) as error:
         return _Outcome(seconds=time.perf_counter() - begun, error=_reason(error))
 
 
-def _received(future: "Future[_Outcome]") -> _Outcome:
+def _future_outcome(future: "Future[_Outcome]") -> _Outcome:
     try:
         return future.result()
     except Exception as error:  # the executor's own: a broken pool, a cancelled future
@@ -304,17 +304,17 @@ def _reason(error: BaseException) -> str:
     return f"{text} ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"
 
 
-def _named(result: Any) -> dict[str, Any]:
+def _plain_results(result: Any) -> dict[str, Any]:
     """A result as plain numbers and text, by name."""
     import pandas as pd
 
     if isinstance(result, pd.DataFrame):
-        return _named(_flat(result))
+        return _plain_results(_flatten_frame(result))
     entries = result if isinstance(result, Mapping | pd.Series) else {"value": result}
-    return {str(name): _plain(value, str(name)) for name, value in entries.items()}
+    return {str(name): _check_plain(value, str(name)) for name, value in entries.items()}
 
 
-def _flat(frame: "pd.DataFrame") -> Mapping[str, Any]:
+def _flatten_frame(frame: "pd.DataFrame") -> Mapping[str, Any]:
     if len(frame) == 1:
         return {str(column): frame[column].iloc[0] for column in frame}
     if len(frame.columns) == 1:
@@ -322,23 +322,28 @@ def _flat(frame: "pd.DataFrame") -> Mapping[str, Any]:
     return {f"{row}[{column}]": value for column in frame for row, value in frame[column].items()}
 
 
-def _plain(value: Any, name: str) -> Any:
+def _check_plain(value: Any, name: str) -> Any:
     value = value.item() if getattr(value, "shape", None) == () else value
     if not isinstance(value, bool | int | float | str):
         raise InputError(f"{name} is {type(value).__name__}; return numbers or text, by name")
     return value
 
 
-def _news(found: Mapping[str, _Outcome], total: int) -> str:
+def _progress_text(found: Mapping[str, _Outcome], total: int) -> str:
     failed = sum(bool(outcome.error) for outcome in found.values())
     return f"{len(found)} of {total} cases" + (f", {failed} failed" if failed else "")
 
 
-def _table(parameters: ParameterSet, runs: Mapping[str, ParameterSet], found: Mapping[str, _Outcome]) -> "pd.DataFrame":
+def _study_table(
+    parameters: ParameterSet, runs: Mapping[str, ParameterSet], found: Mapping[str, _Outcome]
+) -> "pd.DataFrame":
     import pandas as pd
 
     swept = list(dict.fromkeys(n for values in runs.values() for n in values if _differs(n, values, parameters)))
-    outcomes = {name: _distinct(found.get(name, _Outcome(error=INTERRUPTED)), {*_OWN, *swept}) for name in runs}
+    outcomes = {
+        name: _check_column_names(found.get(name, _Outcome(error=INTERRUPTED_CASE)), {*_STUDY_COLUMNS, *swept})
+        for name in runs
+    }
     results = dict.fromkeys(n for outcome in outcomes.values() for n in outcome.results)
     columns: dict[str, list[Any]] = {"case": list(runs)}
     columns |= {n: [v.value(n) if n in v else nan for v in runs.values()] for n in swept}
@@ -351,7 +356,7 @@ def _differs(name: str, values: ParameterSet, parameters: ParameterSet) -> bool:
     return name not in parameters or values.value(name) != parameters.value(name)
 
 
-def _distinct(outcome: _Outcome, taken: set[str]) -> _Outcome:
+def _check_column_names(outcome: _Outcome, taken: set[str]) -> _Outcome:
     twice = taken.intersection(outcome.results)
     if not twice:
         return outcome

@@ -3,7 +3,7 @@
 For many gains and many scenarios. Gradients find the nearest optimum only, and at a narrow band each way to leave it
 once more or once less is an optimum of its own: the mean over bands, wide and narrow, leads a screening across them,
 where ever narrower bands led ten seeds on T32's corners to 0.184 s and this one to 0.159 s. The dither makes optima
-of its own beside each other: `renewals` screens again, and jumps from the best to other dithers (eight more seeds:
+of its own beside each other: `restarts` screens again, and jumps from the best to other dithers (eight more seeds:
 median 0.155 s, 0.183 s where it only swept the dither about the best).
 """
 
@@ -12,27 +12,27 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.requirements import ROBUSTNESS, name
+from pneuopt.evaluation.requirements import ROBUSTNESS_REQUIREMENTS, metric_name
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
-from pneuopt.tuning.linearised import SMOOTH, Linearised, differentiated
-from pneuopt.tuning.screening import Judge, Screened, first_population, generation, merit
-from pneuopt.tuning.simulator import Simulator, each
-from pneuopt.tuning.space import Space, Tell
-from pneuopt.tuning.sqp import SQP, Point, descend
+from pneuopt.quantities.status import ProgressCallback
+from pneuopt.tuning.linearised import SMOOTH_REQUIREMENTS, LinearisedProblem, sensitivity_rollout
+from pneuopt.tuning.screening import BestPoint, MeritFunction, first_population, generation, merit
+from pneuopt.tuning.simulator import Simulator, to_records
+from pneuopt.tuning.space import Space
+from pneuopt.tuning.sqp import SQP, LinearisedPoint, descend
 
-Array = NDArray[np.float64]
-UNFELT = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # gradients are wrong or useless there
-COUNTS = ("sensor.resolution",)  # what makes steps of a signal, wherever it is among the parameters
-APART = 0.03  # of a gain's range: two points closer than that are one
-INSIDE = 0.005  # by which the programs' band and limits are tighter: a solution lies on them, and grazes them
-STIFFER = 2  # times that the penalties are raised tenfold, where they did not keep the limits
-FEW = 12  # points that rank the scenarios
-PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a range, to which a renewal jumps
-BRIEF = 8  # iterations that choose among the jumps
+NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # gradients are wrong or useless there
+QUANTISER_PARAMETERS = ("sensor.resolution",)  # what makes steps of a signal, wherever it is among the parameters
+MIN_POINT_DISTANCE = 0.03  # of a gain's range: two points closer than that are one
+PROGRAM_MARGIN = 0.005  # by which the programs' band and limits are tighter: a solution lies on them, and grazes them
+MAX_PENALTY_RAISES = 2  # times that the penalties are raised tenfold, where they did not keep the limits
+RANKING_POINTS = 12  # points that rank the scenarios
+RESTART_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a range, to which a renewal jumps
+JUMP_ITERATIONS = 8  # iterations that choose among the jumps
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Condensed:
         Settling bands that the screening judges by beside the one asked for, as far as they are wider.
     keep, iterations : int
         Points that the programs improve, and how often.
-    renewals : int
+    restarts : int
         Times that another population is screened, and the programs begin again from the best point with the dither's
-        amplitude, then its offset, and what else is free and not the PID's, put to `PLACES` of its range.
+        amplitude, then its offset, and what else is free and not the PID's, put to `RESTART_FRACTIONS` of its range.
     working : int
         Cases, the worst, that the programs see at a time.
     rounds : int
@@ -71,7 +71,7 @@ class Condensed:
     bands: tuple[float, ...] = (0.1, 0.05, 0.03)
     keep: int = 5
     iterations: int = 25
-    renewals: int = 1
+    restarts: int = 1
     working: int = 12
     rounds: int = 3
     nodes: tuple[int, int] = (500, 2000)
@@ -82,10 +82,10 @@ class Condensed:
     steps: SQP = field(default_factory=SQP)
 
     def __post_init__(self) -> None:
-        for n, least in (("generations", 1), ("keep", 1), ("iterations", 1), ("renewals", 0)):
+        for n, least in (("generations", 1), ("keep", 1), ("iterations", 1), ("restarts", 0)):
             value = getattr(self, n)
-            told = f"Condensed: {n} must be a whole number, at least {least}, got {value}"
-            require(isinstance(value, int) and value >= least, told)
+            message = f"Condensed: {n} must be a whole number, at least {least}, got {value}"
+            require(isinstance(value, int) and value >= least, message)
         require(all(0 < band < 1 for band in self.bands), f"Condensed: bands are fractions below 1, got {self.bands}")
         require(self.members >= 5, f"Condensed: members must be at least 5, got {self.members}")
         require(self.working >= 1, f"Condensed: working must be at least 1, got {self.working}")
@@ -96,33 +96,33 @@ class Condensed:
 
 def check_differentiable(space: Space, spec: Specification) -> None:
     """Refuse what gradients cannot do: `InputError` names it and the remedy."""
-    strange = [*_strange(spec), *_unfelt(space)]
+    strange = [*_nonsmooth_requirements(spec), *_nonsmooth_parameters(space)]
     require(not strange, f"Condensed has no gradient for {', '.join(strange)}; use method=Screening()")
 
 
 def is_differentiable(space: Space, spec: Specification) -> bool:
     """Whether there are gradients of all requirements to all that is free."""
-    return not _strange(spec) and not _unfelt(space)
+    return not _nonsmooth_requirements(spec) and not _nonsmooth_parameters(space)
 
 
-def _strange(spec: Specification) -> list[str]:
-    return [name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH)]
+def _nonsmooth_requirements(spec: Specification) -> list[str]:
+    return [metric_name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH_REQUIREMENTS)]
 
 
-def _unfelt(space: Space) -> list[str]:
-    counted = [f"{n} (an encoder's counts)" for n in COUNTS if n in space.parameters]
-    return [n for n in space.names if n in UNFELT] + counted
+def _nonsmooth_parameters(space: Space) -> list[str]:
+    counted = [f"{n} (an encoder's counts)" for n in QUANTISER_PARAMETERS if n in space.parameters]
+    return [n for n in space.names if n in NONSMOOTH_PARAMETERS] + counted
 
 
-def condense(
+def run_gradient_search(
     simulator: Simulator,
     references: Sequence[Step],
     space: Space,
     spec: Specification,
     method: Condensed,
     start: Array,
-    tell: Tell,
-) -> Screened:
+    tell: ProgressCallback,
+) -> BestPoint:
     """The best point found; Ctrl-C ends the search with the best so far.
 
     Parameters
@@ -137,87 +137,95 @@ def condense(
     """
     check_differentiable(space, spec)
     scale = min(r.horizon - r.at for r in references)
-    search = _Condensing(simulator, spec, method, scale, space.unit(start), tell)
+    search = _CondensedSearch(simulator, spec, method, scale, space.to_unit(start), tell)
     try:
         search.run()
     except KeyboardInterrupt:
-        return Screened(space.draw(search.best), search.count, is_complete=False)
-    return Screened(space.draw(search.best), search.count, is_complete=True)
+        return BestPoint(space.from_unit(search.best), search.count, is_complete=False)
+    return BestPoint(space.from_unit(search.best), search.count, is_complete=True)
 
 
-class _Condensing:
+class _CondensedSearch:
     """The search's state: the best point by exact merit over all cases, and what it took."""
 
     def __init__(
-        self, simulator: Simulator, spec: Specification, method: Condensed, scale: float, start: Array, tell: Tell
+        self,
+        simulator: Simulator,
+        spec: Specification,
+        method: Condensed,
+        scale: float,
+        start: Array,
+        tell: ProgressCallback,
     ) -> None:
-        self._simulator, self._spec, self._method, self._scale, self._tell = simulator, spec, method, scale, tell
-        self._rollout = differentiated(simulator)
+        self._simulator, self._spec, self._method, self._scale, self._progress = simulator, spec, method, scale, tell
+        self._rollout = sensitivity_rollout(simulator)
         self._rng = np.random.default_rng(method.seed)
-        self.best, self._least, self.count, self._size = np.clip(start, 0.0, 1.0), np.inf, 0, 1.0
+        self.best, self._best_merit, self.count, self._objective_scale = np.clip(start, 0.0, 1.0), np.inf, 0, 1.0
 
     def run(self) -> None:
         method, spec = self._method, self._spec
         population = first_population(method.members, self.best, self._rng)
-        cases = self._hardest(population[:FEW])
-        points = self._searched(population, cases)
-        for _ in range(method.renewals):
+        cases = self._worst_cases(population[:RANKING_POINTS])
+        points = self._search(population, cases)
+        for _ in range(method.restarts):
             anew = first_population(method.members, self._rng.random(len(self.best)), self._rng)
-            points = self._judge(np.vstack([points, self._searched(anew, cases)]))
+            points = self._select_best(np.vstack([points, self._search(anew, cases)]))
             self._polish(cases)
-            points = self._judge(np.vstack([points, self.best[None], *self._jumped(points, cases)]))
-        for _ in range(STIFFER):
-            if not self._breaks():
+            points = self._select_best(np.vstack([points, self.best[None], *self._jump(points, cases)]))
+        for _ in range(MAX_PENALTY_RAISES):
+            if not self._violates_limits():
                 break
-            self._size *= 10.0
-            points = self._judge(self._descended(points, cases, spec, method.iterations))
+            self._objective_scale *= 10.0
+            points = self._select_best(self._descend(points, cases, spec, method.iterations))
         for _ in range(method.rounds - 1):
-            missed = self._missed(cases, points)
+            missed = self._worse_cases(cases, points)
             if not missed:
                 break
             cases = [*cases, *missed]
-            points = self._judge(self._descended(points, cases, spec, method.iterations))
+            points = self._select_best(self._descend(points, cases, spec, method.iterations))
         self._polish(cases)
 
-    def _searched(self, population: Array, cases: Sequence[int]) -> Array:
+    def _search(self, population: Array, cases: Sequence[int]) -> Array:
         """The optima that a screening of this population leads to."""
         method = self._method
-        starts = self._screened(population, cases, method.generations)
-        return self._judge(self._descended(starts, cases, self._spec, method.iterations))
+        starts = self._screen(population, cases, method.generations)
+        return self._select_best(self._descend(starts, cases, self._spec, method.iterations))
 
     def _polish(self, cases: Sequence[int]) -> None:
         """Improve the best point on the finer nodes."""
         if self._method.polish:
-            self._judge(self._descended(self.best[None], cases, self._spec, self._method.polish, is_last=True))
+            self._select_best(self._descend(self.best[None], cases, self._spec, self._method.polish, is_last=True))
 
-    def _screened(self, population: Array, cases: Sequence[int], generations: int) -> Array:
+    def _screen(self, population: Array, cases: Sequence[int], generations: int) -> Array:
         """The best points of a short differential evolution over several bands, apart from each other."""
-        simulator, space = self._simulator.only(cases), self._simulator.space
-        judge = Judge(simulator.coarse(self._spec, self._bands), space, self._spec, self._scale, population[0])
+        simulator, space = self._simulator.select_cases(cases), self._simulator.space
+        judge = MeritFunction(simulator.coarse(self._spec, self._bands), space, self._spec, self._scale, population[0])
         merits, worst = judge.race(population, np.full(len(population), np.inf), None)
         for _ in range(generations):
             population, merits, worst = generation(population, merits, worst, judge, self._rng)
-        if self._least == np.inf:
-            self.best, self._size = judge.best, self._objective(judge.best)
-        self._tell(f"screening over {1 + len(self._bands)} bands: best {merits.min():.4g}")
+        if self._best_merit == np.inf:
+            self.best, self._objective_scale = judge.best, self._objective(judge.best)
+        self._progress(f"screening over {1 + len(self._bands)} bands: best {merits.min():.4g}")
         self.count += judge.count + len(population)
-        merits = Judge(simulator.coarse(self._spec), space, self._spec, self._scale, judge.best)(population)
-        return _apart(population, merits)[: self._method.keep]
+        merits = MeritFunction(simulator.coarse(self._spec), space, self._spec, self._scale, judge.best)(population)
+        return _distinct_points(population, merits)[: self._method.keep]
 
-    def _jumped(self, points: Array, cases: Sequence[int]) -> list[Array]:
+    def _jump(self, points: Array, cases: Sequence[int]) -> list[Array]:
         """The optima to which the best point leads with one unknown, not the PID's, put elsewhere; none is known."""
         names, method = self._simulator.space.names, self._method
         others = [k for k, n in enumerate(names) if not n.startswith("pid.")]
-        jumps = [(k, place) for k in others for place in PLACES if abs(place - self.best[k]) > APART]
+        jumps = [
+            (k, place) for k in others for place in RESTART_FRACTIONS if abs(place - self.best[k]) > MIN_POINT_DISTANCE
+        ]
         if not jumps:
             return []
         starts = np.tile(self.best, (len(jumps), 1))
         for start, (k, place) in zip(starts, jumps, strict=True):
             start[k] = place
-        found = self._descended(starts, cases, self._spec, BRIEF)
+        found = self._descend(starts, cases, self._spec, JUMP_ITERATIONS)
         known = np.vstack([points, self.best[None]])
-        fresh = found[np.abs(found[:, None] - known).max(axis=2).min(axis=1) > APART][: method.keep]
-        return [self._descended(fresh, cases, self._spec, method.iterations)] if len(fresh) else []
+        fresh = found[np.abs(found[:, None] - known).max(axis=2).min(axis=1) > MIN_POINT_DISTANCE][: method.keep]
+        return [self._descend(fresh, cases, self._spec, method.iterations)] if len(fresh) else []
 
     @cached_property
     def _bands(self) -> list[float]:
@@ -227,66 +235,70 @@ class _Condensing:
     def _objective(self, unit: Array) -> float:
         """What the objective is of the order of; ten times the penalties hold a search in the first basin it meets."""
         simulator, spec = self._simulator, self._spec
-        values = each(simulator.values(simulator.space.draw(unit[None]), spec))[0]
+        values = to_records(simulator.values(simulator.space.from_unit(unit[None]), spec))[0]
         unknown = {"SettlingTime": self._scale}
         return spec.objective({n: v if np.isfinite(v) else unknown.get(n, 1.0) for n, v in values.items()})
 
-    def _descended(
+    def _descend(
         self, unit: Array, cases: Sequence[int], spec: Specification, most: int, *, is_last: bool = False
     ) -> Array:
         """Improved points, the best first; on coarse samples up to the last time."""
-        inside, simulator = spec.tightened(INSIDE, INSIDE), self._simulator.only(cases)
+        inside, simulator = spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN), self._simulator.select_cases(cases)
         simulator = simulator if is_last else simulator.coarse(spec)
-        problem = Linearised(simulator, self._rollout, inside, self._method.nodes[is_last], self._size)
-        found: list[Point] = descend(problem, problem.start(unit), most, self._method.steps)
+        problem = LinearisedProblem(
+            simulator, self._rollout, inside, self._method.nodes[is_last], self._objective_scale
+        )
+        found: list[LinearisedPoint] = descend(problem, problem.start(unit), most, self._method.steps)
         self.count += problem.count
         merits = np.array([point.merit for point in found])
-        self._tell(f"programs on {len(cases)} cases: best {merits.min():.4g}")
-        return _apart(np.array([point.z[:-1] for point in found]), merits)
+        self._progress(f"programs on {len(cases)} cases: best {merits.min():.4g}")
+        return _distinct_points(np.array([point.z[:-1] for point in found]), merits)
 
-    def _judge(self, unit: Array) -> Array:
+    def _select_best(self, unit: Array) -> Array:
         """The best few of the points by exact merits over all cases, the best first; it is kept."""
-        merits = merit(self._simulator.values(self._simulator.space.draw(unit), self._spec), self._spec, self._scale)
+        merits = merit(
+            self._simulator.values(self._simulator.space.from_unit(unit), self._spec), self._spec, self._scale
+        )
         self.count += len(unit)
-        if merits.min() < self._least:
-            self.best, self._least = unit[np.argmin(merits)], float(merits.min())
-        return _apart(unit, merits)[: self._method.keep]
+        if merits.min() < self._best_merit:
+            self.best, self._best_merit = unit[np.argmin(merits)], float(merits.min())
+        return _distinct_points(unit, merits)[: self._method.keep]
 
-    def _breaks(self) -> bool:
+    def _violates_limits(self) -> bool:
         """Whether the best point breaks a limit: then the penalties were too small."""
-        values = self._simulator.values(self._simulator.space.draw(self.best[None]), self._spec)
-        return bool(self._spec.violated(each(values)[0]))
+        values = self._simulator.values(self._simulator.space.from_unit(self.best[None]), self._spec)
+        return bool(self._spec.violations(to_records(values)[0]))
 
-    def _by_case(self, unit: Array) -> Array:
+    def _merits_by_case(self, unit: Array) -> Array:
         """Merits of each case, the sensitivity left out, shape (m, n_cases)."""
-        responses = self._simulator.respond(self._simulator.space.draw(unit), self._spec.band)
+        responses = self._simulator.respond(self._simulator.space.from_unit(unit), self._spec.band)
         self.count += len(unit)
-        plain = self._spec.without(ROBUSTNESS)
-        if plain.weight(ROBUSTNESS):
+        plain = self._spec.without(ROBUSTNESS_REQUIREMENTS)
+        if plain.weight(ROBUSTNESS_REQUIREMENTS):
             return np.zeros((len(unit), len(self._simulator.cases)))
-        return responses.spread(merit(responses.by_case(), plain, self._scale))
+        return responses.to_table(merit(responses.by_case(), plain, self._scale))
 
-    def _hardest(self, unit: Array) -> list[int]:
+    def _worst_cases(self, unit: Array) -> list[int]:
         """The cases that rank worst for most of some points; all if they are few."""
         count = len(self._simulator.cases)
         if count <= self._method.working:
             return list(range(count))
-        ranks = np.argsort(np.argsort(self._by_case(unit), axis=1), axis=1).mean(axis=0)
+        ranks = np.argsort(np.argsort(self._merits_by_case(unit), axis=1), axis=1).mean(axis=0)
         return sorted(np.argsort(-ranks, kind="stable")[: self._method.working].tolist())
 
-    def _missed(self, cases: Sequence[int], unit: Array) -> list[int]:
+    def _worse_cases(self, cases: Sequence[int], unit: Array) -> list[int]:
         """Cases outside the working set that are worse for the best point than all within."""
         if len(cases) == len(self._simulator.cases):
             return []
-        merits = self._by_case(np.vstack([self.best[None], unit])).max(axis=0)
+        merits = self._merits_by_case(np.vstack([self.best[None], unit])).max(axis=0)
         others = [k for k in range(len(merits)) if k not in set(cases) and merits[k] > merits[list(cases)].max()]
         return sorted(others, key=lambda k: -merits[k])[: self._method.working // 2]
 
 
-def _apart(unit: Array, merits: Array) -> Array:
+def _distinct_points(unit: Array, merits: Array) -> Array:
     """The points in order of merit, without those that lie close to a better one."""
     found = list[Array]()
     for k in np.argsort(merits, kind="stable"):
-        if all(np.max(np.abs(unit[k] - other)) > APART for other in found):
+        if all(np.max(np.abs(unit[k] - other)) > MIN_POINT_DISTANCE for other in found):
             found.append(unit[k])
     return np.array(found)

@@ -9,24 +9,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
-from pneuopt.shooting.full_space import FullSpace, prepare, solve_from
+from pneuopt.shooting.full_space import FullSpace, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Screening
-from pneuopt.tuning.simulator import Simulator, each
+from pneuopt.tuning.simulator import Simulator, to_records
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.two_phase import TwoPhase, check_exact, transcribe
+from pneuopt.tuning.two_phase import TwoPhase, check_exact, transcribe_two_phase
 
-Array = NDArray[np.float64]
-SAME = 0.01  # relative difference of two objectives up to which a search's answer is confirmed
-ROOM = 0.015  # by which the problem's band is tighter than the search's: between nodes a response grazes it
-SLACK = 1e-4  # by which a limit may be missed before the certificate decides
+MAX_CONFIRMED_DIFFERENCE = 0.01  # relative difference of two objectives up to which a search's answer is confirmed
+BAND_TIGHTENING = 0.015  # by which the problem's band is tighter than the search's: between nodes a response grazes it
+LIMIT_TOLERANCE = 1e-4  # by which a limit may be missed before the certificate decides
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ def check_confirmable(loop: ClosedLoop, space: Space, spec: Specification) -> No
     check_exact(spec)
 
 
-def reconsidered(
+def confirm(
     simulator: Simulator,
     references: Sequence[Step],
     spec: Specification,
@@ -90,21 +89,23 @@ def reconsidered(
     values : mapping of str to float
         What the requirements read there, from which the problem's further unknowns start.
     """
-    space = Space(simulator.space.filled(point), simulator.space.names)
+    space = Space(simulator.space.parameters_at(point), simulator.space.names)
     posed = TwoPhase(nodes=method.nodes, solver=method.solver)
-    transcription = transcribe(simulator.loop, references, space, spec.tightened(ROOM, ROOM / 10), posed)
+    transcription = transcribe_two_phase(
+        simulator.loop, references, space, spec.tighten(BAND_TIGHTENING, BAND_TIGHTENING / 10), posed
+    )
     given = transcription.parameters
     known = {n: float(np.clip(values[n], given[n].lower, given[n].upper)) for n in spec.kinds if given[n].free}
     transcription = replace(transcription, parameters=given.with_values(known))
-    solution = solve_from(prepare(transcription, method.solver), transcription.parameters)
+    solution = solve_from(prepare_full_space(transcription, method.solver), transcription.parameters)
     moved = np.array([solution.parameters.value(n) for n in space.names])
-    after = each(simulator.values(moved[None], spec))[0]
+    after = to_records(simulator.values(moved[None], spec))[0]
     before, cost = spec.objective(values), spec.objective(after)
-    better = solution.status.converged and cost < before and not spec.violated(after, SLACK)
-    return (moved if better else point), told(solution, before, cost if better else np.inf)
+    better = solution.status.converged and cost < before and not spec.violations(after, LIMIT_TOLERANCE)
+    return (moved if better else point), describe_confirmation(solution, before, cost if better else np.inf)
 
 
-def told(solution: Solution, before: float, after: float) -> str:
+def describe_confirmation(solution: Solution, before: float, after: float) -> str:
     """What came of it, in words.
 
     Parameters
@@ -127,10 +128,10 @@ def told(solution: Solution, before: float, after: float) -> str:
     if not solution.status.converged:
         return f"full space: not converged ({solution.status.message}); the search's answer stands"
     count, cost = f"{solution.stats['iterations']:.0f} iterations", solution.stats["cost"]
-    if after < before * (1 - SAME):
+    if after < before * (1 - MAX_CONFIRMED_DIFFERENCE):
         return f"full space: bettered from {before:.6g} to {after:.6g} in {count}"
     within = abs(min(after, cost) - before) / abs(before)
-    if within <= SAME:
+    if within <= MAX_CONFIRMED_DIFFERENCE:
         return f"full space: confirmed, a local optimum within {100 * within:.2g} % after {count}"
     why = "which is worse" if cost > before else "which the simulation does not show"
     return f"full space: ended in {cost:.6g} after {count}, {why}; the search's {before:.6g} stands"

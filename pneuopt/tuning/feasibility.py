@@ -5,28 +5,27 @@ from dataclasses import replace
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.control.rest import find_rest, sliding
-from pneuopt.evaluation.cases import Case
+from pneuopt.control.rest import find_rest, set_sliding_direction
+from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.margins import frequency_response
-from pneuopt.evaluation.means import TAIL
-from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, most, name
+from pneuopt.evaluation.means import TAIL_SHARE
+from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.tuning.space import Space, highest
+from pneuopt.tuning.space import Space, highest_dither_frequency
 
-Array = NDArray[np.float64]
-SLOW = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read
-HALVINGS = 10  # of the interval in which the fastest reachable reference is sought
+STATIC_SIGN_FREQUENCY = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read
+BISECTION_STEPS = 10  # of the interval in which the fastest reachable reference is sought
 
 
-def check_reach(loop: ClosedLoop, every: Sequence[Case], space: Space, spec: Specification) -> None:
+def check_feasibility(loop: ClosedLoop, every: Sequence[TuningCase], space: Space, spec: Specification) -> None:
     """Refuse what no gains can mend.
 
     Parameters
@@ -55,37 +54,37 @@ def check_reach(loop: ClosedLoop, every: Sequence[Case], space: Space, spec: Spe
 
 def _check_dither(loop: ClosedLoop, space: Space) -> None:
     if loop.dither is not None:
-        loop.dither.check(highest(loop, space.parameters), loop.pid.sample_time)
+        loop.dither.check(highest_dither_frequency(loop, space.parameters), loop.pid.sample_time)
 
 
 def _check_horizon(reference: Step, spec: Specification) -> None:
     record = reference.horizon - reference.at
     for q in spec.limits:
-        if isinstance(q, SettlingTime | RiseTime) and most(q) > (1 - TAIL) * record:
-            told = f"{name(q)}: max {most(q):g} s is more than {record:g} s after the step can show"
-            needed = f"{reference.at + most(q) / (1 - TAIL):.4g} s"
-            require(False, f"{told} (reference {reference.label}); lengthen its horizon to {needed}, or lower max")
+        if isinstance(q, SettlingTime | RiseTime) and upper_limit(q) > (1 - TAIL_SHARE) * record:
+            message = f"{metric_name(q)}: max {upper_limit(q):g} s is more than {record:g} s after the step can show"
+            needed = f"{reference.at + upper_limit(q) / (1 - TAIL_SHARE):.4g} s"
+            require(False, f"{message} (reference {reference.label}); lengthen its horizon to {needed}, or lower max")
     first = min((t for t, _, _ in spec.envelope), default=0.0)
-    told = f"StepEnvelope begins {first:g} s after the step, the record of reference {reference.label} ends after"
-    require(first < record, f"{told} {record:g} s; lengthen its horizon, or let the bounds begin earlier")
+    message = f"StepEnvelope begins {first:g} s after the step, the record of reference {reference.label} ends after"
+    require(first < record, f"{message} {record:g} s; lengthen its horizon, or let the bounds begin earlier")
 
 
 def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
-    Tf = _range(space, "pid.Tf")[1] + 0.5 * (loop.pid.sample_time or 0.0)  # as `linear_gains` has it
-    least = _least(space, "pid.Kp") + (_least(space, "pid.Kd") / Tf if Tf else 0.0)
-    told = (
+    Tf = _parameter_range(space, "pid.Tf")[1] + 0.5 * (loop.pid.sample_time or 0.0)  # as `linear_gains` has it
+    least = _least_size(space, "pid.Kp") + (_least_size(space, "pid.Kd") / Tf if Tf else 0.0)
+    message = (
         f"NoiseGain: max {spec.limit(NoiseGain):g} is below Kp + Kd/Tf, at least {least:.4g} within the gains' bounds"
     )
-    require(least <= spec.limit(NoiseGain), f"{told}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
+    require(least <= spec.limit(NoiseGain), f"{message}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
 
 
-def _check_travel(loop: ClosedLoop, case: Case, space: Space) -> None:
+def _check_travel(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
     """That a piston led along the reference stays off the end stops."""
-    stops = [g for g in loop.plant.guards if g.state == "position"]
+    stops = [g for g in loop.plant.validity_limits if g.state == "position"]
     states = [q.name for q in loop.plant.states]
     if not stops or "position" not in states:
         return
-    reference, own = case.reference, case.filled(space.parameters)
+    reference, own = case.reference, case.case_parameters(space.parameters)
     begin = float(case.initial(loop, space.parameters)[states.index("position")])
     for stop in stops:
         limit = stop.limit(loop.parameters | own)
@@ -103,53 +102,55 @@ def _check_travel(loop: ClosedLoop, case: Case, space: Space) -> None:
         where = "front" if stop.side > 0 else "rear"
         require(
             far <= left,
-            f"{_lead(case)}it leads the piston over {write_value(far, 'm', 4)}, but from position "
+            f"{_case_prefix(case)}it leads the piston over {write_value(far, 'm', 4)}, but from position "
             f"{write_value(begin, 'm', 4)} to the {where} end stop there are {write_value(max(left, 0.0), 'm', 4)}; "
             f"{remedy}",
         )
 
 
-def _check_hold(loop: ClosedLoop, case: Case, space: Space, spec: Specification) -> None:
+def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
     """That some command, one that the limits allow, holds the reference to within the settling band."""
     reference = case.reference
     target = reference.final - spec.band * reference.size  # of a disturbance alone 0: what is to be held is known
 
-    def missing(share: float) -> str:
+    def find_obstacle(share: float) -> str:
         """What keeps a part of the reference from being held; empty: nothing."""
         try:
-            command = _holding(loop, case, space, share * target)
+            command = _holding_command(loop, case, space, share * target)
         except InputError as error:
             return str(error)
-        return _beyond(loop, case, space, spec, command, share * target)
+        return _describe_command_excess(loop, case, space, spec, command, share * target)
 
-    fault = missing(1.0)
+    fault = find_obstacle(1.0)
     if fault:
         low, high = 0.0, 1.0
-        for _ in range(HALVINGS if not missing(0.0) else 0):
+        for _ in range(BISECTION_STEPS if not find_obstacle(0.0) else 0):
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if missing(middle) else (middle, high)
+            low, high = (low, middle) if find_obstacle(middle) else (middle, high)
         most_held = f"; the most that can be held is {low * target:.3g} {loop.feedback.unit}" if low else ""
-        require(False, f"{_lead(case)}{fault}{most_held}")
+        require(False, f"{_case_prefix(case)}{fault}{most_held}")
 
 
-def _holding(loop: ClosedLoop, case: Case, space: Space, value: float) -> float:
+def _holding_command(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> float:
     """The command that holds the measured signal at a value; 0 where no steady state is known."""
     try:
-        return _held(loop, case, space, value)[1]
+        return _find_operating_point(loop, case, space, value)[1]
     except ConvergenceError:
         return 0.0
 
 
-def _held(loop: ClosedLoop, case: Case, space: Space, value: float) -> tuple[Array, float]:
+def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> tuple[Array, float]:
     """The plant's state and the command with the measured signal at a value, as an integral action finds them."""
-    own, acting = case.filled(loop.parameters | space.parameters), replace(loop, pid=PID(loop.pid.sample_time))
+    own, acting = case.case_parameters(loop.parameters | space.parameters), replace(loop, pid=PID(loop.pid.sample_time))
     own = own | ParameterSet({"pid.Ki": replace(acting.parameters["pid.Ki"], value=1.0)})
     start = {n: v for n, v in case.reference.start.items() if n == "position"}
-    return find_rest(acting, sliding(acting, own, value), value, start)
+    return find_rest(acting, set_sliding_direction(acting, own, value), value, start)
 
 
-def _beyond(loop: ClosedLoop, case: Case, space: Space, spec: Specification, command: float, value: float) -> str:
-    own, unit = case.filled(loop.parameters | space.parameters), loop.command.unit
+def _describe_command_excess(
+    loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, command: float, value: float
+) -> str:
+    own, unit = case.case_parameters(loop.parameters | space.parameters), loop.command.unit
     takes = f"holding {value:.4g} {loop.feedback.unit} takes {command:.4g} {unit}"
     if loop.pid.limits:
         low, high = own.value("pid.lower"), own.value("pid.upper")
@@ -157,7 +158,7 @@ def _beyond(loop: ClosedLoop, case: Case, space: Space, spec: Specification, com
             return (
                 f"{takes}, the controller's limits are {low:g} and {high:g} {unit}; take a smaller step, or widen them"
             )
-    shaken = _least(space, "dither.amplitude")
+    shaken = _least_size(space, "dither.amplitude")
     if abs(command) + shaken > spec.limit(PeakControl):
         beside = f" beside a dither of at least {shaken:g} {unit}" if shaken else ""
         most_allowed = f"PeakControl allows {spec.limit(PeakControl):g} {unit}"
@@ -165,33 +166,33 @@ def _beyond(loop: ClosedLoop, case: Case, space: Space, spec: Specification, com
     return ""
 
 
-def _check_sign(loop: ClosedLoop, case: Case, space: Space) -> None:
+def _check_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
     """That not every loop allowed is positive feedback."""
     sign = _static_sign(loop, case, space)
-    gains = {n: [sign * v for v in _range(space, n)] for n in ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")}
+    gains = {n: [sign * v for v in _parameter_range(space, n)] for n in ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")}
     best = {n: max(ends) for n, ends in gains.items()}
     wrong = [n for n, ends in gains.items() if max(ends) <= 0 and min(ends) < 0]
     hopeless = best["pid.Ki"] < 0 or (wrong and all(v <= 0 for v in best.values()))
     if sign and hopeless:
-        words = ", ".join(f"{n} within [{', '.join(f'{v:g}' for v in _range(space, n))}]" for n in wrong)
+        words = ", ".join(f"{n} within [{', '.join(f'{v:g}' for v in _parameter_range(space, n))}]" for n in wrong)
         moves = f"{loop.feedback.name} {'rises' if sign > 0 else 'falls'} with {loop.command.name}"
         remedy = "turn the sign of the gains' bounds, or of the actuator"
         require(False, f"{words}: every gain allowed has the wrong sign, for the plant's {moves}; {remedy}")
 
 
-def _static_sign(loop: ClosedLoop, case: Case, space: Space) -> float:
+def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
     """Of the plant's response to a slow command, where it follows the reference; 0 where that is unknown."""
-    reference, own = case.reference, case.filled(loop.parameters | space.parameters)
+    reference, own = case.reference, case.case_parameters(loop.parameters | space.parameters)
     try:
-        x, command = _held(loop, case, space, reference.final)
+        x, command = _find_operating_point(loop, case, space, reference.final)
         plant = loop.linear_plant(own, x, {loop.command.name: command})
-        slow = complex(frequency_response(plant, [SLOW / reference.horizon])[0])
+        slow = complex(frequency_response(plant, [STATIC_SIGN_FREQUENCY / reference.horizon])[0])
     except (ConvergenceError, InputError, ModelError, np.linalg.LinAlgError):
         return 0.0
     return float(np.sign(slow.real if abs(slow.real) >= abs(slow.imag) else -slow.imag))
 
 
-def _range(space: Space, n: str) -> tuple[float, float]:
+def _parameter_range(space: Space, n: str) -> tuple[float, float]:
     """Between what a parameter may lie, a fixed one at its value; (0, 0) where there is none."""
     if n not in space.parameters:
         return 0.0, 0.0
@@ -199,11 +200,11 @@ def _range(space: Space, n: str) -> tuple[float, float]:
     return (p.lower, p.upper) if n in space.names else (p.value, p.value)
 
 
-def _least(space: Space, n: str) -> float:
+def _least_size(space: Space, n: str) -> float:
     """The least size that a parameter may have."""
-    low, high = _range(space, n)
+    low, high = _parameter_range(space, n)
     return 0.0 if low <= 0 <= high else min(abs(low), abs(high))
 
 
-def _lead(case: Case) -> str:
+def _case_prefix(case: TuningCase) -> str:
     return f"reference {case.label}: "

@@ -9,32 +9,35 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.evaluation.means import TAIL
-from pneuopt.evaluation.metrics import PERIODS_INSIDE
-from pneuopt.evaluation.requirements import ROBUSTNESS, Overshoot, SettlingTime, SteadyStateError, read
+from pneuopt.evaluation.means import TAIL_SHARE
+from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
+from pneuopt.evaluation.requirements import (
+    ROBUSTNESS_REQUIREMENTS,
+    Overshoot,
+    SettlingTime,
+    SteadyStateError,
+    requirement_values,
+)
 from pneuopt.evaluation.specification import Specification
-from pneuopt.tuning.readings import CONTROL, METERED, watched
-from pneuopt.tuning.rows import READ, Lanes
-from pneuopt.tuning.rows import nodes as times
-from pneuopt.tuning.simulator import Mask, Simulator, is_sound
-from pneuopt.tuning.sqp import Groups, Point
+from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.tuning.readings import AIR_METRIC, CONTROL_OUTPUT, loop_pieces
+from pneuopt.tuning.rows import ROW_READERS, Lanes, reading_times
+from pneuopt.tuning.simulator import Simulator, is_sound
+from pneuopt.tuning.sqp import LinearisedPoint, RowGroups
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-SMOOTH = (SettlingTime, *READ, *ROBUSTNESS)
+SMOOTH_REQUIREMENTS = (SettlingTime, *ROW_READERS, *ROBUSTNESS_REQUIREMENTS)
 """What gradients are there for."""
-BAND = 50.0  # what leaving the band by the whole step costs at least, times the objective's scale
-LIMIT = 2.0  # what a limit missed by its whole size costs, times the same
-FREELY = 5.0  # trust region of Ts over that of the gains: with 1 it, not they, was what held steps back
-LANES = 64  # that are run and read at a time
-NUDGE = 1e-4  # of a gain's range: the sensitivity is differentiated over it
+PROGRAM_BAND_PENALTY = 50.0  # what leaving the band by the whole step costs at least, times the objective's scale
+PROGRAM_LIMIT_PENALTY = 2.0  # what a limit missed by its whole size costs, times the same
+SETTLING_RADIUS_RATIO = 5.0  # trust region of Ts over that of the gains: with 1 it, not they, was what held steps back
+MAX_SENSITIVITY_LANES = 64  # that are run and read at a time
+DIFFERENCE_STEP = 1e-4  # of a gain's range: the sensitivity is differentiated over it
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class LinearisedResponse:
     """What was read off one point's responses to one reference, C cases on K nodes, by n gains.
 
     Attributes
@@ -52,7 +55,7 @@ class Reading:
     derivatives: dict[type, Array]
 
 
-class Linearised:
+class LinearisedProblem:
     """The problem that `nlp.sqp` minimises: unknowns are the gains as numbers from 0 to 1, and Ts over the horizon.
 
     Parameters
@@ -60,7 +63,7 @@ class Linearised:
     simulator : Simulator
         Of the cases that count.
     rollout : Rollout
-        Of `differentiated`.
+        Of `sensitivity_rollout`.
     spec : Specification
     nodes : int
         At which a response is read.
@@ -83,33 +86,35 @@ class Linearised:
         self._space = simulator.space
         self._order = list(simulator.loop.parameters)
         self._wrt = [self._order.index(n) for n in self._space.names]
-        self._cases = [np.flatnonzero(own) for own in simulator.by_grid()]
-        self._periods = simulator.averaged_over()
+        self._cases = [np.flatnonzero(own) for own in simulator.cases_by_grid()]
+        self._periods = simulator.dither_periods()
         self.horizon = min(g.reference.horizon - g.reference.at for g in simulator.grids)
-        self._strides = [max(1, (len(g.t) - g.after) // nodes) for g in simulator.grids]
+        self._strides = [max(1, (len(g.t) - g.step_index) // nodes) for g in simulator.grids]
         longest = max(self._periods, default=0.0)
-        self._nodes = [times(g, stride, longest) for g, stride in zip(simulator.grids, self._strides, strict=True)]
-        self._latest = (1 - TAIL) * self.horizon
-        self._latest = min(self._latest, self.horizon - PERIODS_INSIDE * max(self._periods, default=0.0))
+        self._nodes = [
+            reading_times(g, stride, longest) for g, stride in zip(simulator.grids, self._strides, strict=True)
+        ]
+        self._latest = (1 - TAIL_SHARE) * self.horizon
+        self._latest = min(self._latest, self.horizon - MIN_SETTLED_PERIODS * max(self._periods, default=0.0))
         most = min(self._latest, spec.limit(SettlingTime))
         low = most if spec.concerns(SettlingTime) and not spec.weight(SettlingTime) else 0.0
         self.bounds = np.array([*[[0.0, 1.0]] * len(self._space.names), [low / self.horizon, most / self.horizon]])
-        self.scales = np.append(np.ones(len(self._space.names)), FREELY)
+        self.scales = np.append(np.ones(len(self._space.names)), SETTLING_RADIUS_RATIO)
 
     def start(self, unit: Array) -> Array:
         """Unknowns for gains, shape (m, n + 1): Ts as late as may be, which `improve` mends."""
         return np.column_stack([np.clip(unit, 0.0, 1.0), np.full(len(unit), self.bounds[-1, 1])])
 
-    def evaluate(self, z: Array) -> Sequence[Point]:
+    def evaluate(self, z: Array) -> Sequence[LinearisedPoint]:
         """Simulate and linearise each row of z."""
         self.count += len(z)
         readings = self._read(z[:, :-1])
         return [self._point(row, reading) for row, reading in zip(z, readings, strict=True)]
 
-    def improve(self, point: Point) -> Point:
+    def improve(self, point: LinearisedPoint) -> LinearisedPoint:
         """The same gains with their best Ts: the earliest, or one a little early if that is worth its penalty."""
         weight = self._spec.weight(SettlingTime)
-        readings: Sequence[Reading] = point.data
+        readings: Sequence[LinearisedResponse] = point.data
         if not weight or not np.isfinite(point.values).any() or np.isinf(point.merit):
             return point
         times = np.unique(np.concatenate(self._nodes))
@@ -119,7 +124,7 @@ class Linearised:
             after = np.maximum.accumulate(size.max(axis=0)[::-1])[::-1]
             k = np.searchsorted(t, times)
             late = np.maximum(late, np.append(after, 0.0)[k])
-            crossings = np.maximum(crossings, np.append(_crossings(t, size, self._spec.band), np.inf)[k])
+            crossings = np.maximum(crossings, np.append(_band_entry_times(t, size, self._spec.band), np.inf)[k])
         excess = np.maximum(late - self._spec.band, 0.0)
         times = np.where(excess == 0, np.minimum(crossings, times), times)
         costs = np.where(
@@ -131,15 +136,15 @@ class Linearised:
 
     @cached_property
     def _band_weight(self) -> float:
-        return self._scale * max(BAND, 1 / self._spec.band)
+        return self._scale * max(PROGRAM_BAND_PENALTY, 1 / self._spec.band)
 
     @cached_property
-    def _groups(self) -> tuple[list[tuple[type, float, bool]], Groups]:
+    def _groups(self) -> tuple[list[tuple[type, float, bool]], RowGroups]:
         """Rows' kinds, what their values are divided by, whether they are limits; the band's is the first group."""
         kinds, weights, floors = list[tuple[type, float, bool]](), [], []
         if self._spec.concerns(SettlingTime):
             kinds, weights, floors = [(SettlingTime, 1.0, True)], [self._band_weight], [0.0]
-        for kind in SMOOTH[1:]:
+        for kind in SMOOTH_REQUIREMENTS[1:]:
             weight, limit = self._spec.weight(kind), self._spec.limit(kind)
             if weight > 0:
                 kinds.append((kind, 1.0, False))
@@ -147,13 +152,13 @@ class Linearised:
                 floors.append(0.0 if kind in (Overshoot, SteadyStateError) else -np.inf)
             if limit < np.inf:
                 kinds.append((kind, limit, True))
-                weights.append(LIMIT * self._scale)
+                weights.append(PROGRAM_LIMIT_PENALTY * self._scale)
                 floors.append(0.0)
-        return kinds, Groups(np.array(weights), np.array(floors))
+        return kinds, RowGroups(np.array(weights), np.array(floors))
 
-    def _point(self, z: Array, readings: Sequence[Reading]) -> Point:
+    def _point(self, z: Array, readings: Sequence[LinearisedResponse]) -> LinearisedPoint:
         kinds, groups = self._groups
-        values, slopes, group = list[Array](), list[Array](), list[Index]()
+        values, slopes, group = list[Array](), list[Array](), list[Indices]()
         for g, (kind, size, is_limit) in enumerate(kinds):
             for t, reading in zip(self._nodes, readings, strict=True):
                 if kind is SettlingTime:
@@ -167,9 +172,9 @@ class Linearised:
         weight = self._spec.weight(SettlingTime) * self.horizon
         gradient = np.append(np.zeros(len(z) - 1), weight)
         rows, whose = (np.concatenate(values), np.concatenate(slopes)), np.concatenate(group)
-        return Point(z, float(weight * z[-1]), gradient, *rows, whose, groups, readings)
+        return LinearisedPoint(z, float(weight * z[-1]), gradient, *rows, whose, groups, readings)
 
-    def _band_rows(self, t: Array, reading: Reading, Ts: float) -> tuple[Array, Array]:
+    def _band_rows(self, t: Array, reading: LinearisedResponse, Ts: float) -> tuple[Array, Array]:
         """Both sides of the band at as many instants from Ts to the end, which move with it."""
         late = np.linspace(0.0, 1.0, len(t))
         at = Ts + late * (t[-1] - Ts)
@@ -183,25 +188,28 @@ class Linearised:
         slopes = np.concatenate([by_gain, by_time[..., None]], axis=-1)
         return np.array([error, -error]) - self._spec.band, np.array([slopes, -slopes])
 
-    def _read(self, unit: Array) -> list[list[Reading]]:
+    def _read(self, unit: Array) -> list[list[LinearisedResponse]]:
         """Readings of each point, one a reference."""
-        points = self._space.draw(unit)
-        found: list[list[Reading]] = [[] for _ in points]
+        points = self._space.from_unit(unit)
+        found: list[list[LinearisedResponse]] = [[] for _ in points]
         for g, own in enumerate(self._cases):
             rows, case = np.repeat(np.arange(len(points)), len(own)), np.tile(own, len(points))
             parts = [
-                self._lanes(g, points, rows[k : k + LANES], case[k : k + LANES]) for k in range(0, len(rows), LANES)
+                self._simulate_lanes(
+                    g, points, rows[k : k + MAX_SENSITIVITY_LANES], case[k : k + MAX_SENSITIVITY_LANES]
+                )
+                for k in range(0, len(rows), MAX_SENSITIVITY_LANES)
             ]
-            whole = _joined(parts)
+            whole = _concatenate_responses(parts)
             for i in range(len(points)):
-                found[i].append(_part(whole, slice(i * len(own), (i + 1) * len(own))))
+                found[i].append(_slice_response(whole, slice(i * len(own), (i + 1) * len(own))))
         return found
 
-    def _lanes(self, g: int, points: Array, rows: Index, case: Index) -> Reading:
+    def _simulate_lanes(self, g: int, points: Array, rows: Indices, case: Indices) -> LinearisedResponse:
         """Simulate lanes on one grid and read them."""
         grid = self._simulator.grids[g]
         p, starts = self._simulator.lanes(points, rows, case)
-        u, instants, h, steps = self._simulator.padded(case)
+        u, instants, h, steps = self._simulator.pad(case)
         with np.errstate(all="ignore"):
             found = self._rollout.run(starts, u, p, instants, h, substeps=steps)
         assert found.dy is not None
@@ -218,43 +226,47 @@ class Linearised:
             self._spec.envelope,
         )
         error, by_gain = lanes.error
-        rows_of = {kind: reader(lanes) for kind, reader in READ.items() if self._spec.concerns(kind)}
-        if self._spec.concerns(ROBUSTNESS):
-            ends = self._simulator.points_of_operation(
-                p[sound], case[sound], found.x_end[sound], found.y[sound, -1, CONTROL]
+        rows_of = {kind: reader(lanes) for kind, reader in ROW_READERS.items() if self._spec.concerns(kind)}
+        if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
+            ends = self._simulator.operating_points(
+                p[sound], case[sound], found.x_end[sound], found.y[sound, -1, CONTROL_OUTPUT]
             )
-            rows_of |= self._robust(p, sound, ends, points[rows], case)
-        return Reading(
+            rows_of |= self._robustness_rows(p, sound, ends, points[rows], case)
+        return LinearisedResponse(
             np.where(sound[:, None], error, np.inf),
             by_gain,
             {kind: np.where(sound[:, None], value, np.inf) for kind, (value, _) in rows_of.items()},
             {kind: slopes for kind, (_, slopes) in rows_of.items()},
         )
 
-    def _chain(self, points: Array, rows: Index, case: Index) -> Array:
+    def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:
         """How parameters, and before them the rest, move with the unknowns, shape (m, n_columns, n)."""
         names, cases = self._space.names, self._simulator.cases
         factors = np.array([case.slopes(names) for case in cases])[case]
         chain = factors[:, :, None] * np.eye(len(names))
         if self._rollout.n_columns > len(names):
             chain = np.concatenate([self._rest_slopes(points, rows, case), chain], axis=1)
-        return np.asarray(chain * self._space.rates(points)[rows][:, None, :])
+        return np.asarray(chain * self._space.from_unit_slope(points)[rows][:, None, :])
 
-    def _rest_slopes(self, points: Array, rows: Index, case: Index) -> Array:
+    def _rest_slopes(self, points: Array, rows: Indices, case: Indices) -> Array:
         """How the rest moves with the gains, by central differences, shape (m, n_states, n)."""
         (low, up), columns = self._space.bounds.T, []
-        for k, step in enumerate(NUDGE * (up - low)):
+        for k, step in enumerate(DIFFERENCE_STEP * (up - low)):
             nudge = step * (np.arange(len(low)) == k)
             above, below = (np.clip(points + sign * nudge, low, up) for sign in (1, -1))
             moved = (self._simulator.lanes(side, rows, case)[1] for side in (above, below))
             columns.append((next(moved) - next(moved)) / (above - below)[rows, k][:, None])
         return np.stack(columns, axis=-1)
 
-    def _robust(
-        self, p: Array, sound: Mask, ends: tuple[Array, Array], points: Array, case: Index
+    def _robustness_rows(
+        self, p: Array, sound: Mask, ends: tuple[Array, Array], points: Array, case: Indices
     ) -> dict[type, tuple[Array, Array]]:
         """Margins and peaks of the linearised loop, and derivatives by differences, the operating point held."""
-        names, n, kinds = self._space.names, len(self._wrt), [k for k in ROBUSTNESS if self._spec.concerns(k)]
+        names, n, kinds = (
+            self._space.names,
+            len(self._wrt),
+            [k for k in ROBUSTNESS_REQUIREMENTS if self._spec.concerns(k)],
+        )
         felt = {f"pid.{gain}" for gain in self._simulator.loop.pid.form.gains}
         shaping = [k for k, name in enumerate(names) if name in felt]
         found: dict[type, tuple[Array, Array]] = {
@@ -262,13 +274,13 @@ class Linearised:
         }
         if not sound.any():
             return found
-        steps = NUDGE * np.diff(self._space.bounds, axis=1)[:, 0]
+        steps = DIFFERENCE_STEP * np.diff(self._space.bounds, axis=1)[:, 0]
         nudged = [p, *(p + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping)]
         tiled = np.tile(ends[0], (len(nudged), 1)), np.tile(ends[1], len(nudged))
         stacked = np.concatenate([q[sound] for q in nudged])
-        metrics = read(self._simulator.robustness(stacked, *tiled, [k.__name__ for k in kinds]))
+        metrics = requirement_values(self._simulator.robustness(stacked, *tiled, [k.__name__ for k in kinds]))
         factors = np.array([c.slopes(names) for c in self._simulator.cases])[case[sound]]
-        rates = self._space.rates(points[sound]) * factors
+        rates = self._space.from_unit_slope(points[sound]) * factors
         for kind, (values, slopes) in found.items():
             first, *others = np.reshape(metrics[kind.__name__], (len(nudged), -1))
             values[sound, 0] = np.nan_to_num(first, nan=np.inf, posinf=np.inf)
@@ -278,18 +290,18 @@ class Linearised:
         return found
 
 
-def differentiated(simulator: Simulator) -> Rollout:
+def sensitivity_rollout(simulator: Simulator) -> Rollout:
     """The compiled loop with its sensitivities to the gains; to the start where the rest depends on them."""
     order, names = list(simulator.loop.parameters), simulator.space.names
     through_start = any(simulator.starts_vary(k) for k in range(len(simulator.cases)))
     return Rollout(
-        watched(simulator.loop, with_meter=METERED in simulator.read),
+        loop_pieces(simulator.loop, with_meter=AIR_METRIC in simulator.response_metrics),
         [order.index(n) for n in names],
         start=through_start,
     )
 
 
-def _crossings(t: Array, size: Array, band: float) -> Array:
+def _band_entry_times(t: Array, size: Array, band: float) -> Array:
     """For each node when the band was last entered just before it, linear between nodes; the node's time otherwise."""
     before, after = size[:, :-1], size[:, 1:]
     with np.errstate(all="ignore"):
@@ -298,11 +310,11 @@ def _crossings(t: Array, size: Array, band: float) -> Array:
     return np.asarray(np.append(t[0], entered.max(axis=0)))
 
 
-def _joined(parts: Sequence[Reading]) -> Reading:
+def _concatenate_responses(parts: Sequence[LinearisedResponse]) -> LinearisedResponse:
     if len(parts) == 1:
         return parts[0]
     kinds = parts[0].values
-    return Reading(
+    return LinearisedResponse(
         np.concatenate([r.error for r in parts]),
         np.concatenate([r.by_gain for r in parts]),
         {k: np.concatenate([r.values[k] for r in parts]) for k in kinds},
@@ -310,8 +322,8 @@ def _joined(parts: Sequence[Reading]) -> Reading:
     )
 
 
-def _part(whole: Reading, lanes: slice) -> Reading:
-    return Reading(
+def _slice_response(whole: LinearisedResponse, lanes: slice) -> LinearisedResponse:
+    return LinearisedResponse(
         whole.error[lanes],
         whole.by_gain[lanes],
         {k: v[lanes] for k, v in whole.values.items()},

@@ -15,34 +15,42 @@ from math import nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.requirements import Requirement, bound, bounded, most, name, shown
-from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
-from pneuopt.evaluation.specification import Specification, allowing
+from pneuopt.evaluation.requirements import (
+    Requirement,
+    metric_name,
+    upper_limit,
+    user_limit,
+    user_value,
+    with_user_limit,
+)
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.evaluation.specification import Specification, with_upper_limit
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code, Solution, Status
-from pneuopt.tuning.relaxation import settling
-from pneuopt.tuning.result import Found, TuningResult
+from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.shooting.solution import Solution
+from pneuopt.tuning.relaxation import limits_with_settling
+from pneuopt.tuning.result import SearchResult, TuningResult
 from pneuopt.tuning.screening import first_population
-from pneuopt.tuning.search import Method, Search, brief, ended_in
-from pneuopt.tuning.simulator import each
-from pneuopt.tuning.space import Tell
-from pneuopt.tuning.tune import pose
+from pneuopt.tuning.search import Method, Search, end_point, short_method
+from pneuopt.tuning.simulator import to_records
+from pneuopt.tuning.tune import prepare_search
 from pneuopt.tuning.two_phase import TwoPhase, TwoPhasePath, two_phase_path
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-WIDE = 8.0  # ratio of the ends from which on the limits lie evenly in the logarithm
-ROUNDS = 2  # of searching again for designs that others beat
-SAMPLES = 2000  # points at which all requirements are read: branches that neither end leads to
-BEATEN = 1e-3  # relative, by which another design has to be better
-BESIDE = 1e-3  # weight of the other requirement at an end: of designs that are equally good, the best by the other
+LOG_SPACING_RATIO = 8.0  # ratio of the ends from which on the limits lie evenly in the logarithm
+MAX_IMPROVEMENT_ROUNDS = 2  # of searching again for designs that others beat
+RIVAL_SAMPLES = 2000  # points at which all requirements are read: branches that neither end leads to
+MIN_IMPROVEMENT = 1e-3  # relative, by which another design has to be better
+SECONDARY_WEIGHT = (
+    1e-3  # weight of the other requirement at an end: of designs that are equally good, the best by the other
+)
 
 
 def pareto_front(
@@ -52,11 +60,11 @@ def pareto_front(
     *,
     minimise: tuple[Requirement, Requirement],
     subject_to: Sequence[Requirement] = (),
-    scenarios: Scenarios = NOMINAL,
+    scenarios: Scenarios = NO_SCENARIOS,
     points: int = 15,
     until: float | None = None,
     method: Method | None = None,
-    progress: Tell | None = None,
+    progress: ProgressCallback | None = None,
 ) -> "pd.DataFrame":
     """Designs that are best by one requirement for what they are by another.
 
@@ -101,16 +109,21 @@ def pareto_front(
     (True, True)
     """
     first, second = minimise
-    require(name(first) != name(second), f"both requirements are {name(first)}; a front needs two kinds")
+    require(
+        metric_name(first) != metric_name(second),
+        f"both requirements are {metric_name(first)}; a front needs two kinds",
+    )
     require(points >= 2, f"a front needs at least 2 points, got {points}")
-    last = None if until is None else most(bounded(second, until))
-    told = f"a front from {name(second)} {bound(second)} until {until} ends before it begins"
-    require(last is None or last < most(second), told)
-    both = pose(loop, references, parameters, {first: 1.0, second: 1.0}, subject_to, scenarios, method, progress)
+    last = None if until is None else upper_limit(with_user_limit(second, until))
+    message = f"a front from {metric_name(second)} {user_limit(second)} until {until} ends before it begins"
+    require(last is None or last < upper_limit(second), message)
+    both = prepare_search(
+        loop, references, parameters, {first: 1.0, second: 1.0}, subject_to, scenarios, method, progress
+    )
     front = _Front(both, first, second, last)
     with suppress(KeyboardInterrupt):
-        front.find(points)
-    return front.frame()
+        front.find_designs(points)
+    return front.to_frame()
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,30 +149,30 @@ class Design:
 class _Front:
     """A front in the making."""
 
-    both: Search
+    base_search: Search
     first: Requirement
     second: Requirement
     last: float | None
     designs: list[Design] = field(default_factory=list)
 
-    def find(self, points: int) -> None:
+    def find_designs(self, points: int) -> None:
         """All designs; again where one between the ends shows that an end was none."""
         self.designs = [Design(nan)] * points
         for k, q in ((0, self.first), (-1, self.second)):
-            self.designs[k] = self._end(q)
+            self.designs[k] = self._find_end(q)
         ends = [self.designs[0], self.designs[-1]]
-        for _ in range(ROUNDS):
+        for _ in range(MAX_IMPROVEMENT_ROUNDS):
             done = self.designs
             try:
-                self._between(ends, points)
+                self._fill_between(ends, points)
             except KeyboardInterrupt:
-                self.designs = max((self.designs, done), key=_count)
+                self.designs = max((self.designs, done), key=_count_successes)
                 raise
             better = [self._best(self.first), self._best(self.second)]
             if better == ends or len(self.designs) == 1:
                 break
             pairs = zip((self.first, self.second), ends, better, strict=True)
-            ends = [old if old is new else self._end(q, new.result) for q, old, new in pairs]
+            ends = [old if old is new else self._find_end(q, new.result) for q, old, new in pairs]
 
     def _best(self, requirement: Requirement) -> Design:
         """The best design by one requirement; an end unless another is clearly better."""
@@ -167,147 +180,169 @@ class _Front:
         if requirement is self.second and self.last is not None:
             return end
         good = [d for d in self.designs if d.result is not None and d.result.status.converged]
-        best = min(good, key=lambda d: _value(_found(d), requirement))
-        return best if _value(_found(best), requirement) < _value(_found(end), requirement) * (1 - BEATEN) else end
+        best = min(good, key=lambda d: _result_value(_result_of(d), requirement))
+        return (
+            best
+            if _result_value(_result_of(best), requirement)
+            < _result_value(_result_of(end), requirement) * (1 - MIN_IMPROVEMENT)
+            else end
+        )
 
-    def _between(self, ends: list[Design], points: int) -> None:
+    def _fill_between(self, ends: list[Design], points: int) -> None:
         """What lies between the ends."""
         high, low = ends[0].limit, ends[1].limit
-        if high <= low * (1 + BEATEN):
+        if high <= low * (1 + MIN_IMPROVEMENT):
             self.designs = ends[:1]
             return
-        self.designs = [ends[0], *(Design(limit) for limit in _spread(high, low, points)[1:-1]), ends[1]]
-        if isinstance(self.both.method, TwoPhase):
+        self.designs = [ends[0], *(Design(limit) for limit in _limit_grid(high, low, points)[1:-1]), ends[1]]
+        if isinstance(self.base_search.method, TwoPhase):
             self._follow()
         else:
             for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
                 self._improve(k, self._gains(start))
-        for _ in range(ROUNDS):
+        for _ in range(MAX_IMPROVEMENT_ROUNDS):
             for k in range(1, points - 1):
                 better = self._rival(k)
                 if better is not None:
                     self._improve(k, better)
 
-    def frame(self) -> "pd.DataFrame":
+    def to_frame(self) -> "pd.DataFrame":
         """What there is so far."""
         import pandas as pd
 
         return pd.DataFrame([self._row(design) for design in self.designs])
 
-    def _end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
+    def _find_end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
         """The best by one requirement, and of many such by the other."""
         begun, pair = time.perf_counter(), (self.first, self.second)
-        weights = {q: self._weight(q) * (1.0 if q is requirement else BESIDE) for q in pair}
-        spec = replace(self.both.spec, weights=weights, limits=settling(self.both.spec, self.both.notary.references))
+        weights = {q: self._weight(q) * (1.0 if q is requirement else SECONDARY_WEIGHT) for q in pair}
+        spec = replace(
+            self.base_search.spec,
+            weights=weights,
+            limits=limits_with_settling(self.base_search.spec, self.base_search.certifier.references),
+        )
         held = requirement is self.second and self.last is not None
         if self.last is not None and held:
-            spec = self._limited(self.last)
-        method, point = self.both.method, None
+            spec = self._constrain_second(self.last)
+        method, point = self.base_search.method, None
         if start is not None:  # a search over wide bands would lose it
-            method, point = brief(method, method.margin), ended_in(start, self.both.space)
-        result = _uninterrupted(self.both.asking(spec, method).run(point))
+            method, point = short_method(method, method.margin), end_point(start, self.base_search.space)
+        result = _check_interruption(self.base_search.with_specification(spec, method).run(point))
         if not result.status.converged:
             which = "at its last limit" if held else "as good as the limits allow"
-            raise ConvergenceError(f"no front: its end, {name(requirement)} {which}, is {result.status}", result)
-        limit = self.last if self.last is not None and held else _value(result, self.second)
+            raise ConvergenceError(f"no front: its end, {metric_name(requirement)} {which}, is {result.status}", result)
+        limit = self.last if self.last is not None and held else _result_value(result, self.second)
         return Design(limit, result, time.perf_counter() - begun)
 
     def _weight(self, requirement: Requirement) -> float:
         """That makes a requirement of the order of the horizon, as the searches' penalties are."""
-        horizon = min(r.horizon - r.at for r in self.both.notary.references)
-        return horizon / self._sizes[name(requirement)] if self._sizes[name(requirement)] else 1.0
+        horizon = min(r.horizon - r.at for r in self.base_search.certifier.references)
+        return (
+            horizon / self._requirement_scales[metric_name(requirement)]
+            if self._requirement_scales[metric_name(requirement)]
+            else 1.0
+        )
 
     @cached_property
-    def _sizes(self) -> dict[str, float]:
+    def _requirement_scales(self) -> dict[str, float]:
         """What the requirements come to with the given gains; 0 where that is unknown."""
-        space = self.both.space
-        found = each(self.both.simulator.values(space.start[None], self.both.spec))[0]
+        space = self.base_search.space
+        found = to_records(self.base_search.simulator.values(space.start[None], self.base_search.spec))[0]
         return {n: v if np.isfinite(v) and v > 0 else 0.0 for n, v in found.items()}
 
-    def _limited(self, limit: float) -> Specification:
+    def _constrain_second(self, limit: float) -> Specification:
         """The first requirement to be minimised, the second held."""
-        others = tuple(q for q in self.both.spec.limits if name(q) != name(self.second))
+        others = tuple(q for q in self.base_search.spec.limits if metric_name(q) != metric_name(self.second))
         weights = {self.first: self._weight(self.first)}
-        return replace(self.both.spec, weights=weights, limits=(*others, allowing(self.second, limit)))
+        return replace(self.base_search.spec, weights=weights, limits=(*others, with_upper_limit(self.second, limit)))
 
     def _follow(self) -> None:
         """With a solver along the limits; where what is found does not survive printing, again with more margin."""
         todo = list(range(1, len(self.designs) - 1))
         for margin in self._margins:
-            asked = [self._search(k, self.both.method) for k in todo]
-            found = self._tracked([own.tightened(margin) for own in asked]) if todo else []
+            asked = [self._search_for(k, self.base_search.method) for k in todo]
+            found = self._track([own.tighten(margin) for own in asked]) if todo else []
             for k, own, solution in zip(todo, asked, found, strict=True):
                 self._certify(k, own, solution, margin)
-                self.both.tell(f"design {k + 1} of {len(self.designs)}: {_status(self.designs[k])}")
-            todo = [k for k in todo if not _status(self.designs[k]).converged]
+                self.base_search.progress(f"design {k + 1} of {len(self.designs)}: {_design_status(self.designs[k])}")
+            todo = [k for k in todo if not _design_status(self.designs[k]).converged]
 
     @property
     def _margins(self) -> tuple[float, ...]:
         """Of the limits, one after the other where a design does not survive printing."""
-        return tuple(self.both.method.margin * factor for factor in (1, 2, 4))
+        return tuple(self.base_search.method.margin * factor for factor in (1, 2, 4))
 
     @cached_property
     def _path(self) -> TwoPhasePath:
         """The problem, differentiated once, of which all designs are solutions."""
-        method, search = self.both.method, self._search(1, self.both.method)
+        method, search = self.base_search.method, self._search_for(1, self.base_search.method)
         assert isinstance(method, TwoPhase)
-        spec, notary = search.tightened(method.margin), search.notary
+        spec, notary = search.tighten(method.margin), search.certifier
         return two_phase_path(notary.loop, notary.references, search.space, spec, method)
 
-    def _tracked(self, specs: Sequence[Specification]) -> list[Solution]:
+    def _track(self, specs: Sequence[Specification]) -> list[Solution]:
         """From the first end; where the other end is on another branch, from there, too, and the better.
 
         Two tracks that agree next to the second end are one.
         """
-        space, ends = self.both.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
-        starts = [ended_in(result, space) for result in ends]
+        space, ends = self.base_search.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
+        starts = [end_point(result, space) for result in ends]
         found = self._path.follow(starts[0], specs)
         other = self._path.follow(starts[1], specs[-1:])
-        if _cost(other[0]) < _cost(found[-1]) * (1 - BEATEN):
+        if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - MIN_IMPROVEMENT):
             other = self._path.follow(starts[1], specs[::-1])
         for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
             spent = found[k].stats["seconds"] + back.stats["seconds"]
-            better = back if _cost(back) < _cost(found[k]) else found[k]
+            better = back if _solution_cost(back) < _solution_cost(found[k]) else found[k]
             found[k] = replace(better, stats={**better.stats, "seconds": spent})
         return found
 
     def _certify(self, k: int, search: Search, solution: Solution, margin: float) -> None:
         begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
-        result = self._printed(search, solution, margin)
+        result = self._round_and_certify(search, solution, margin)
         seconds = old.seconds + spent + time.perf_counter() - begun
         self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
 
-    def _printed(self, search: Search, solution: Solution, margin: float) -> TuningResult:
+    def _round_and_certify(self, search: Search, solution: Solution, margin: float) -> TuningResult:
         """A solution as printed, with its certificate."""
         if solution.status.code is Code.INTERRUPTED:
             raise KeyboardInterrupt
         point = np.array([solution.parameters.value(n) for n in search.space.names])
-        found = Found(point, solution.status, tuple(solution.multipliers), {"optimum": solution.stats["cost"]})
+        found = SearchResult(point, solution.status, tuple(solution.multipliers), {"optimum": solution.stats["cost"]})
         good = solution.status.converged
-        return search.certified(found, margin) if good else search.notary.result(search.simulator, found, point)
+        return (
+            search.certify_roundings(found, margin)
+            if good
+            else search.certifier.certify(search.simulator, found, point)
+        )
 
-    def _search(self, k: int, method: Method) -> Search:
-        return self.both.asking(self._limited(self.designs[k].limit), method)
+    def _search_for(self, k: int, method: Method) -> Search:
+        return self.base_search.with_specification(self._constrain_second(self.designs[k].limit), method)
 
     def _improve(self, k: int, start: Array | None) -> None:
         """Search for a design from given gains; the better stays."""
-        begun, old, follows = time.perf_counter(), self.designs[k], isinstance(self.both.method, TwoPhase)
+        begun, old, follows = time.perf_counter(), self.designs[k], isinstance(self.base_search.method, TwoPhase)
         if follows and start is not None:
-            result, spent = self._resolved(k, start)
+            result, spent = self._resolve(k, start)
         else:
-            search, spent = self._search(k, brief(self.both.method, self.both.method.margin)), 0.0
-            result = _uninterrupted(search.run(start))
+            search, spent = (
+                self._search_for(k, short_method(self.base_search.method, self.base_search.method.margin)),
+                0.0,
+            )
+            result = _check_interruption(search.run(start))
         kept = old.result if old.result is not None and not self._is_better(result, old.result) else result
         seconds, solver_seconds = old.seconds + time.perf_counter() - begun, old.solver_seconds + spent
         self.designs[k] = replace(old, result=kept, seconds=seconds, solver_seconds=solver_seconds)
-        self.both.tell(f"{name(self.second)} {shown(self.second, old.limit):.4g}: {result.status}")
+        self.base_search.progress(
+            f"{metric_name(self.second)} {user_value(self.second, old.limit):.4g}: {result.status}"
+        )
 
-    def _resolved(self, k: int, start: Array) -> tuple[TuningResult, float]:
+    def _resolve(self, k: int, start: Array) -> tuple[TuningResult, float]:
         """The solver's answer from given gains, with more margin where it does not survive printing; its seconds."""
-        search, spent, result = self._search(k, self.both.method), 0.0, None
+        search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
         for margin in self._margins:
-            (solution,) = self._path.follow(start, [search.tightened(margin)])
-            result, spent = self._printed(search, solution, margin), spent + solution.stats["seconds"]
+            (solution,) = self._path.follow(start, [search.tighten(margin)])
+            result, spent = self._round_and_certify(search, solution, margin), spent + solution.stats["seconds"]
             if result.status.converged:
                 break
         assert result is not None
@@ -316,80 +351,86 @@ class _Front:
     def _is_better(self, one: TuningResult, other: TuningResult) -> bool:
         if not one.status.converged or not other.status.converged:
             return one.status.converged
-        return _value(one, self.first) < _value(other, self.first)
+        return _result_value(one, self.first) < _result_value(other, self.first)
 
     def _gains(self, k: int) -> Array | None:
         result = self.designs[k].result
-        return None if result is None else ended_in(result, self.both.space)
+        return None if result is None else end_point(result, self.base_search.space)
 
     def _rival(self, k: int) -> Array | None:
         """The gains of what beats a design within its limit, another design or a sampled point; None without."""
-        design, space = self.designs[k], self.both.space
-        spec, own = self._limited(design.limit), np.inf
+        design, space = self.designs[k], self.base_search.space
+        spec, own = self._constrain_second(design.limit), np.inf
         if design.result is not None and design.result.status.converged:
-            own = _value(design.result, self.first)
-        found = [d.result for d in self.designs if d is not design and _status(d).converged and d.result is not None]
-        rivals = {_value(r, self.first): ended_in(r, space) for r in found if _value(r, self.second) <= design.limit}
-        points, rows = self._sampled
-        rivals |= {v[name(self.first)]: x for x, v in zip(points, rows, strict=True) if not spec.violated(v)}
+            own = _result_value(design.result, self.first)
+        found = [
+            d.result for d in self.designs if d is not design and _design_status(d).converged and d.result is not None
+        ]
+        rivals = {
+            _result_value(r, self.first): end_point(r, space)
+            for r in found
+            if _result_value(r, self.second) <= design.limit
+        }
+        points, rows = self._samples
+        rivals |= {v[metric_name(self.first)]: x for x, v in zip(points, rows, strict=True) if not spec.violations(v)}
         least = min((v for v in rivals if np.isfinite(v)), default=np.inf)
-        return rivals[least] if least < own * (1 - BEATEN) else None
+        return rivals[least] if least < own * (1 - MIN_IMPROVEMENT) else None
 
     @cached_property
-    def _sampled(self) -> tuple[Array, list[dict[str, float]]]:
+    def _samples(self) -> tuple[Array, list[dict[str, float]]]:
         """Points spread over the gains' box, and what the requirements read there."""
-        space, rng = self.both.space, np.random.default_rng(0)
-        points = space.draw(first_population(SAMPLES, space.unit(space.start), rng))
-        return points, each(self.both.simulator.values(points, self.both.spec))
+        space, rng = self.base_search.space, np.random.default_rng(0)
+        points = space.from_unit(first_population(RIVAL_SAMPLES, space.to_unit(space.start), rng))
+        return points, to_records(self.base_search.simulator.values(points, self.base_search.spec))
 
     def _row(self, design: Design) -> dict[str, Any]:
-        result, pair, space = design.result, (self.first, self.second), self.both.space
+        result, pair, space = design.result, (self.first, self.second), self.base_search.space
         good = result is not None and result.status.converged
         columns = {"": "certified", "claimed ": "claimed"}
         known = result.requirements if result is not None and good else None
         figures = {
-            f"{lead}{name(q)}": nan if known is None else float(known[column][name(q)])
+            f"{lead}{metric_name(q)}": nan if known is None else float(known[column][metric_name(q)])
             for lead, column in columns.items()
             for q in pair
         }
         gains = {n: nan if result is None or not good else result.parameters.value(n) for n in space.names}
         costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
         error = "" if good else Code.INTERRUPTED.value if result is None else str(result.status)
-        return {**figures, "limit": shown(self.second, design.limit), **gains, **costs, "error": error}
+        return {**figures, "limit": user_value(self.second, design.limit), **gains, **costs, "error": error}
 
 
-def _found(design: Design) -> TuningResult:
+def _result_of(design: Design) -> TuningResult:
     assert design.result is not None
     return design.result
 
 
-def _uninterrupted(result: TuningResult) -> TuningResult:
+def _check_interruption(result: TuningResult) -> TuningResult:
     """The same; Ctrl-C, which a search turns into its best so far, ends a front."""
     if result.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     return result
 
 
-def _count(designs: Sequence[Design]) -> int:
+def _count_successes(designs: Sequence[Design]) -> int:
     """How many of them are certified."""
-    return sum(_status(design).converged for design in designs)
+    return sum(_design_status(design).converged for design in designs)
 
 
-def _status(design: Design) -> Status:
+def _design_status(design: Design) -> Status:
     return Status(Code.INTERRUPTED) if design.result is None else design.result.status
 
 
-def _cost(solution: Solution) -> float:
+def _solution_cost(solution: Solution) -> float:
     """The objective; inf where it is no solution."""
     return solution.stats["cost"] if solution.status.converged else np.inf
 
 
-def _value(result: TuningResult, requirement: Requirement) -> float:
+def _result_value(result: TuningResult, requirement: Requirement) -> float:
     """The certified figure as `read` gives it, so that smaller is better."""
-    return shown(requirement, float(result.requirements["certified"][name(requirement)]))  # its own inverse
+    return user_value(requirement, float(result.requirements["certified"][metric_name(requirement)]))  # its own inverse
 
 
-def _spread(high: float, low: float, points: int) -> list[float]:
+def _limit_grid(high: float, low: float, points: int) -> list[float]:
     """Limits from high to low, evenly or, where the ends are far apart, evenly in the logarithm."""
-    even = np.geomspace if low > 0 and high / low > WIDE else np.linspace
+    even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
     return [float(v) for v in even(high, low, points)]

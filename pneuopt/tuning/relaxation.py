@@ -11,43 +11,51 @@ from math import ceil, floor, inf, isfinite, log10, nan
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.means import TAIL
-from pneuopt.evaluation.requirements import AT_LEAST, Requirement, SettlingTime, bound, most, name
+from pneuopt.evaluation.means import TAIL_SHARE
+from pneuopt.evaluation.requirements import (
+    MINIMUM_REQUIREMENTS,
+    Requirement,
+    SettlingTime,
+    metric_name,
+    upper_limit,
+    user_limit,
+)
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
-Array = NDArray[np.float64]
-DIGITS = 3  # of a relaxed limit, rounded so that the design that was found keeps it
-UNSETTLED = 10.0  # relative excess of what never settles, before what it is off at the end
-SIMULATIONS = 200  # of the local search for all limits together
+RELAXED_LIMIT_DIGITS = 3  # of a relaxed limit, rounded so that the design that was found keeps it
+UNSETTLED_EXCESS = 10.0  # relative excess of what never settles, before what it is off at the end
+MAX_LOCAL_SIMULATIONS = 200  # of the local search for all limits together
 
 
-def alone(spec: Specification, requirement: Requirement, references: Sequence[Step]) -> Specification:
+def relaxation_specification(
+    spec: Specification, requirement: Requirement, references: Sequence[Step]
+) -> Specification:
     """The tuning that finds how small a limited requirement can be where the others are kept.
 
     Where a settling time is minimised, the response still has to settle. The objective is of the order of the horizon,
     as the searches' penalties are.
     """
-    limits, horizon = settling(spec, references), min(r.horizon - r.at for r in references)
-    term: dict[str, Any] = {"min" if isinstance(requirement, AT_LEAST) else "max": None}
-    weights = {replace(requirement, **term): horizon / most(requirement)}
+    limits, horizon = limits_with_settling(spec, references), min(r.horizon - r.at for r in references)
+    term: dict[str, Any] = {"min" if isinstance(requirement, MINIMUM_REQUIREMENTS) else "max": None}
+    weights = {replace(requirement, **term): horizon / upper_limit(requirement)}
     return replace(spec, weights=weights, limits=tuple(q for q in limits if q is not requirement))
 
 
-def settling(spec: Specification, references: Sequence[Step]) -> tuple[Requirement, ...]:
+def limits_with_settling(spec: Specification, references: Sequence[Step]) -> tuple[Requirement, ...]:
     """The limits, and where a settling time is only minimised, that there is one."""
     horizon = min(r.horizon - r.at for r in references)
     if not spec.weight(SettlingTime) or any(isinstance(q, SettlingTime) for q in spec.limits):
         return spec.limits
-    return (*spec.limits, SettlingTime(spec.band, max=(1 - TAIL) * horizon))
+    return (*spec.limits, SettlingTime(spec.band, max=(1 - TAIL_SHARE) * horizon))
 
 
-def together(simulator: Simulator, space: Space, spec: Specification, points: Sequence[Array]) -> Array:
+def relax_all(simulator: Simulator, space: Space, spec: Specification, points: Sequence[Array]) -> Array:
     """The point whose limits have to be widened by the least common share, by Nelder-Mead from the best of `points`.
 
     Parameters
@@ -64,34 +72,41 @@ def together(simulator: Simulator, space: Space, spec: Specification, points: Se
     """
 
     def share(unit: Array) -> Array:
-        return excess(simulator.values(space.draw(np.clip(unit, 0.0, 1.0)), spec), spec)
+        return limit_excess(simulator.values(space.from_unit(np.clip(unit, 0.0, 1.0)), spec), spec)
 
-    starts = np.array([space.unit(point) for point in points])
+    starts = np.array([space.to_unit(point) for point in points])
     best = starts[np.argmin(share(starts))]
     steps = np.where(best < 0.5, 0.02, -0.02) * np.eye(len(best))
-    options = {"maxfev": SIMULATIONS, "initial_simplex": np.vstack([best, best + steps]), "xatol": 1e-5, "fatol": 1e-5}
+    options = {
+        "maxfev": MAX_LOCAL_SIMULATIONS,
+        "initial_simplex": np.vstack([best, best + steps]),
+        "xatol": 1e-5,
+        "fatol": 1e-5,
+    }
     settings: Any = {"method": "Nelder-Mead", "bounds": [(0.0, 1.0)] * len(best), "options": options}
 
     def cost(unit: Array) -> float:
         return float(share(unit[None])[0])
 
     found = minimize(cost, best, **settings)
-    return space.draw(np.clip(found.x, 0.0, 1.0))
+    return space.from_unit(np.clip(found.x, 0.0, 1.0))
 
 
-def excess(values: Mapping[str, Array], spec: Specification) -> Array:
+def limit_excess(values: Mapping[str, Array], spec: Specification) -> Array:
     """The share by which every limit would have to be wider, shape (m,); graded where nothing settles."""
-    unsettled = UNSETTLED + np.minimum(values["Excess"], UNSETTLED)
+    unsettled = UNSETTLED_EXCESS + np.minimum(values["Excess"], UNSETTLED_EXCESS)
     worst = np.full_like(unsettled, -np.inf)
     if spec.concerns(SettlingTime):
         worst = np.where(np.isfinite(values["SettlingTime"]), worst, unsettled)
     for q in spec.limits:
-        used = np.where(np.isfinite(values[name(q)]), values[name(q)] / most(q) - 1, unsettled)
+        used = np.where(np.isfinite(values[metric_name(q)]), values[metric_name(q)] / upper_limit(q) - 1, unsettled)
         worst = np.maximum(worst, used)
     return worst
 
 
-def row(requirement: Requirement | None, value: float, point: Array, names: Sequence[str]) -> dict[str, float]:
+def relaxation_row(
+    requirement: Requirement | None, value: float, point: Array, names: Sequence[str]
+) -> dict[str, float]:
     """A row of `TuningResult.relaxations`.
 
     Parameters
@@ -105,14 +120,14 @@ def row(requirement: Requirement | None, value: float, point: Array, names: Sequ
     """
     gains = dict(zip(names, point.tolist(), strict=True)) if np.isfinite(value) else dict.fromkeys(names, nan)
     if requirement is None:
-        return {"asked": nan, "needed": nan, "share": _away(value, upwards=True), **gains}
-    asked, least = bound(requirement), isinstance(requirement, AT_LEAST)
+        return {"asked": nan, "needed": nan, "share": _round_outwards(value, upwards=True), **gains}
+    asked, least = user_limit(requirement), isinstance(requirement, MINIMUM_REQUIREMENTS)
     assert asked is not None
-    needed = _away(value, upwards=not least)
+    needed = _round_outwards(value, upwards=not least)
     return {"asked": asked, "needed": needed, "share": (asked - needed if least else needed - asked) / asked, **gains}
 
 
-def sentence(rows: Mapping[str, Mapping[str, float]]) -> str:
+def describe_relaxations(rows: Mapping[str, Mapping[str, float]]) -> str:
     """What the table says, in words."""
     able = {n: r for n, r in rows.items() if n != "all" and isfinite(r["needed"])}
     each = ", or ".join(f"{n} relaxed to {r['needed']:.6g} ({r['asked']:.6g} asked)" for n, r in able.items())
@@ -123,7 +138,7 @@ def sentence(rows: Mapping[str, Mapping[str, float]]) -> str:
     return "; or ".join(parts)
 
 
-def _away(value: float, *, upwards: bool) -> float:
+def _round_outwards(value: float, *, upwards: bool) -> float:
     """Rounded so that the design that was found keeps it.
 
     Examples
@@ -133,6 +148,6 @@ def _away(value: float, *, upwards: bool) -> float:
     """
     if not 0 < abs(value) < inf:
         return value
-    place = 10.0 ** (floor(log10(abs(value))) - DIGITS + 1)
+    place = 10.0 ** (floor(log10(abs(value))) - RELAXED_LIMIT_DIGITS + 1)
     steps = (ceil if upwards else floor)(value / place * (1 - 1e-12 if upwards else 1 + 1e-12))
-    return float(f"{steps * place:.{DIGITS}g}")
+    return float(f"{steps * place:.{RELAXED_LIMIT_DIGITS}g}")

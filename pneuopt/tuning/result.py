@@ -7,30 +7,38 @@ from math import nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import AT_LEAST, Requirement, bound, most, name, read, shown, told
+from pneuopt.evaluation.requirements import (
+    MINIMUM_REQUIREMENTS,
+    Requirement,
+    describe_value,
+    metric_name,
+    requirement_values,
+    upper_limit,
+    user_limit,
+    user_value,
+)
 from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
-from pneuopt.shooting.solution import Code, Status
-from pneuopt.tuning.relaxation import sentence
-from pneuopt.tuning.simulator import Simulator, worst
+from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.relaxation import describe_relaxations
+from pneuopt.tuning.simulator import Simulator, worst_values
 from pneuopt.tuning.space import Space
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-GRAZING = 0.01  # relative excess of the certified over the claimed settling time
-ACTIVE = 0.02  # of a limit, the room within which it counts as reached
-RELAXED = ("asked", "needed", "share")
-SHOWN = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity")
+MAX_CERTIFIED_EXCESS = 0.01  # relative excess of the certified over the claimed settling time
+ACTIVE_ROOM = 0.02  # of a limit, the room within which it counts as reached
+RELAXATION_COLUMNS = ("asked", "needed", "share")
+TABLE_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +91,10 @@ class TuningResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """What a search hands over: a point before rounding, what is active there, figures; whether it came to its end.
 
-    `told` is for the status of a design that holds.
+    `remark` is for the status of a design that holds.
     """
 
     point: Array
@@ -94,11 +102,11 @@ class Found:
     active: tuple[str, ...]
     stats: Mapping[str, float]
     is_complete: bool = True
-    told: str = ""
+    remark: str = ""
 
 
 @dataclass(frozen=True, eq=False)
-class Notary:
+class Certifier:
     """Certifies what a search found.
 
     Parameters
@@ -120,20 +128,20 @@ class Notary:
     spec: Specification
     method: object
 
-    def result(self, simulator: Simulator, found: Found, point: Array) -> TuningResult:
+    def certify(self, simulator: Simulator, found: SearchResult, point: Array) -> TuningResult:
         """Claim and certificate of a point; its values are handed out where the certificate holds."""
         import pandas as pd
 
-        parameters = self.space.filled(point)
+        parameters = self.space.parameters_at(point)
         ripple = ("Ripple",) if self.loop.dither_period(parameters) else ()
-        shown = list(dict.fromkeys((*SHOWN, *ripple, *self.spec.kinds)))
+        shown = list(dict.fromkeys((*TABLE_METRICS, *ripple, *self.spec.kinds)))
         rows = zip(simulator.cases, simulator.table(point, self.spec), strict=True)
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:
-            certified, met = self._certified(parameters)
-            slopes = _slopes(certified)
+            certified, met = self._evaluate(parameters)
+            slopes = _friction_slopes(certified)
             certified = certified.loc[shown]
-            status = _outside(met) if met else self._verdict(found, claimed, certified)
+            status = _contact_status(met) if met else self._certificate_status(found, claimed, certified)
         except ConvergenceError as error:
             certified, met, slopes = claimed * np.nan, [], {}
             status = Status(Code.NOT_CERTIFIED, str(error))
@@ -145,17 +153,17 @@ class Notary:
             self.space.parameters.with_values(values) if status.converged else self.space.parameters,
             claimed,
             certified,
-            required(self.spec, claimed, certified, found.active),
-            pd.DataFrame(columns=[*RELAXED, *self.space.names], dtype=float),
+            requirement_table(self.spec, claimed, certified, found.active),
+            pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.space.names], dtype=float),
             found.active,
             status,
             {**found.stats, **deviation, **contacts, **rejected, **slopes},
             provenance(self.method, *self.spec.weights, *self.spec.limits, *self.references, *self.scenarios.items()),
         )
 
-    def _certified(self, parameters: ParameterSet) -> tuple["pd.DataFrame", list[str]]:
+    def _evaluate(self, parameters: ParameterSet) -> tuple["pd.DataFrame", list[str]]:
         """The certificate, and what the responses ran into."""
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             certified = evaluate(
                 self.loop,
@@ -165,22 +173,22 @@ class Notary:
                 band=self.spec.band,
                 envelope=self.spec.envelope,
             )
-        return certified, [str(w.message) for w in told if issubclass(w.category, PhysicsWarning)]
+        return certified, [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
 
-    def _verdict(self, found: Found, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
+    def _certificate_status(self, found: SearchResult, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
         """Whether the independent simulation confirms the search."""
         if not found.status.converged:
             return found.status
-        claim, proof = (worst([read(dict(f[r])) for r in f]) for f in (claimed, certified))
-        for q in self.spec.violated(proof):
-            n, (value, allowed) = name(q), told(q, proof[name(q)])
+        claim, proof = (worst_values([requirement_values(dict(f[r])) for r in f]) for f in (claimed, certified))
+        for q in self.spec.violations(proof):
+            n, (value, allowed) = metric_name(q), describe_value(q, proof[metric_name(q)])
             return Status(
                 Code.NOT_CERTIFIED,
-                f"{n} is {value}{self._where(certified, n)}, {allowed}, claimed {told(q, claim[n])[0]}; "
+                f"{n} is {value}{self._worst_case(certified, n)}, {allowed}, claimed {describe_value(q, claim[n])[0]}; "
                 f"give {n} more room",
             )
         ours, theirs = self.spec.objective(proof), min(self.spec.objective(claim), found.stats["optimum"])
-        if not ours <= theirs * (1 + GRAZING):
+        if not ours <= theirs * (1 + MAX_CERTIFIED_EXCESS):
             return Status(
                 Code.NOT_CERTIFIED,
                 f"the objective is {ours:.6g}, claimed {theirs:.6g}: the optimum grazes the band, or does not survive "
@@ -192,31 +200,34 @@ class Notary:
             else ""
         )
         message = f"certified objective {ours:.6g}, claimed {self.spec.objective(claim):.6g}{agreeing}"
-        return Status(Code.CONVERGED, f"{message}; {found.told}" if found.told else message)
+        return Status(Code.CONVERGED, f"{message}; {found.remark}" if found.remark else message)
 
-    def _where(self, certified: "pd.DataFrame", metric: str) -> str:
+    def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
         """The worst case, where there are several."""
-        values = read({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
+        values = requirement_values({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
         k = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
         return f" at {certified.columns[k]}" if len(values) > 1 else ""
 
 
-def _slopes(certified: "pd.DataFrame") -> dict[str, float]:
+def _friction_slopes(certified: "pd.DataFrame") -> dict[str, float]:
     """The slope of friction with which margins are read, a case each."""
     rows = certified.loc[[n for n in certified.index if n == "FrictionSlope"]]
     return {f"friction_slope[{case}]": float(v) for case, column in rows.items() for v in column}
 
 
-def required(
+def requirement_table(
     spec: Specification, claimed: "pd.DataFrame", certified: "pd.DataFrame", active: Sequence[str] = ()
 ) -> "pd.DataFrame":
     """Each requirement beside what is allowed; see `TuningResult.requirements`."""
     import pandas as pd
 
-    limits = {name(q): q for q in spec.limits}
-    rows = {name(q): _row(limits.get(name(q), q), claimed, certified) for q in (*spec.weights, *spec.limits)}
+    limits = {metric_name(q): q for q in spec.limits}
+    rows = {
+        metric_name(q): _requirement_row(limits.get(metric_name(q), q), claimed, certified)
+        for q in (*spec.weights, *spec.limits)
+    }
     frame = pd.DataFrame.from_dict(rows, orient="index")
-    frame["active"] = [n in active or room <= ACTIVE for n, room in frame["room"].items()]
+    frame["active"] = [n in active or room <= ACTIVE_ROOM for n, room in frame["room"].items()]
     return frame
 
 
@@ -227,13 +238,13 @@ def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]]) ->
     broken = result.requirements[~(result.requirements["room"] >= 0) & result.requirements["allowed"].notna()]
     closest = [f"{n} {row.certified:.6g} ({row.allowed:.6g} asked)" for n, row in broken.iterrows()]
     unknown = [str(n) for n, row in result.requirements.iterrows() if np.isnan(row.certified) and np.isnan(row.allowed)]
-    told = f"no design found keeps all limits, the closest has {', '.join([*closest, *(f'no {n}' for n in unknown)])}"
-    message = f"{told}; {sentence(rows)}; or widen the gains' bounds"
+    lead = f"no design found keeps all limits, the closest has {', '.join([*closest, *(f'no {n}' for n in unknown)])}"
+    message = f"{lead}; {describe_relaxations(rows)}; or widen the gains' bounds"
     relaxations = pd.DataFrame.from_dict(rows, orient="index")
     return replace(result, status=Status(Code.INFEASIBLE, message), relaxations=relaxations)
 
 
-def missing(result: TuningResult) -> float:
+def relaxation_share(result: TuningResult) -> float:
     """The share by which every limit would have to be wider for a result; inf where something is not reached at all."""
     known = result.requirements
     rooms = known["room"][known["allowed"].notna()]
@@ -241,24 +252,24 @@ def missing(result: TuningResult) -> float:
     return float("inf") if unreached else float(-rooms.min())
 
 
-def _row(requirement: Requirement, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> dict[str, Any]:
-    n = name(requirement)
-    values = [read({n: frame.loc[n].to_numpy(dtype=float)})[n] for frame in (claimed, certified)]
+def _requirement_row(requirement: Requirement, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> dict[str, Any]:
+    n = metric_name(requirement)
+    values = [requirement_values({n: frame.loc[n].to_numpy(dtype=float)})[n] for frame in (claimed, certified)]
     k = [int(np.argmax(np.where(np.isnan(v), np.inf, v))) for v in values]
     claim, proof = (float(v[i]) for v, i in zip(values, k, strict=True))
-    limit, allowed = bound(requirement), most(requirement)
-    least = isinstance(requirement, AT_LEAST)
-    room = nan if limit is None else (shown(requirement, proof) * allowed - 1 if least else 1 - proof / allowed)
+    limit, allowed = user_limit(requirement), upper_limit(requirement)
+    least = isinstance(requirement, MINIMUM_REQUIREMENTS)
+    room = nan if limit is None else (user_value(requirement, proof) * allowed - 1 if least else 1 - proof / allowed)
     return {
-        "claimed": shown(requirement, claim),
-        "certified": shown(requirement, proof),
+        "claimed": user_value(requirement, claim),
+        "certified": user_value(requirement, proof),
         "allowed": nan if limit is None else limit,
         "room": room,
         "case": str(certified.columns[k[1]]),
     }
 
 
-def _outside(met: Sequence[str]) -> Status:
+def _contact_status(met: Sequence[str]) -> Status:
     """Of a response that ran into an end stop or emptied a chamber: whatever it shows, the drive does not."""
     remedy = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
     return Status(Code.NOT_CERTIFIED, f"{'; '.join(dict.fromkeys(met))}; {remedy}")

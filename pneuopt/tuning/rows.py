@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.evaluation.air import LITRES, NORMAL_DENSITY
+from pneuopt.evaluation.air import ANR_DENSITY, LITRES_PER_CUBIC_METRE
 from pneuopt.evaluation.means import end_mean
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.requirements import (
@@ -25,11 +25,11 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.evaluation.window import Window
-from pneuopt.tuning.readings import CONTROL, FLOW, INTEGRAL, SIGNAL, Grid
+from pneuopt.evaluation.window import DitherPeriodMean
+from pneuopt.quantities.arrays import Array
+from pneuopt.tuning.readings import CONTROL_OUTPUT, FLOW_OUTPUT, INTEGRAL_OUTPUT, SIGNAL_OUTPUT, ReferenceGrid
 
-Array = NDArray[np.float64]
-Rows = tuple[Array, Array]
+ValuesAndSlopes = tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Lanes:
     envelope : sequence of (float, float, float)
     """
 
-    grid: Grid
+    grid: ReferenceGrid
     y: Array
     dy: Array
     chain: Array
@@ -62,50 +62,52 @@ class Lanes:
     @cached_property
     def t(self) -> Array:
         """From the step on, shape (n,) [s]."""
-        return self.grid.t[self.grid.after :] - self.grid.reference.at
+        return self.grid.t[self.grid.step_index :] - self.grid.reference.at
 
     @cached_property
     def nodes(self) -> Array:
         """Shape (K,) [s]."""
-        return nodes(self.grid, self.stride, max(self.periods))
+        return reading_times(self.grid, self.stride, max(self.periods))
 
     @cached_property
-    def error(self) -> Rows:
+    def error(self) -> ValuesAndSlopes:
         """The averaged distance from the reference at the nodes, a fraction of the step: shapes (m, K), (m, K, n)."""
         reference, columns, K = self.grid.reference, self.dy.shape[-1], len(self.nodes)
         error, by_column = np.empty((len(self.y), K)), np.empty((len(self.y), columns, K))
-        for period, own in self._alike():
-            signal, slopes = self._watched(own, SIGNAL), self._slopes(own, SIGNAL)
+        for period, own in self._lanes_by_period():
+            signal, slopes = self._output(own, SIGNAL_OUTPUT), self._slopes(own, SIGNAL_OUTPUT)
             if period:
-                window = Window(period, self.grid.spacing)
-                integral, grown = self._watched(own, INTEGRAL), self._slopes(own, INTEGRAL)
+                window = DitherPeriodMean(period, self.grid.spacing)
+                integral, grown = self._output(own, INTEGRAL_OUTPUT), self._slopes(own, INTEGRAL_OUTPUT)
                 error[own] = window.means(signal, integral, reference.initial, self.stride)[:, :K]
                 found = window.means(slopes, grown, 0.0, self.stride)[:, :K]
             else:
                 error[own], found = signal[:, :: self.stride][:, :K], slopes[:, :: self.stride][:, :K]
             by_column[own] = found.reshape(-1, columns, K)
-        by_gain = self._by_gain(np.swapaxes(by_column, 1, 2))
-        return (error - reference.final) / reference.whole, by_gain / reference.whole
+        by_gain = self._to_gains(np.swapaxes(by_column, 1, 2))
+        return (error - reference.final) / reference.nominal_size, by_gain / reference.nominal_size
 
-    def at_end(self) -> Rows:
+    def final_error(self) -> ValuesAndSlopes:
         """The final distance from the reference, a fraction of the step, a row a lane."""
         reference, columns = self.grid.reference, self.dy.shape[-1]
         error, by_column = np.empty((len(self.y), 1)), np.empty((len(self.y), 1, columns))
-        for period, own in self._alike():
-            signal, slopes = self._watched(own, SIGNAL), self._slopes(own, SIGNAL)
+        for period, own in self._lanes_by_period():
+            signal, slopes = self._output(own, SIGNAL_OUTPUT), self._slopes(own, SIGNAL_OUTPUT)
             error[own, 0] = end_mean(self.t, signal, period or None) - reference.final
             by_column[own, 0] = end_mean(self.t, slopes, period or None).reshape(-1, columns)
-        return error / reference.whole, self._by_gain(by_column) / reference.whole
+        return error / reference.nominal_size, self._to_gains(by_column) / reference.nominal_size
 
-    def largest(self, values: Array, slopes: Array) -> Rows:
+    def largest(self, values: Array, slopes: Array) -> ValuesAndSlopes:
         """The largest size of each stretch of time as long as that between nodes, either side."""
         edges = np.arange(0, values.shape[1], max(1, self.stride))
         parts = np.split(np.abs(values), edges[1:], axis=1)
         k = np.array([edge + part.argmax(axis=1) for edge, part in zip(edges, parts, strict=True)]).T
         rows = np.arange(len(values))[:, None]
-        return np.abs(values[rows, k]), np.sign(values[rows, k])[..., None] * self._by_gain(slopes[rows, k])
+        return np.abs(values[rows, k]), np.sign(values[rows, k])[..., None] * self._to_gains(slopes[rows, k])
 
-    def summed(self, weights: Array, of: Callable[[Array], Array], slope: Callable[[Array], Array]) -> Rows:
+    def sum_error(
+        self, weights: Array, of: Callable[[Array], Array], slope: Callable[[Array], Array]
+    ) -> ValuesAndSlopes:
         """A weighted sum over the nodes of a function of the error, a row a lane."""
         error, by_gain = self.error
         return (of(error) @ weights)[:, None], np.einsum("mk,mkn->mn", slope(error) * weights, by_gain)[:, None]
@@ -116,7 +118,7 @@ class Lanes:
         h = np.diff(self.nodes)
         return np.asarray(0.5 * (np.append(h, 0.0) + np.append(0.0, h)))
 
-    def between(self, begin: float, end: float) -> Rows:
+    def error_between(self, begin: float, end: float) -> ValuesAndSlopes:
         """The error at the nodes of a span and at its ends, linear between nodes."""
         (error, by_gain), t = self.error, self.nodes
         at = np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])
@@ -125,30 +127,30 @@ class Lanes:
         slopes = by_gain[:, k] * (1 - share)[:, None] + by_gain[:, k + 1] * share[:, None]
         return error[:, k] * (1 - share) + error[:, k + 1] * share, slopes
 
-    def _by_gain(self, by_column: Array) -> Array:
+    def _to_gains(self, by_column: Array) -> Array:
         return np.asarray(by_column @ self.chain)
 
-    def _watched(self, own: NDArray[np.bool_], which: int) -> Array:
-        return np.ascontiguousarray(self.y[own, self.grid.after :, which])
+    def _output(self, own: NDArray[np.bool_], which: int) -> Array:
+        return np.ascontiguousarray(self.y[own, self.grid.step_index :, which])
 
     def _slopes(self, own: NDArray[np.bool_], which: int) -> Array:
         """A row a lane and column."""
-        found = np.ascontiguousarray(np.moveaxis(self.dy[own, self.grid.after :, which], 2, 1))
+        found = np.ascontiguousarray(np.moveaxis(self.dy[own, self.grid.step_index :, which], 2, 1))
         return found.reshape(-1, found.shape[-1])
 
-    def _alike(self) -> Iterator[tuple[float, NDArray[np.bool_]]]:
+    def _lanes_by_period(self) -> Iterator[tuple[float, NDArray[np.bool_]]]:
         """Lanes with one period."""
         for period in sorted(set(self.periods)):
             yield period, np.array([other == period for other in self.periods])
 
 
-def nodes(grid: Grid, stride: int, period: float) -> Array:
+def reading_times(grid: ReferenceGrid, stride: int, period: float) -> Array:
     """Instants after the step at which a response averaged over a period is read [s]."""
-    t = grid.t[grid.after :] - grid.reference.at
-    return t[: Window(period, grid.spacing).reach(len(t)) if period else len(t)][::stride]
+    t = grid.t[grid.step_index :] - grid.reference.at
+    return t[: DitherPeriodMean(period, grid.spacing).mean_count(len(t)) if period else len(t)][::stride]
 
 
-def _beyond(lanes: Lanes) -> Rows:
+def _overshoot_rows(lanes: Lanes) -> ValuesAndSlopes:
     """The error, of what should not move either side."""
     error, slopes = lanes.error
     if lanes.grid.reference.is_step:
@@ -156,53 +158,53 @@ def _beyond(lanes: Lanes) -> Rows:
     return np.concatenate([error, -error], axis=1), np.concatenate([slopes, -slopes], axis=1)
 
 
-def _steady(lanes: Lanes) -> Rows:
-    error, slopes = lanes.at_end()
+def _steady_state_rows(lanes: Lanes) -> ValuesAndSlopes:
+    error, slopes = lanes.final_error()
     return np.abs(error), np.sign(error)[..., None] * slopes
 
 
-def _peak(lanes: Lanes) -> Rows:
-    since = slice(lanes.grid.after, None)
-    return lanes.largest(lanes.y[:, since, CONTROL], lanes.dy[:, since, CONTROL])
+def _peak_control_rows(lanes: Lanes) -> ValuesAndSlopes:
+    since = slice(lanes.grid.step_index, None)
+    return lanes.largest(lanes.y[:, since, CONTROL_OUTPUT], lanes.dy[:, since, CONTROL_OUTPUT])
 
 
-def _rate(lanes: Lanes) -> Rows:
+def _control_rate_rows(lanes: Lanes) -> ValuesAndSlopes:
     """From sample to sample, of a sampled controller over its own sample."""
-    h, since = lanes.grid.sample_time or lanes.grid.spacing, slice(lanes.grid.after, None)
+    h, since = lanes.grid.sample_time or lanes.grid.spacing, slice(lanes.grid.step_index, None)
     k = max(1, round(h / lanes.grid.spacing))
-    u, slopes = lanes.y[:, since, CONTROL], lanes.dy[:, since, CONTROL]
+    u, slopes = lanes.y[:, since, CONTROL_OUTPUT], lanes.dy[:, since, CONTROL_OUTPUT]
     return lanes.largest((u[:, k:] - u[:, :-k]) / h, (slopes[:, k:] - slopes[:, :-k]) / h)
 
 
-def _enveloped(lanes: Lanes) -> Rows:
+def _envelope_rows(lanes: Lanes) -> ValuesAndSlopes:
     """Both sides of the envelope, over its half width."""
     last, values, slopes = lanes.nodes[-1], [], []
     ends = [*(begin for begin, _, _ in lanes.envelope[1:]), np.inf]
     for (begin, lower, upper), end in zip(lanes.envelope, ends, strict=True):
         if begin < last:
-            error, by_gain = lanes.between(begin, min(end, last))
+            error, by_gain = lanes.error_between(begin, min(end, last))
             used, half = error + 1 - (lower + upper) / 2, (upper - lower) / 2
             values += [used / half, -used / half]
             slopes += [by_gain / half, -by_gain / half]
     return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
 
 
-def _air(lanes: Lanes) -> Rows:
-    h, since = np.diff(lanes.t), slice(lanes.grid.after, None)
-    weights = LITRES / NORMAL_DENSITY * 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
-    slopes = np.einsum("k,mkc->mc", weights, lanes.dy[:, since, FLOW])[:, None]
-    return (lanes.y[:, since, FLOW] @ weights)[:, None], np.asarray(slopes @ lanes.chain)
+def _air_use_rows(lanes: Lanes) -> ValuesAndSlopes:
+    h, since = np.diff(lanes.t), slice(lanes.grid.step_index, None)
+    weights = LITRES_PER_CUBIC_METRE / ANR_DENSITY * 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
+    slopes = np.einsum("k,mkc->mc", weights, lanes.dy[:, since, FLOW_OUTPUT])[:, None]
+    return (lanes.y[:, since, FLOW_OUTPUT] @ weights)[:, None], np.asarray(slopes @ lanes.chain)
 
 
-READ: dict[type, Callable[[Lanes], Rows]] = {
-    Overshoot: _beyond,
-    SteadyStateError: _steady,
-    PeakControl: _peak,
-    ControlRate: _rate,
-    IAE: lambda lanes: lanes.summed(lanes.weights, np.abs, np.sign),
-    ISE: lambda lanes: lanes.summed(lanes.weights, np.square, lambda e: 2 * e),
-    ITAE: lambda lanes: lanes.summed(lanes.weights * lanes.nodes, np.abs, np.sign),
-    StepEnvelope: _enveloped,
-    AirUse: _air,
+ROW_READERS: dict[type, Callable[[Lanes], ValuesAndSlopes]] = {
+    Overshoot: _overshoot_rows,
+    SteadyStateError: _steady_state_rows,
+    PeakControl: _peak_control_rows,
+    ControlRate: _control_rate_rows,
+    IAE: lambda lanes: lanes.sum_error(lanes.weights, np.abs, np.sign),
+    ISE: lambda lanes: lanes.sum_error(lanes.weights, np.square, lambda e: 2 * e),
+    ITAE: lambda lanes: lanes.sum_error(lanes.weights * lanes.nodes, np.abs, np.sign),
+    StepEnvelope: _envelope_rows,
+    AirUse: _air_use_rows,
 }
 """The requirements that are read off responses here, and how."""

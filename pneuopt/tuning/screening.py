@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.requirements import ROBUSTNESS, SettlingTime, most, name
+from pneuopt.evaluation.requirements import ROBUSTNESS_REQUIREMENTS, SettlingTime, metric_name, upper_limit
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import require
-from pneuopt.tuning.readings import LOST, unsettled
-from pneuopt.tuning.simulator import Index, Mask, Responses, Simulator
-from pneuopt.tuning.space import Space, Tell
+from pneuopt.quantities.status import ProgressCallback
+from pneuopt.tuning.readings import WORST_MERIT, penalty_settling_time
+from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.space import Space
 
-Array = NDArray[np.float64]
-PENALTY = 20.0  # weight of a limit's relative violation beside that of never settling
+VIOLATION_PENALTY = 20.0  # weight of a limit's relative violation beside that of never settling
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Screening:
 
 
 @dataclass(frozen=True, eq=False)
-class Screened:
-    """What `screen` found.
+class BestPoint:
+    """What `run_screening` found.
 
     Attributes
     ----------
@@ -80,15 +80,15 @@ class Screened:
     is_complete: bool
 
 
-def screen(
+def run_screening(
     simulator: Simulator,
     references: Sequence[Step],
     space: Space,
     spec: Specification,
     method: Screening,
     start: Array,
-    tell: Tell,
-) -> Screened:
+    tell: ProgressCallback,
+) -> BestPoint:
     """The best point found; Ctrl-C ends the search with the best so far.
 
     Parameters
@@ -101,19 +101,19 @@ def screen(
     tell : callable
         Hears of each generation.
     """
-    judge = Judge(simulator, space, spec, min(r.horizon - r.at for r in references), space.unit(start))
+    judge = MeritFunction(simulator, space, spec, min(r.horizon - r.at for r in references), space.to_unit(start))
     try:
         _search(judge, spec, method, tell)
     except KeyboardInterrupt:
-        return Screened(space.draw(judge.best), judge.count, is_complete=False)
-    return Screened(space.draw(judge.best), judge.count, is_complete=True)
+        return BestPoint(space.from_unit(judge.best), judge.count, is_complete=False)
+    return BestPoint(space.from_unit(judge.best), judge.count, is_complete=True)
 
 
-def _search(judge: "Judge", spec: Specification, method: Screening, tell: Tell) -> None:
+def _search(judge: "MeritFunction", spec: Specification, method: Screening, tell: ProgressCallback) -> None:
     rng = np.random.default_rng(method.seed)
     population = first_population(method.members, judge.best, rng)
     for band in [*(b for b in method.bands if b > spec.band), spec.band, spec.band]:
-        judge.ask(spec.with_band(band))
+        judge.set_specification(spec.with_band(band))
         merits, worst = judge.race(population, np.full(len(population), np.inf), None)
         for number in range(method.generations):
             population, merits, worst = generation(population, merits, worst, judge, rng)
@@ -122,7 +122,7 @@ def _search(judge: "Judge", spec: Specification, method: Screening, tell: Tell) 
         _refine(judge.best, judge, method.refinements)
 
 
-class Judge:
+class MeritFunction:
     """Merit of points of the unit cube, one a row; counts them, and keeps the best under what was asked last.
 
     Attributes
@@ -134,17 +134,17 @@ class Judge:
 
     def __init__(self, simulator: Simulator, space: Space, spec: Specification, scale: float, start: Array) -> None:
         self._simulator, self._space, self._spec, self._scale = simulator, space, spec, scale
-        self.best, self._least, self.count = start, np.inf, 0
+        self.best, self._best_merit, self.count = start, np.inf, 0
 
-    def ask(self, spec: Specification) -> None:
+    def set_specification(self, spec: Specification) -> None:
         """Judge by another specification from now on."""
-        self._spec, self._least = spec, np.inf
+        self._spec, self._best_merit = spec, np.inf
 
     def __call__(self, unit: Array) -> Array:
         """The merit of each point, on every case."""
         return self.race(unit, np.full(len(unit), np.inf), None)[0]
 
-    def race(self, unit: Array, rivals: Array, first: Index | None) -> tuple[Array, Index]:
+    def race(self, unit: Array, rivals: Array, first: Indices | None) -> tuple[Array, Indices]:
         """The merit of each point that may beat its rival, and of the others a lower bound that does not.
 
         Parameters
@@ -161,60 +161,60 @@ class Judge:
             Each point's worst case.
         """
         self.count += len(unit)
-        points, C = self._space.draw(np.clip(unit, 0.0, 1.0)), len(self._simulator.cases)
+        points, C = self._space.from_unit(np.clip(unit, 0.0, 1.0)), len(self._simulator.cases)
         if first is None or C == 1:
-            merits, worst, _ = self._look(points, None, rivals, {})
+            merits, worst, _ = self._evaluate(points, None, rivals, {})
         else:
             opening = np.arange(C) == first[:, None]
-            merits, worst, seen = self._look(points, opening, rivals, {})
+            merits, worst, seen = self._evaluate(points, opening, rivals, {})
             on = merits <= rivals
             if on.any():
                 seen = {n: value[on] for n, value in seen.items()}
-                merits[on], worst[on], _ = self._look(points[on], ~opening[on], rivals[on], seen)
+                merits[on], worst[on], _ = self._evaluate(points[on], ~opening[on], rivals[on], seen)
         k = int(np.argmin(merits))
-        if merits[k] < self._least:
-            self.best, self._least = unit[k], float(merits[k])
+        if merits[k] < self._best_merit:
+            self.best, self._best_merit = unit[k], float(merits[k])
         return merits, worst
 
-    def _look(
+    def _evaluate(
         self, points: Array, lanes: Mask | None, rivals: Array, seen: Mapping[str, Array]
-    ) -> tuple[Array, Index, dict[str, Array]]:
+    ) -> tuple[Array, Indices, dict[str, Array]]:
         """Merits, worst cases and values over the cases of `lanes` and what was `seen` before.
 
         Margins, a frequency response each, cost as much as a simulation; as limits they only add.
         """
         given = () if lanes is None else (lanes,)
         responses = self._simulator.respond(points, self._spec.band, *given)
-        plain = self._spec.without(ROBUSTNESS)
-        values = _larger(responses.values, seen)
+        plain = self._spec.without(ROBUSTNESS_REQUIREMENTS)
+        values = _elementwise_max(responses.values, seen)
         merits = np.full(len(points), -np.inf)
-        if not self._spec.weight(ROBUSTNESS):
+        if not self._spec.weight(ROBUSTNESS_REQUIREMENTS):
             merits = merit(values, plain, self._scale)
-        if self._spec.concerns(ROBUSTNESS):
+        if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
             ahead = merits <= rivals
-            margins = {n: np.full(len(points), -np.inf) for n in self._simulator.margins}
-            robust = responses.robust(ahead)
+            margins = {n: np.full(len(points), -np.inf) for n in self._simulator.margin_metrics}
+            robust = responses.with_margins(ahead)
             for n, value in margins.items():
                 value[ahead] = robust[n]
-            values = _larger({**values, **margins}, seen)
+            values = _elementwise_max({**values, **margins}, seen)
             merits[ahead] = merit({n: value[ahead] for n, value in values.items()}, self._spec, self._scale)
-        return merits, self._worst(responses, plain), values
+        return merits, self._worst_case(responses, plain), values
 
-    def _worst(self, responses: Responses, plain: Specification) -> Index:
+    def _worst_case(self, responses: Responses, plain: Specification) -> Indices:
         """The case with the largest merit, margins left out."""
-        if len(self._simulator.cases) == 1 or self._spec.weight(ROBUSTNESS):
+        if len(self._simulator.cases) == 1 or self._spec.weight(ROBUSTNESS_REQUIREMENTS):
             return np.zeros(len(responses.values["Excess"]), dtype=np.intp)
-        table = responses.spread(merit(responses.by_case(), plain, self._scale))
+        table = responses.to_table(merit(responses.by_case(), plain, self._scale))
         return np.asarray(np.argmax(table, axis=1))
 
 
-def _larger(values: Mapping[str, Array], seen: Mapping[str, Array]) -> dict[str, Array]:
+def _elementwise_max(values: Mapping[str, Array], seen: Mapping[str, Array]) -> dict[str, Array]:
     return {n: np.maximum(value, seen[n]) if n in seen else value for n, value in values.items()}
 
 
 def generation(
-    population: Array, merits: Array, worst: Index, judge: Judge, rng: np.random.Generator
-) -> tuple[Array, Array, Index]:
+    population: Array, merits: Array, worst: Indices, judge: MeritFunction, rng: np.random.Generator
+) -> tuple[Array, Array, Indices]:
     """One generation of differential evolution: half of the members search about themselves and the best."""
     m, n = population.shape
     a, b, c = (rng.permutation(m) for _ in range(3))
@@ -233,7 +233,7 @@ def generation(
     return population, np.where(better, found, merits), np.where(better, cases, worst)
 
 
-def _refine(best: Array, judge: Judge, most: int) -> None:
+def _refine(best: Array, judge: MeritFunction, most: int) -> None:
     """Nelder-Mead from a small simplex; the judge keeps the best."""
     steps = np.where(best < 0.5, 0.03, -0.03) * np.eye(len(best))
     options = {"maxfev": most, "initial_simplex": np.vstack([best, best + steps]), "xatol": 1e-5, "fatol": 1e-7}
@@ -259,16 +259,16 @@ def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Arr
     scale : float
         The horizon, which stands for the settling time of what never settles [s].
     """
-    filled = {n: np.where(np.isfinite(value), value, LOST) for n, value in values.items()}
-    settles, late = np.isfinite(values["SettlingTime"]), unsettled(scale, filled["Excess"])
+    filled = {n: np.where(np.isfinite(value), value, WORST_MERIT) for n, value in values.items()}
+    settles, late = np.isfinite(values["SettlingTime"]), penalty_settling_time(scale, filled["Excess"])
     filled["SettlingTime"] = np.where(settles, filled["SettlingTime"], late)
     missed = np.where(settles, 0.0, late / scale) if spec.weight(SettlingTime) else np.zeros_like(late)
     for q in spec.limits:
-        missed += PENALTY * np.maximum(0.0, filled[name(q)] / most(q) - 1)
+        missed += VIOLATION_PENALTY * np.maximum(0.0, filled[metric_name(q)] / upper_limit(q) - 1)
     total = np.zeros_like(late)
     for q, weight in spec.weights.items():
-        total += weight * filled[name(q)]
-    return np.where(missed > 0, LOST * (1 + missed), np.minimum(total, LOST))
+        total += weight * filled[metric_name(q)]
+    return np.where(missed > 0, WORST_MERIT * (1 + missed), np.minimum(total, WORST_MERIT))
 
 
 def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:

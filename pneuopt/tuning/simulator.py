@@ -5,40 +5,39 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.batch_margins import robustness
+from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.cases import cases
-from pneuopt.evaluation.requirements import AT_LEAST, ROBUSTNESS, read
-from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.requirements import MINIMUM_REQUIREMENTS, ROBUSTNESS_REQUIREMENTS, requirement_values
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.readings import CONTROL, METERED, Grid, is_averaged, read_off, watched
+from pneuopt.tuning.readings import AIR_METRIC, CONTROL_OUTPUT, ReferenceGrid, has_integral, loop_pieces, read_metrics
 from pneuopt.tuning.space import (
-    MOST_SUBSTEPS,
-    POINTS_A_PERIOD,
+    MAX_LOOP_SUBSTEPS,
+    SAMPLES_A_DITHER_PERIOD,
     Space,
-    fastest,
-    inputs,
-    readings,
-    resolving,
-    spacing,
-    substeps,
+    dither_resolution_rate,
+    fastest_eigenvalue,
+    loop_inputs,
+    readings_a_sample,
+    rk4_substeps,
+    sample_spacing,
 )
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Index = NDArray[np.intp]
-RUNAWAY = 1e12
-READ = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "Ripple", "Excess")
-FEW = 32  # lanes: different references then share the lanes of a processor, the shorter ones padded
-CHUNK = 128  # lanes that are run, and read, at a time: what a processor's cache holds
-COARSE = 10  # samples a dither period; settling times then are off by a tenth of a millisecond on T32, 3 at worst
-STIFFEST = 8  # corners of the gains' box whose rates are looked at on the scenarios' plants too
+RUNAWAY_LEVEL = 1e12
+BASE_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "Ripple", "Excess")
+MAX_MIXED_LANES = 32  # lanes: different references then share the lanes of a processor, the shorter ones padded
+MAX_CHUNK_LANES = 128  # lanes that are run, and read, at a time: what a processor's cache holds
+COARSE_SAMPLES_A_PERIOD = (
+    10  # samples a dither period; settling times then are off by a tenth of a millisecond on T32, 3 at worst
+)
+STIFFEST_CORNERS = 8  # corners of the gains' box whose rates are looked at on the scenarios' plants too
 
 
 class Simulator:
@@ -68,27 +67,27 @@ class Simulator:
         loop: ClosedLoop,
         references: Sequence[Step],
         space: Space,
-        scenarios: Scenarios = NOMINAL,
+        scenarios: Scenarios = NO_SCENARIOS,
         spec: Specification | None = None,
     ) -> None:
-        linearised, kinds = [k.__name__ for k in ROBUSTNESS], spec.kinds if spec else ()
-        self.read = tuple(dict.fromkeys((*READ, *(k for k in kinds if k not in linearised))))
-        self.margins = tuple(dict.fromkeys(("MaxSensitivity", *(k for k in kinds if k in linearised))))
+        linearised, kinds = [k.__name__ for k in ROBUSTNESS_REQUIREMENTS], spec.kinds if spec else ()
+        self.response_metrics = tuple(dict.fromkeys((*BASE_METRICS, *(k for k in kinds if k not in linearised))))
+        self.margin_metrics = tuple(dict.fromkeys(("MaxSensitivity", *(k for k in kinds if k in linearised))))
         self._envelope = spec.envelope if spec else ()
         self._wider: tuple[float, ...] = ()
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
-        self._rest = [case.rest(loop, space) for case in self.cases]
-        self._rollout = Rollout(watched(loop, with_meter=METERED in self.read))
+        self._rest = [case.gain_independent_rest(loop, space) for case in self.cases]
+        self._rollout = Rollout(loop_pieces(loop, with_meter=AIR_METRIC in self.response_metrics))
         self.grids = _grids(loop, references, space.parameters)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
-        self._rate = rate = max(self._fastest(references), resolving(loop, space.parameters))
-        self.substeps = [substeps(rate, grid.spacing) for grid in self.grids]
+        self._rate = rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
+        self.substeps = [rk4_substeps(rate, grid.spacing) for grid in self.grids]
         slowest = 1 / max(r.horizon for r in references)
         omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
-        if len(self.margins) > 1:  # unlike the sensitivity's peak, crossings lie where a slow integral puts them
+        if len(self.margin_metrics) > 1:  # unlike the sensitivity's peak, crossings lie where a slow integral puts them
             omega = np.concatenate([np.geomspace(3e-5, 0.29, 60) * slowest, omega])
-        self.robustness = robustness(loop, omega)  # about what `points_of_operation` gives
+        self.robustness = batch_margin_function(loop, omega)  # about what `operating_points` gives
 
     def coarse(self, spec: Specification, bands: Sequence[float] = ()) -> "Simulator":
         """The same for a search on its way, by copy: half as many samples, and nothing read but what `spec` asks.
@@ -98,12 +97,16 @@ class Simulator:
         """
         part = copy.copy(self)
         part._wider = tuple(bands)
-        part.read = tuple(dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.kinds if n in self.read))))
-        part.grids = _grids(self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE)
-        part.substeps = [substeps(self._rate, grid.spacing) for grid in part.grids]
+        part.response_metrics = tuple(
+            dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.kinds if n in self.response_metrics)))
+        )
+        part.grids = _grids(
+            self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE_SAMPLES_A_PERIOD
+        )
+        part.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in part.grids]
         return part
 
-    def only(self, chosen: Sequence[int]) -> "Simulator":
+    def select_cases(self, chosen: Sequence[int]) -> "Simulator":
         """The same with some of the cases, by copy."""
         part = copy.copy(self)
         part.cases, part._rest = tuple(self.cases[k] for k in chosen), [self._rest[k] for k in chosen]
@@ -111,18 +114,18 @@ class Simulator:
         part.grids, part.substeps = [self.grids[g] for g in used], [self.substeps[g] for g in used]
         return part
 
-    def by_grid(self) -> list[Mask]:
+    def cases_by_grid(self) -> list[Mask]:
         """The cases of each grid, a reference's."""
         return [self._grid_of == g for g in range(len(self.grids))]
 
-    def averaged_over(self) -> list[float]:
+    def dither_periods(self) -> list[float]:
         """The time over which the dither is averaged, a case each [s]; 0: no dither, at any amplitude."""
         order, dither = list(self.space.parameters), self.loop.dither
         amplitude = self.space.parameters["dither.amplitude"] if dither else None
         if dither is None or amplitude is None or not (amplitude.free or amplitude.value):
             return [0.0] * len(self.cases)
         given = self.space.vectors(self.space.start[None])
-        rates = [float(case.rows(given, order)[0, order.index("dither.frequency")]) for case in self.cases]
+        rates = [float(case.case_vectors(given, order)[0, order.index("dither.frequency")]) for case in self.cases]
         return [dither.period(rate, self.loop.pid.sample_time) for rate in rates]
 
     def respond(self, points: Array, band: float, lanes: Mask | None = None) -> "Responses":
@@ -139,7 +142,7 @@ class Simulator:
         wanted = np.ones((len(points), len(self.cases)), dtype=bool) if lanes is None else lanes
         rows, case = np.nonzero(wanted)
         p, starts = self.lanes(points, rows, case)
-        measured = Measured.empty(len(rows), starts.shape[1], self.read)
+        measured = LaneMetrics.empty(len(rows), starts.shape[1], self.response_metrics)
         for chunk in self._chunks(case):
             self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
         return Responses(self, wanted, p, measured)
@@ -155,43 +158,43 @@ class Simulator:
         """
         responses = self.respond(points, spec.band)
         every = np.ones(len(points), dtype=bool)
-        return responses.robust(every) if spec.concerns(ROBUSTNESS) else responses.values
+        return responses.with_margins(every) if spec.concerns(ROBUSTNESS_REQUIREMENTS) else responses.values
 
     def table(self, point: Array, spec: Specification) -> list[dict[str, float]]:
         """The metrics of one candidate, a row a case."""
         responses = self.respond(point[None], spec.band)
-        margins = {n: table[0] for n, table in responses.margins(np.ones(1, dtype=bool)).items()}
-        return each({n: responses.table(n)[0] for n in self.read} | margins)
+        margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
+        return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
 
-    def points_of_operation(self, p: Array, case: Index, x_end: Array, commands: Array) -> tuple[Array, Array]:
+    def operating_points(self, p: Array, case: Indices, x_end: Array, commands: Array) -> tuple[Array, Array]:
         """The plant's states and commands in which lanes end; under dither their means over its last period.
 
         A search keeps no states on the way: the period after the end is run, and what it drifts by is taken off.
         """
         x, u = x_end[:, : len(self.loop.plant.states)].copy(), commands.copy()
-        for period, rows in self.periods(p, np.ones(len(p), dtype=bool)):
+        for period, rows in self.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
             for g in np.unique(self._grid_of[case[rows]]).tolist() if period is not None else ():
                 own = np.flatnonzero(rows & (self._grid_of[case] == g))
-                means = self._period_after(self.grids[g], x_end[own], p[own], period or 0.0)
+                means = self._means_after_end(self.grids[g], x_end[own], p[own], period or 0.0)
                 tame = np.isfinite(means).all(axis=1)
                 x[own[tame]], u[own[tame]] = means[tame, :-1], means[tame, -1]
         return x, u
 
-    def _period_after(self, grid: Grid, x_end: Array, p: Array, period: float) -> Array:
+    def _means_after_end(self, grid: ReferenceGrid, x_end: Array, p: Array, period: float) -> Array:
         """Means of the plant's states and the command over the period after the end, less the drift in one."""
         held = self.loop.pid.sample_time is not None
-        n = max(1, round(period / grid.spacing)) if held else POINTS_A_PERIOD
+        n = max(1, round(period / grid.spacing)) if held else SAMPLES_A_DITHER_PERIOD
         h = grid.spacing if held else period / n
         u = np.tile(grid.u[-1], (len(p), n + 1, 1))
         t, steps = (np.tile(a, (len(p), 1)) for a in (grid.t[-1] + h * np.arange(n + 1), [h] * n + [0.0]))
         with np.errstate(all="ignore"):
-            found = self._rollout.run(x_end, u, p, t, steps, substeps=substeps(self._rate, h), states=True)
+            found = self._rollout.run(x_end, u, p, t, steps, substeps=rk4_substeps(self._rate, h), states=True)
             assert found.x is not None
-            plant, control = found.x[:, :, : len(self.loop.plant.states)], found.y[:, :, CONTROL, None]
+            plant, control = found.x[:, :, : len(self.loop.plant.states)], found.y[:, :, CONTROL_OUTPUT, None]
             along = np.concatenate([plant, control], axis=2)
             return np.asarray(np.trapezoid(along, axis=1) / n - (along[:, -1] - along[:, 0]))
 
-    def lanes(self, points: Array, rows: Index, case: Index) -> tuple[Array, Array]:
+    def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
         """Parameters and start states of lanes, each a candidate's row and a case."""
         base, order = self.space.vectors(points)[rows], list(self.space.parameters)
         p, starts = np.empty_like(base), np.empty((len(rows), self._rollout.n_states))
@@ -207,21 +210,21 @@ class Simulator:
         if rest is not None:
             found = np.tile(rest, (len(points), 1))
         else:
-            found = np.array([self.cases[case].initial(self.loop, self.space.filled(point)) for point in points])
-        return np.column_stack([found, np.zeros((len(found), int(is_averaged(self.loop))))])
+            found = np.array([self.cases[case].initial(self.loop, self.space.parameters_at(point)) for point in points])
+        return np.column_stack([found, np.zeros((len(found), int(has_integral(self.loop))))])
 
     def starts_vary(self, case: int) -> bool:
         """Whether the rest of a case depends on the gains."""
         return self._rest[case] is None
 
-    def periods(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
+    def lanes_by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
         """Which of the sound lanes are averaged over which time."""
         rates = self._dither_rates(p)
         for rate in np.unique(rates[sound]).tolist():
             period = self.loop.dither.period(rate, self.loop.pid.sample_time) if rate and self.loop.dither else None
             yield period, sound & (rates == rate)
 
-    def padded(self, case: Index) -> tuple[Array, Array, Array, int]:
+    def pad(self, case: Indices) -> tuple[Array, Array, Array, int]:
         """Inputs, instants and steps of lanes, shapes (m, n, n_inputs), (m, n), (m, n); substeps."""
         own = self._grid_of[case]
         n = max(len(self.grids[g].t) for g in np.unique(own))
@@ -229,19 +232,19 @@ class Simulator:
         u, t, h = (np.array([full[g][k] for g in own.tolist()]) for k in range(3))
         return u, t, h, max(self.substeps[g] for g in np.unique(own))
 
-    def _chunks(self, case: Index) -> Iterator[Index]:
+    def _chunks(self, case: Indices) -> Iterator[Indices]:
         """Lanes that run together: few of them all at once, many with those on the same grid."""
-        if len(case) <= FEW:
+        if len(case) <= MAX_MIXED_LANES:
             yield np.arange(len(case))
             return
         for g in range(len(self.grids)):
             own = np.flatnonzero(self._grid_of[case] == g)
-            yield from np.split(own, np.arange(CHUNK, len(own), CHUNK))
+            yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
 
-    def _measure(self, out: "Measured", chunk: Index, case: Index, starts: Array, p: Array, band: float) -> None:
+    def _measure(self, out: "LaneMetrics", chunk: Indices, case: Indices, starts: Array, p: Array, band: float) -> None:
         if not len(chunk):
             return
-        u, t, h, steps = self.padded(case)
+        u, t, h, steps = self.pad(case)
         with np.errstate(all="ignore"):
             found = self._rollout.run(starts, u, p, t, h, substeps=steps)
         out.x_end[chunk] = found.x_end
@@ -250,9 +253,11 @@ class Simulator:
             own, grid = self._grid_of[case] == g, self.grids[g]
             y = np.moveaxis(planes[:, own, : len(grid.t)], 0, 2)
             sound = is_sound(y, found.x_end[own])
-            out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL]
-            for period, rows in self.periods(p[own], sound):
-                metrics = read_off(grid, _some(y, rows), (band, *self._wider), period, self.read, self._envelope)
+            out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
+            for period, rows in self.lanes_by_dither_period(p[own], sound):
+                metrics = read_metrics(
+                    grid, _select_rows(y, rows), (band, *self._wider), period, self.response_metrics, self._envelope
+                )
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
 
@@ -263,28 +268,28 @@ class Simulator:
         amplitude, frequency = (p[:, order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
         return np.where(amplitude == 0, 0.0, frequency)
 
-    def _fastest(self, references: Sequence[Step]) -> float:
+    def _fastest_eigenvalue(self, references: Sequence[Step]) -> float:
         """The fastest mode over the gains' box; on the scenarios' plants at the corners that are fastest nominally."""
-        states = [x for k in range(len(references)) for x in self._visited(k)]
+        states = [x for k in range(len(references)) for x in self._sample_states(k)]
         corners, order = self.space.vectors(self.space.corners()), list(self.space.parameters)
-        rates = fastest(self.loop, corners, states)
-        worst = corners[np.argsort(rates)[-STIFFEST:]]
-        others = [case.rows(worst, order) for case in self.cases[len(references) :: len(references)]]
-        return float(max([rates.max(), *(fastest(self.loop, p, states).max() for p in others)]))
+        rates = fastest_eigenvalue(self.loop, corners, states)
+        worst = corners[np.argsort(rates)[-STIFFEST_CORNERS:]]
+        others = [case.case_vectors(worst, order) for case in self.cases[len(references) :: len(references)]]
+        return float(max([rates.max(), *(fastest_eigenvalue(self.loop, p, states).max() for p in others)]))
 
-    def _visited(self, k: int) -> list[Array]:
+    def _sample_states(self, k: int) -> list[Array]:
         """Some states along the response of the given gains, and the rest."""
         grid, given = self.grids[k], self.space.start[None]
         start, p = self.starts(k, given), self.space.vectors(given)
-        u, t, h = (a[None] for a in grid.padded(len(grid.t)))
-        found = self._rollout.run(start, u, p, t, h, substeps=MOST_SUBSTEPS, states=True).x
+        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
+        found = self._rollout.run(start, u, p, t, h, substeps=MAX_LOOP_SUBSTEPS, states=True).x
         assert found is not None
         along = np.vstack([start, found[0][:: max(1, len(grid.t) // 10)]])[:, : len(self.loop.states)]
         return list(along[np.isfinite(along).all(axis=1)])
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class LaneMetrics:
     """What m lanes showed.
 
     Attributes
@@ -305,9 +310,9 @@ class Measured:
     command: Array
 
     @staticmethod
-    def empty(m: int, n_states: int, read: Sequence[str]) -> "Measured":
+    def empty(m: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
         """For m lanes, to be filled."""
-        return Measured(
+        return LaneMetrics(
             {n: np.full(m, np.inf) for n in read}, np.zeros(m, dtype=bool), np.empty((m, n_states)), np.empty(m)
         )
 
@@ -321,61 +326,61 @@ class Responses:
         What the requirements read but for margins, the worst over the cases that were run.
     """
 
-    def __init__(self, simulator: Simulator, lanes: Mask, p: Array, measured: Measured) -> None:
+    def __init__(self, simulator: Simulator, lanes: Mask, p: Array, measured: LaneMetrics) -> None:
         self._simulator, self._lanes, self._p, self._measured = simulator, lanes, p, measured
-        metrics = {n: self.table(n).max(axis=1) for n in simulator.read}
-        self.values = {**read(metrics), "Excess": metrics["Excess"]}
+        metrics = {n: self.table(n).max(axis=1) for n in simulator.response_metrics}
+        self.values = {**requirement_values(metrics), "Excess": metrics["Excess"]}
 
     def table(self, metric: str) -> Array:
         """One metric, shape (m, n_cases); minus infinity where a case was not run."""
-        return self.spread(self._measured.metrics[metric])
+        return self.to_table(self._measured.metrics[metric])
 
     def by_case(self) -> dict[str, Array]:
         """The values of each case that was run, shape (n_lanes,), as `lanes` lists them row by row."""
         metrics = self._measured.metrics
-        return {**read(metrics), "Excess": metrics["Excess"]}
+        return {**requirement_values(metrics), "Excess": metrics["Excess"]}
 
-    def robust(self, rows: Mask) -> dict[str, Array]:
+    def with_margins(self, rows: Mask) -> dict[str, Array]:
         """The values of some candidates, with their margins."""
         chosen = {n: value[rows] for n, value in self.values.items()}
-        margins = read(self.margins(rows))
+        margins = requirement_values(self.margin_metrics(rows))
         ran = self._lanes[rows]
         return chosen | {n: np.max(np.where(ran, table, -np.inf), axis=1) for n, table in margins.items()}
 
-    def margins(self, rows: Mask) -> dict[str, Array]:
+    def margin_metrics(self, rows: Mask) -> dict[str, Array]:
         """Margins and peaks of some candidates, a column a case; NaN and infinite where the response runs away."""
-        measured, names = self._measured, self._simulator.margins
-        absent = {k.__name__: np.nan for k in AT_LEAST}
+        measured, names = self._measured, self._simulator.margin_metrics
+        absent = {k.__name__: np.nan for k in MINIMUM_REQUIREMENTS}
         found = {n: np.full(len(measured.sound), absent.get(n, np.inf)) for n in names}
         row, case = np.nonzero(self._lanes)
         wanted = measured.sound & rows[row]
         if wanted.any():
             p = self._p[wanted]
             ends = measured.x_end[wanted], measured.command[wanted]
-            points = self._simulator.points_of_operation(p, case[wanted], *ends)
+            points = self._simulator.operating_points(p, case[wanted], *ends)
             for n, value in self._simulator.robustness(p, *points, names).items():
                 found[n][wanted] = value
-        return {n: self.spread(value)[rows] for n, value in found.items()}
+        return {n: self.to_table(value)[rows] for n, value in found.items()}
 
-    def spread(self, lanes: Array) -> Array:
+    def to_table(self, lanes: Array) -> Array:
         """Numbers of the lanes as a table, shape (m, n_cases); minus infinity where a case was not run."""
         table = np.full(self._lanes.shape, -np.inf)
         table[self._lanes] = lanes
         return table
 
 
-def each(values: Mapping[str, Array]) -> list[dict[str, float]]:
+def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
     """The values of one candidate after another."""
     rows = zip(*(value.tolist() for value in values.values()), strict=True)
     return [dict(zip(values, row, strict=True)) for row in rows]
 
 
-def worst(found: Sequence[dict[str, float]]) -> dict[str, float]:
+def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
     """The largest of each value over the cases; NaN wins."""
     return {n: float(np.max([values[n] for values in found])) for n in found[0]}
 
 
-def _some(y: Array, rows: Mask) -> Array:
+def _select_rows(y: Array, rows: Mask) -> Array:
     """Some rows, the time axis as contiguous as it was."""
     return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)
 
@@ -383,18 +388,20 @@ def _some(y: Array, rows: Mask) -> Array:
 def is_sound(y: Array, x_end: Array) -> Mask:
     """Which lanes did not run away."""
     with np.errstate(all="ignore"):
-        tame = np.all(np.abs(y) < RUNAWAY, axis=(1, 2))
+        tame = np.all(np.abs(y) < RUNAWAY_LEVEL, axis=(1, 2))
     return np.asarray(tame & np.isfinite(x_end).all(axis=1))
 
 
 def _grids(
-    loop: ClosedLoop, references: Sequence[Step], parameters: ParameterSet, a_period: int = POINTS_A_PERIOD
-) -> list[Grid]:
+    loop: ClosedLoop, references: Sequence[Step], parameters: ParameterSet, a_period: int = SAMPLES_A_DITHER_PERIOD
+) -> list[ReferenceGrid]:
     found = []
     for reference in references:
-        h = spacing(loop, reference, parameters, a_period)
-        run, k = inputs(loop, reference, h), readings(loop, reference)
+        h = sample_spacing(loop, reference, parameters, a_period)
+        run, k = loop_inputs(loop, reference, h), readings_a_sample(loop, reference)
         number = np.arange(k * (len(run) - 1) + 1)
         t: Array = np.asarray(number * (h / k), dtype=np.float64)
-        found.append(Grid(reference, t, run.matrix(names(loop.inputs))[number // k], h / k, loop.pid.sample_time))
+        found.append(
+            ReferenceGrid(reference, t, run.matrix(names(loop.inputs))[number // k], h / k, loop.pid.sample_time)
+        )
     return found

@@ -2,31 +2,33 @@
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.control.disturbance import disturbed
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbing
+from pneuopt.control.reference import Step, disturbance_input
 from pneuopt.dynamics.system import Linearisation
-from pneuopt.evaluation.metrics import About, Envelope, step_metrics
+from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-Tell = Callable[[str], None]
-STABLE = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
-MOST_SUBSTEPS = 100
-MOST_AROUND = 625  # points: all that differ by two last places or less in four gains
-POINTS = 1000  # samples of a response where the loop has no sample time
-READINGS, FEWEST_READINGS, MOST_READINGS = 1000, 2, 16  # of a sampled loop: so many a horizon, and a sample
-POINTS_A_PERIOD = 20  # of a continuous dither; at six, its average claimed 47 ms on T32 where 63 are certified
+RK4_MAX_H_LAMBDA = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
+MAX_LOOP_SUBSTEPS = 100
+MAX_ROUNDING_POINTS = 625  # points: all that differ by two last places or less in four gains
+RESPONSE_SAMPLES = 1000  # samples of a response where the loop has no sample time
+READINGS_A_HORIZON, MIN_READINGS_A_SAMPLE, MAX_READINGS_A_SAMPLE = (
+    1000,
+    2,
+    16,
+)  # of a sampled loop: so many a horizon, and a sample
+SAMPLES_A_DITHER_PERIOD = 20  # of a continuous dither; at six, its average claimed 47 ms on T32 where 63 are certified
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +56,11 @@ class Space:
         """The given values, shape (n,)."""
         return np.array([self.parameters.value(n) for n in self.names])
 
-    def filled(self, point: Array) -> ParameterSet:
+    def parameters_at(self, point: Array) -> ParameterSet:
         """The loop's parameters with the free ones at `point`."""
         return self.parameters.with_values(dict(zip(self.names, np.clip(point, *self.bounds.T).tolist(), strict=True)))
 
-    def draw(self, unit: Array) -> Array:
+    def from_unit(self, unit: Array) -> Array:
         """Points for numbers between 0 and 1, shape (..., n): along the range, or its logarithm where so flagged."""
         low, up = self.bounds.T
         log = np.array([self.parameters[n].log for n in self.names], dtype=bool)
@@ -66,8 +68,8 @@ class Space:
         drawn: Array = np.where(log, tiny * (np.where(log, up, 1.0) / tiny) ** unit, low + (up - low) * unit)
         return np.clip(drawn, low, up)
 
-    def unit(self, point: Array) -> Array:
-        """The inverse of `draw`."""
+    def to_unit(self, point: Array) -> Array:
+        """The inverse of `from_unit`."""
         low, up = self.bounds.T
         log = np.array([self.parameters[n].log for n in self.names], dtype=bool)
         safe = np.where(log, [low, up, point], 1.0)
@@ -76,8 +78,8 @@ class Space:
         )
         return share
 
-    def rates(self, points: Array) -> Array:
-        """The derivative of `draw` at points, shape (..., n)."""
+    def from_unit_slope(self, points: Array) -> Array:
+        """The derivative of `from_unit` at points, shape (..., n)."""
         low, up = self.bounds.T
         log = np.array([self.parameters[n].log for n in self.names], dtype=bool)
         ratio = np.where(log, up, 1.0) / np.where(log, low, 1.0)
@@ -93,7 +95,7 @@ class Space:
         rows[:, [list(self.parameters).index(n) for n in self.names]] = np.clip(points, *self.bounds.T)
         return rows
 
-    def printed(self, point: Array, digits: int) -> Array:
+    def round_point(self, point: Array, digits: int) -> Array:
         """The point with so many significant digits, shape (n,).
 
         Examples
@@ -106,7 +108,7 @@ class Space:
         """
         found = np.array(point)
         for k, (value, (low, up)) in enumerate(zip(point.tolist(), self.bounds, strict=True)):
-            rounded = (_rounded(value + n * _place(value, digits), digits) for n in (0, -1, 1))
+            rounded = (_round_digits(value + n * _last_place(value, digits), digits) for n in (0, -1, 1))
             found[k] = next((v for v in rounded if low <= v <= up), value)
         return found
 
@@ -114,14 +116,14 @@ class Space:
         """The points that differ from a printed one by a last place in one coordinate, shape (m, n) with m <= 2 n."""
         found = []
         for k, (value, (low, up)) in enumerate(zip(printed.tolist(), self.bounds, strict=True)):
-            sides = (_rounded(value + n * _place(value, digits), digits) for n in (-1, 1)) if value else ()
+            sides = (_round_digits(value + n * _last_place(value, digits), digits) for n in (-1, 1)) if value else ()
             found += [np.where(np.arange(len(printed)) == k, v, printed) for v in sides if low <= v <= up]
         return np.reshape(found, (-1, len(printed)))
 
-    def around(self, printed: Array, digits: int) -> Array:
+    def neighbourhood(self, printed: Array, digits: int) -> Array:
         """The points that differ from a printed one by up to two last places in every coordinate, shape (m, n).
 
-        Of more than `MOST_AROUND` a random share.
+        Of more than `MAX_ROUNDING_POINTS` a random share.
 
         Examples
         --------
@@ -131,25 +133,25 @@ class Space:
         [0.3998, 0.3999, 0.4, 0.4001]
         """
         n, sides = len(printed), np.arange(-2, 3)
-        few = len(sides) ** n <= MOST_AROUND
-        drawn = np.random.default_rng(0).integers(-2, 3, (MOST_AROUND, n))
+        few = len(sides) ** n <= MAX_ROUNDING_POINTS
+        drawn = np.random.default_rng(0).integers(-2, 3, (MAX_ROUNDING_POINTS, n))
         offsets = np.array(list(itertools.product(sides, repeat=n))) if few else np.unique(drawn, axis=0)
-        places = np.array([_place(value, digits) for value in printed.tolist()])
-        points = [[_rounded(v, digits) for v in row] for row in (printed + offsets * places).tolist()]
+        places = np.array([_last_place(value, digits) for value in printed.tolist()])
+        points = [[_round_digits(v, digits) for v in row] for row in (printed + offsets * places).tolist()]
         low, up = self.bounds.T
         return np.array([point for point in points if np.all((point >= low) & (point <= up))]).reshape(-1, n)
 
 
-def _place(value: float, digits: int) -> float:
+def _last_place(value: float, digits: int) -> float:
     """What one in the last of so many digits is worth."""
     return float(10.0 ** (np.floor(np.log10(abs(value))) - digits + 1)) if value else 0.0
 
 
-def _rounded(value: float, digits: int) -> float:
+def _round_digits(value: float, digits: int) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def span(loop: ClosedLoop, parameters: ParameterSet) -> Space:
+def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     """The box that the free parameters span, checked.
 
     Raises
@@ -161,7 +163,7 @@ def span(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     full = loop.parameters | parameters.select(n for n in parameters if n in loop.parameters)
     free = tuple(n for n in parameters.free_names if n in loop.parameters)
     require(len(free) > 0, 'nothing is free; mark what may be tuned: parameters.freed("pid.K*", "dither.offset")')
-    divisors = {"dither.frequency", *(f"pid.{n}" for n in loop.pid.positive)}
+    divisors = {"dither.frequency", *(f"pid.{n}" for n in loop.pid.positive_parameters)}
     for n in free:
         require(
             n.startswith(("pid.", "dither.", "feedforward.")),
@@ -227,53 +229,55 @@ def measure(
         reference.initial,
         start=reference.at,
         band=band,
-        about=About.REFERENCE,
+        band_centre=BandCentre.REFERENCE,
         dither_period=loop.dither_period(parameters),
         control=response["control"],
         sample_time=loop.pid.sample_time,
         envelope=envelope,
-        scale=None if reference.is_step else reference.whole,
+        scale=None if reference.is_step else reference.nominal_size,
     )
 
 
-def cut(
+def linearise_open_loop(
     loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step | None = None
 ) -> Linearisation:
     """The open loop for margins, about a plant state x under a command, and under what disturbs it in the end."""
-    others = {} if reference is None else {disturbing(n): v for n, v in reference.disturbance.items()}
-    return disturbed(loop, [reference] if reference else []).open_loop(
+    others = {} if reference is None else {disturbance_input(n): v for n, v in reference.disturbance.items()}
+    return add_disturbances(loop, [reference] if reference else []).open_loop(
         parameters, x, {loop.command.name: command, **others}
     )
 
 
-def inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
+def loop_inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
     """The loop's inputs under a reference; those that the reference does not name are zero."""
     run = reference.trajectory(step)
     others = [q.name for q in loop.inputs if q.name not in run]
     return run.with_columns({n: np.zeros(len(run)) for n in others})
 
 
-def spacing(
-    loop: ClosedLoop, reference: Step, parameters: ParameterSet, points_a_period: int = POINTS_A_PERIOD
+def sample_spacing(
+    loop: ClosedLoop, reference: Step, parameters: ParameterSet, samples_a_period: int = SAMPLES_A_DITHER_PERIOD
 ) -> float:
     """Samples' distance [s]: the controller's, or a fine one on which the step's instant lies."""
     if loop.pid.sample_time is not None:
         return loop.pid.sample_time
-    rate = highest(loop, parameters)
-    longest = min(reference.horizon / POINTS, 1 / (points_a_period * rate) if rate else np.inf)
+    rate = highest_dither_frequency(loop, parameters)
+    longest = min(reference.horizon / RESPONSE_SAMPLES, 1 / (samples_a_period * rate) if rate else np.inf)
     whole = reference.at if reference.at > 0 else reference.horizon
     return float(whole / math.ceil(whole / longest - 1e-9))
 
 
-def readings(loop: ClosedLoop, reference: Step) -> int:
+def readings_a_sample(loop: ClosedLoop, reference: Step) -> int:
     """How often a response is read in a sample: between two of them it may leave the band."""
     h = loop.pid.sample_time
     if h is None:
         return 1
-    return min(MOST_READINGS, max(FEWEST_READINGS, math.ceil(h * READINGS / reference.horizon - 1e-9)))
+    return min(
+        MAX_READINGS_A_SAMPLE, max(MIN_READINGS_A_SAMPLE, math.ceil(h * READINGS_A_HORIZON / reference.horizon - 1e-9))
+    )
 
 
-def highest(loop: ClosedLoop, parameters: ParameterSet) -> float:
+def highest_dither_frequency(loop: ClosedLoop, parameters: ParameterSet) -> float:
     """The highest frequency that the dither may get [Hz]; 0 without dither."""
     if loop.dither is None:
         return 0.0
@@ -281,15 +285,15 @@ def highest(loop: ClosedLoop, parameters: ParameterSet) -> float:
     return frequency.upper if frequency.free else frequency.value
 
 
-def resolving(loop: ClosedLoop, parameters: ParameterSet) -> float:
+def dither_resolution_rate(loop: ClosedLoop, parameters: ParameterSet) -> float:
     """The rate [1/s] with which steps must keep up between two samples, so that an analogue dither has its points."""
     between = loop.dither is not None and loop.dither.analogue and loop.pid.sample_time is not None
-    return STABLE * POINTS_A_PERIOD * highest(loop, parameters) if between else 0.0
+    return RK4_MAX_H_LAMBDA * SAMPLES_A_DITHER_PERIOD * highest_dither_frequency(loop, parameters) if between else 0.0
 
 
-def fastest(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> Array:
+def fastest_eigenvalue(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> Array:
     """The largest eigenvalue's size [1/s] of the loop over the given states, for each row of parameters, shape (m,)."""
-    system = loop.system() if loop.pid.sample_time is None else loop.held()
+    system = loop.system() if loop.pid.sample_time is None else loop.hold_system()
     x, q = ca.SX.sym("x", len(system.states)), ca.SX.sym("p", len(system.parameters))
     rates = system.ode(0, x, np.zeros(len(system.inputs)), q)[0]
     slope = ca.Function("slope", [x, q], [ca.densify(ca.jacobian(rates, x))])
@@ -300,7 +304,7 @@ def fastest(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> Array:
     return np.asarray(sizes.reshape(len(p), len(states)).max(axis=1))
 
 
-def substeps(rate: float, h: float) -> int:
+def rk4_substeps(rate: float, h: float) -> int:
     """RK4 steps in a sample of length h so that the rate stays stable.
 
     Raises
@@ -308,10 +312,11 @@ def substeps(rate: float, h: float) -> int:
     InputError
         If that takes too many; the message names the remedy.
     """
-    k = int(np.ceil(rate * h / STABLE))
+    k = int(np.ceil(rate * h / RK4_MAX_H_LAMBDA))
     require(
-        k <= MOST_SUBSTEPS,
+        k <= MAX_LOOP_SUBSTEPS,
         f"within the bounds the loop has a mode as fast as {rate:.3g} 1/s, which takes {k} steps in {h:.3g} s, at most "
-        f"{MOST_SUBSTEPS}; narrow the gains' bounds (raise the lower one of pid.Tf), smooth the friction, or shorten h",
+        f"{MAX_LOOP_SUBSTEPS}; narrow the gains' bounds (raise the lower one of pid.Tf), smooth the friction, "
+        "or shorten h",
     )
     return max(1, k)

@@ -10,30 +10,38 @@ from dataclasses import replace
 
 import numpy as np
 
-from pneuopt.control.disturbance import disturbed
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.requirements import PeakControl, Requirement
-from pneuopt.evaluation.scenarios import NOMINAL, Scenarios
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.identification.checks import check_smooth
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code
+from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.tuning.condensed import Condensed, check_differentiable, is_differentiable
 from pneuopt.tuning.confirmed import Confirmed, check_confirmable
-from pneuopt.tuning.feasibility import check_reach
-from pneuopt.tuning.result import Notary, TuningResult
+from pneuopt.tuning.feasibility import check_feasibility
+from pneuopt.tuning.result import Certifier, TuningResult
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.search import Method, Search, relax
-from pneuopt.tuning.space import Space, Tell, span
-from pneuopt.tuning.two_phase import TwoPhase, check_exact, is_exact, is_light, is_linear
+from pneuopt.tuning.space import Space, search_space
+from pneuopt.tuning.two_phase import TwoPhase, check_exact, has_few_steps, is_exact, is_linear
 
-__all__ = ["Method", "TuningResult", "pose", "tune"]
-FEW_GAINS = 6  # up to which one plant is tuned as well without gradients; with 8 on T32 it takes twice the time
-CONTRADICTED = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)  # limits may be why
-UNFELT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # by a linear loop's average
+__all__ = ["Method", "TuningResult", "prepare_search", "tune"]
+MAX_SCREENING_GAINS = (
+    6  # up to which one plant is tuned as well without gradients; with 8 on T32 it takes twice the time
+)
+INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)  # limits may be why
+PARAMETERS_WITHOUT_EFFECT = (
+    "dither.amplitude",
+    "dither.frequency",
+    "pid.Tt",
+    "pid.lower",
+    "pid.upper",
+)  # by a linear loop's average
 
 
 def tune(
@@ -43,10 +51,10 @@ def tune(
     *,
     minimise: Requirement | Mapping[Requirement, float],
     subject_to: Sequence[Requirement] = (),
-    scenarios: Scenarios = NOMINAL,
+    scenarios: Scenarios = NO_SCENARIOS,
     method: Method | None = None,
     throw: bool = True,
-    progress: Tell | None = None,
+    progress: ProgressCallback | None = None,
 ) -> TuningResult:
     """Find the free gains, and dither, that do best on the references within the limits.
 
@@ -101,14 +109,14 @@ def tune(
     """
     begun = time.perf_counter()
     posed = (loop, references, parameters, minimise, subject_to, scenarios)
-    search = pose(*posed, method, progress)
+    search = prepare_search(*posed, method, progress)
     result = search.run()
     if method is None and isinstance(search.method, TwoPhase) and not result.status.converged:
-        search = pose(*posed, Screening(), progress)  # the exact problem keeps its band at its nodes only
+        search = prepare_search(*posed, Screening(), progress)  # the exact problem keeps its band at its nodes only
         result = search.run()
-    result = relax(search, result) if search.spec.limits and result.status.code in CONTRADICTED else result
+    result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     felt = search.space.names
-    unfelt = [n for n in span(loop, parameters).names if n not in felt]
+    unfelt = [n for n in search_space(loop, parameters).names if n not in felt]
     note = f"; {', '.join(unfelt)} left as given: without effect on a linear loop's average" if unfelt else ""
     result = replace(
         result,
@@ -121,44 +129,46 @@ def tune(
     return result
 
 
-def pose(
+def prepare_search(
     loop: ClosedLoop,
     references: Step | Sequence[Step],
     parameters: ParameterSet,
     minimise: Requirement | Mapping[Requirement, float],
     subject_to: Sequence[Requirement] = (),
-    scenarios: Scenarios = NOMINAL,
+    scenarios: Scenarios = NO_SCENARIOS,
     method: Method | None = None,
-    progress: Tell | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Search:
     """The search that a tuning is, everything checked; parameters and errors as for `tune`."""
     check_smooth(loop.plant)
     steps = [references] if isinstance(references, Step) else list(references)
-    loop = disturbed(loop, steps)
+    loop = add_disturbances(loop, steps)
     spec = specify(minimise, subject_to)
-    spec = spec.without(PeakControl) if _clip(loop, parameters) <= spec.limit(PeakControl) else spec
+    spec = spec.without(PeakControl) if _clip_level(loop, parameters) <= spec.limit(PeakControl) else spec
     require(len(steps) > 0, "no reference to tune for; give a Step")
-    space = span(loop, parameters)
+    space = search_space(loop, parameters)
     every = cases(steps, scenarios, space.parameters, space.names)
-    check_reach(loop, every, space, spec)
-    given, method = method, _checked(method, loop, scenarios, space, spec)
-    if given is None and isinstance(method, TwoPhase) and not is_light(loop, steps, space, method):
+    check_feasibility(loop, every, space, spec)
+    given, method = method, _choose_method(method, loop, scenarios, space, spec)
+    if given is None and isinstance(method, TwoPhase) and not has_few_steps(loop, steps, space, method):
         method = Screening()
-    unfelt = tuple(n for n in space.names if n in UNFELT) if isinstance(method, TwoPhase) else ()
+    unfelt = tuple(n for n in space.names if n in PARAMETERS_WITHOUT_EFFECT) if isinstance(method, TwoPhase) else ()
     felt = Space(space.parameters, tuple(n for n in space.names if n not in unfelt))
     require(len(felt.names) > 0, f"{', '.join(unfelt)}: without effect on a linear loop; free a gain as well")
-    notary = Notary(loop, tuple(steps), scenarios, felt, spec, method)
+    notary = Certifier(loop, tuple(steps), scenarios, felt, spec, method)
     return Search(notary, felt, spec, method, progress or (lambda _: None))
 
 
-def _checked(
+def _choose_method(
     method: Method | None, loop: ClosedLoop, scenarios: Scenarios, space: Space, spec: Specification
 ) -> Method:
     """The method, by default what suits the loop."""
     linear = is_linear(loop)
     if isinstance(method, TwoPhase):
-        told = "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()"
-        require(linear, told)
+        message = (
+            "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()"
+        )
+        require(linear, message)
         require(not scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
         check_exact(spec)
     if isinstance(method, Confirmed):
@@ -169,15 +179,15 @@ def _checked(
         check_differentiable(space, spec)
     if method is not None:
         return method
-    clip = _clip(loop, space.parameters)
+    clip = _clip_level(loop, space.parameters)
     clipped = clip < np.inf and not spec.limit(PeakControl) < clip  # designs that saturate are no less welcome
     if linear and not clipped and not scenarios and is_exact(spec):
         return TwoPhase()
-    many = bool(scenarios) or len(space.names) > FEW_GAINS
+    many = bool(scenarios) or len(space.names) > MAX_SCREENING_GAINS
     return Condensed() if many and is_differentiable(space, spec) else Screening()
 
 
-def _clip(loop: ClosedLoop, parameters: ParameterSet) -> float:
+def _clip_level(loop: ClosedLoop, parameters: ParameterSet) -> float:
     """The largest command that the controller's own limits let through."""
     full = loop.parameters | parameters
     return max(abs(full.value("pid.lower")), abs(full.value("pid.upper"))) if loop.pid.limits else np.inf

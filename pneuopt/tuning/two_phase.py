@@ -12,37 +12,37 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbing
+from pneuopt.control.reference import Step, disturbance_input
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
 from pneuopt.evaluation.margins import frequency_grid, sensitivity_terms
-from pneuopt.evaluation.means import TAIL
+from pneuopt.evaluation.means import TAIL_SHARE
 from pneuopt.evaluation.requirements import (
     MaxSensitivity,
     Overshoot,
     PeakControl,
     SettlingTime,
     SteadyStateError,
-    most,
-    name,
+    metric_name,
+    upper_limit,
 )
 from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.shooting.full_space import FullSpace, Problem, follow, prepare, solve_from
+from pneuopt.quantities.status import ProgressCallback
+from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
-from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, every
-from pneuopt.tuning.space import STABLE, Space, Tell, fastest, substeps
+from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, regular_nodes
+from pneuopt.tuning.space import RK4_MAX_H_LAMBDA, Space, fastest_eigenvalue, rk4_substeps
 
-Array = NDArray[np.float64]
-KINDS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
-LARGEST = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
-SETTLING = "SettlingTime"
-BAND = "band.share"  # of the settling band as transcribed: a number that a continuation may move
-MOST_STEPS = 12  # between two nodes; the paper's loop takes 3, a lag with dead time and wide bounds 50
-SAME = 1e-3  # relative difference of two optima that count as one
+EXACT_REQUIREMENTS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
+UNKNOWN_UPPER_BOUNDS = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
+SETTLING_PARAMETER = "SettlingTime"
+BAND_PARAMETER = "band.share"  # of the settling band as transcribed: a number that a continuation may move
+MAX_STEPS_A_SEGMENT = 12  # between two nodes; the paper's loop takes 3, a lag with dead time and wide bounds 50
+OPTIMA_TOLERANCE = 1e-3  # relative difference of two optima that count as one
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def is_linear(loop: ClosedLoop) -> bool:
     """Whether the loop, its clip aside, is a linear ODE: no state and no input is in its Jacobian."""
     if loop.pid.sample_time is not None:
         return False
-    ode = unlimited(loop).system().ode
+    ode = without_clip(loop).system().ode
     t, x, u, p = (ca.SX.sym(k, ode.size1_in(i)) for i, k in enumerate("txup"))
     signals = ca.vertcat(x, u)
     return not ca.depends_on(ca.jacobian(ca.vertcat(*ode(t, x, u, p)), signals), signals)
@@ -99,33 +99,41 @@ def is_linear(loop: ClosedLoop) -> bool:
 
 def is_exact(spec: Specification) -> bool:
     """Whether the two-phase problem has an equation for all that is asked for."""
-    return not _strange(spec)
+    return not _inexact_requirements(spec)
 
 
-def is_light(loop: ClosedLoop, references: Sequence[Step], space: Space, method: TwoPhase) -> bool:
+def has_few_steps(loop: ClosedLoop, references: Sequence[Step], space: Space, method: TwoPhase) -> bool:
     """Whether the steps between two nodes are few; with many the problem takes minutes, where a screening takes one."""
     own = Space(space.parameters, tuple(n for n in space.names if n not in ("pid.Tt", "pid.lower", "pid.upper")))
-    rate = fastest(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))]).max()
+    rate = fastest_eigenvalue(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))]).max()
     longest = max(r.horizon for r in references) / min(method.nodes)
-    return bool(rate * longest <= MOST_STEPS * STABLE)
+    return bool(rate * longest <= MAX_STEPS_A_SEGMENT * RK4_MAX_H_LAMBDA)
 
 
 def check_exact(spec: Specification) -> None:
     """Refuse what the problem has no equation for: `InputError` names it and the remedy."""
-    require(not _strange(spec), f"TwoPhase has no equation for {', '.join(_strange(spec))}; use method=Screening()")
+    require(
+        not _inexact_requirements(spec),
+        f"TwoPhase has no equation for {', '.join(_inexact_requirements(spec))}; use method=Screening()",
+    )
 
 
-def _strange(spec: Specification) -> list[str]:
-    return [n for n in spec.kinds if n not in {k.__name__ for k in (SettlingTime, *KINDS)}]
+def _inexact_requirements(spec: Specification) -> list[str]:
+    return [n for n in spec.kinds if n not in {k.__name__ for k in (SettlingTime, *EXACT_REQUIREMENTS)}]
 
 
-def unlimited(loop: ClosedLoop) -> ClosedLoop:
+def without_clip(loop: ClosedLoop) -> ClosedLoop:
     """The loop without its clip."""
     return replace(loop, pid=replace(loop.pid, limits=False))
 
 
 def solve_two_phase(
-    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase, tell: Tell
+    loop: ClosedLoop,
+    references: Sequence[Step],
+    space: Space,
+    spec: Specification,
+    method: TwoPhase,
+    tell: ProgressCallback,
 ) -> Optima:
     """Solve from every start; `tell` hears of each.
 
@@ -134,20 +142,23 @@ def solve_two_phase(
     InputError
         If the loop's rest depends on the gains, or a mode is too fast for the grid.
     """
-    problem = prepare(transcribe(loop, references, space, spec, method), method.solver)
+    problem = prepare_full_space(transcribe_two_phase(loop, references, space, spec, method), method.solver)
     parameters = problem.graph.transcription.parameters
     rng = np.random.default_rng(method.seed)
     found = []
     for k in range(method.starts):
-        point = space.draw(rng.random(len(space.names))) if k else space.start
+        point = space.from_unit(rng.random(len(space.names))) if k else space.start
         gains = dict(zip(space.names, point.tolist(), strict=True))
         found.append(solve_from(problem, parameters.with_values(gains)))
-        tell(f"start {k + 1} of {method.starts}: objective {_cost(found[-1]):.4g}, {found[-1].status.code.value}")
+        value, ended = _objective_value(found[-1]), found[-1].status.code.value
+        tell(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
     good = [s for s in found if s.status.converged]
     if not good:
         return Optima(min(found, key=lambda s: s.stats.get("largest_violation", math.inf)), len(found), 0, 0)
-    best = min(good, key=_cost)
-    agreeing = sum(_cost(s) - _cost(best) <= SAME * abs(_cost(best)) for s in good)
+    best = min(good, key=_objective_value)
+    agreeing = sum(
+        _objective_value(s) - _objective_value(best) <= OPTIMA_TOLERANCE * abs(_objective_value(best)) for s in good
+    )
     return Optima(best, len(found), len(good), agreeing)
 
 
@@ -164,7 +175,7 @@ class TwoPhasePath:
         The settling band as transcribed.
     """
 
-    problem: Problem
+    problem: FullSpaceProblem
     names: tuple[str, ...]
     band: float
 
@@ -172,30 +183,33 @@ class TwoPhasePath:
         """Solve for one after the other, the first from gains of shape (n,)."""
         parameters = self.problem.graph.transcription.parameters
         gains = dict(zip(self.names, start.tolist(), strict=True))
-        path = [{name(q): most(q) for q in spec.limits} | {BAND: spec.band / self.band} for spec in specs]
-        return follow(self.problem, parameters.with_values(gains), path)
+        path = [
+            {metric_name(q): upper_limit(q) for q in spec.limits} | {BAND_PARAMETER: spec.band / self.band}
+            for spec in specs
+        ]
+        return follow_path(self.problem, parameters.with_values(gains), path)
 
 
 def two_phase_path(
     loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
 ) -> TwoPhasePath:
     """Prepare a problem whose limits and settling band will move; `spec` already tightened."""
-    transcription = transcribe(loop, references, space, spec, method)
-    return TwoPhasePath(prepare(transcription, method.solver, follows=True), space.names, spec.band)
+    transcription = transcribe_two_phase(loop, references, space, spec, method)
+    return TwoPhasePath(prepare_full_space(transcription, method.solver, warm_start=True), space.names, spec.band)
 
 
-def transcribe(
+def transcribe_two_phase(
     loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
 ) -> Transcription:
     """Write the two-phase problem; the references share one settling time, the worst of them."""
-    free_loop = unlimited(loop)
+    free_loop = without_clip(loop)
     averaged = space.parameters.select(free_loop.parameters)
     if loop.dither:
         averaged = averaged.with_values({"dither.amplitude": 0.0}).fixed("dither.amplitude")
-    extra = _extra(references, spec)
-    system = _extended(free_loop, extra, space, references, method)
+    extra = _extra_unknowns(references, spec)
+    system = _extend_system(free_loop, extra, space, references, method)
     parameters = (averaged | extra).select(system.parameters)
-    phases = [p for i, r in enumerate(references) for p in _phases(loop, space, i, r, method)]
+    phases = [p for i, r in enumerate(references) for p in _reference_phases(loop, space, i, r, method)]
     parameters = parameters | _durations(references)
     limits = [
         *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)),
@@ -204,25 +218,25 @@ def transcribe(
     return Transcription(system, parameters, tuple(phases), (), _costs(spec, parameters), tuple(limits))
 
 
-def _cost(solution: Solution) -> float:
+def _objective_value(solution: Solution) -> float:
     return float(solution.stats["cost"])
 
 
-def _extra(references: Sequence[Step], spec: Specification) -> ParameterSet:
+def _extra_unknowns(references: Sequence[Step], spec: Specification) -> ParameterSet:
     """The settling time, an unknown for each further term of the objective, and a number for each other limit."""
     horizon = min(r.horizon - r.at for r in references)
-    most = min(spec.limit(SettlingTime), (1 - TAIL) * horizon)  # in the rest a metric would not call it settled
+    most = min(spec.limit(SettlingTime), (1 - TAIL_SHARE) * horizon)  # in the rest a metric would not call it settled
     free = spec.weight(SettlingTime) > 0
     given = {
-        SETTLING: Parameter(
+        SETTLING_PARAMETER: Parameter(
             0.5 * most if free or not spec.concerns(SettlingTime) else most, "s", 1e-3 * most, most, free=free
         ),
-        BAND: Parameter(1.0, "1"),
+        BAND_PARAMETER: Parameter(1.0, "1"),
     }
-    for kind in KINDS:
+    for kind in EXACT_REQUIREMENTS:
         if spec.weight(kind) > 0:
             least = 1.0 if kind is MaxSensitivity else 0.0
-            most = min(spec.limit(kind), LARGEST[kind.__name__])
+            most = min(spec.limit(kind), UNKNOWN_UPPER_BOUNDS[kind.__name__])
             start = min(2.0, most) if kind is MaxSensitivity else min(1.0, most)
             given[kind.__name__] = Parameter(start, "1", least, most, free=True)
         elif spec.limit(kind) < math.inf:  # a number of the problem, which a continuation may move
@@ -235,7 +249,7 @@ def _durations(references: Sequence[Step]) -> ParameterSet:
     return ParameterSet(rest | {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0})
 
 
-def _extended(
+def _extend_system(
     loop: ClosedLoop, extra: ParameterSet, space: Space, references: Sequence[Step], method: TwoPhase
 ) -> DiscreteSystem:
     """The loop with the extra unknowns among its parameters, so that path limits may depend on them."""
@@ -245,35 +259,37 @@ def _extended(
     ode = ca.Function(
         "ode", [t, x, u, ca.vertcat(p, more)], [*system.ode(t, x, u, p)], ["t", "x", "u", "p"], ["xdot", "y"]
     )
-    longest = max(max(extra[SETTLING].upper / method.nodes[0], r.horizon / method.nodes[1]) for r in references)
+    longest = max(
+        max(extra[SETTLING_PARAMETER].upper / method.nodes[0], r.horizon / method.nodes[1]) for r in references
+    )
     own = Space(space.parameters.select(loop.parameters), space.names)
-    rates = fastest(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))])
-    steps = substeps(float(rates.max()), longest)
+    rates = fastest_eigenvalue(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))])
+    steps = rk4_substeps(float(rates.max()), longest)
     return discretise(
         System(system.states, system.inputs, system.outputs, system.parameters | extra, ode), max(2, steps)
     )
 
 
-def _phases(loop: ClosedLoop, space: Space, i: int, reference: Step, method: TwoPhase) -> list[Phase]:
-    start = _rest(loop, space, reference)
-    disturbed = {disturbing(n): v for n, v in reference.disturbance.items()}
+def _reference_phases(loop: ClosedLoop, space: Space, i: int, reference: Step, method: TwoPhase) -> list[Phase]:
+    start = _state_before_step(loop, space, reference)
+    disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
     after = [disturbed.get(n, 0.0) for n in names(loop.inputs)[1:]]
 
-    def phase(name: str, n: int, value: float, duration: str, first: Array | None) -> Phase:
+    def make_phase(name: str, n: int, value: float, duration: str, first: Array | None) -> Phase:
         inputs = np.tile([value, *(np.zeros(len(after)) if name == "before" else after)], (n, 1))
         grid, step = np.arange(n) / n, np.full(n, 1 / n)
-        return Phase(f"{name}.{i}", grid, step, inputs, every(n, 1), first, first is None, duration)
+        return Phase(f"{name}.{i}", grid, step, inputs, regular_nodes(n, 1), first, first is None, duration)
 
     moved = reference.at > 0
-    before = [phase("before", method.nodes[0], reference.initial, f"before.{i}", start)] if moved else []
-    transient = phase("transient", method.nodes[0], reference.final, SETTLING, None if moved else start)
-    return [*before, transient, phase("settled", method.nodes[1], reference.final, f"rest.{i}", None)]
+    before = [make_phase("before", method.nodes[0], reference.initial, f"before.{i}", start)] if moved else []
+    transient = make_phase("transient", method.nodes[0], reference.final, SETTLING_PARAMETER, None if moved else start)
+    return [*before, transient, make_phase("settled", method.nodes[1], reference.final, f"rest.{i}", None)]
 
 
-def _rest(loop: ClosedLoop, space: Space, reference: Step) -> Array:
+def _state_before_step(loop: ClosedLoop, space: Space, reference: Step) -> Array:
     first = loop.initial(space.parameters, reference=reference.initial, start=reference.start)
     for share in (0.3, 0.8):
-        gains = space.filled(space.draw(np.full(len(space.names), share)))
+        gains = space.parameters_at(space.from_unit(np.full(len(space.names), share)))
         other = loop.initial(gains, reference=reference.initial, start=reference.start)
         scale = np.array([q.nominal for q in loop.states])
         require(
@@ -290,33 +306,33 @@ def _path_limits(
     t, x, u, p = (ca.SX.sym(k, system.step.size1_in(j)) for k, j in zip("txup", (0, 2, 3, 4), strict=True))
     y = system.step(t, 0, x, u, p)[1]
     outputs, at = names(system.outputs), list(system.parameters).index
-    error = (y[outputs.index(loop.feedback.name)] - u[0]) / reference.whole
+    error = (y[outputs.index(loop.feedback.name)] - u[0]) / reference.nominal_size
     control = y[outputs.index("control")]
     count = 3 if reference.at > 0 else 2
     transient, settled = count * i + count - 2, count * i + count - 1
     both = (transient, settled)
 
-    def limit(name: str, value: ca.SX, lower: float, upper: float, where: Where, phases: tuple[int, ...]) -> Limit:
+    def path_limit(name: str, value: ca.SX, lower: float, upper: float, where: Where, phases: tuple[int, ...]) -> Limit:
         return Limit(name, ca.Function("limit", [t, x, u, p], [value]), lower, upper, where, phases)
 
-    def below(kind: type, value: ca.SX, where: Where, phases: tuple[int, ...]) -> list[Limit]:
+    def upper_limits(kind: type, value: ca.SX, where: Where, phases: tuple[int, ...]) -> list[Limit]:
         """Value and, where it has a sign, its negative, at most the limit or the unknown."""
         if not spec.concerns(kind):
             return []
-        return [limit(kind.__name__, value - p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
+        return [path_limit(kind.__name__, value - p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
 
     found = []
     if spec.concerns(SettlingTime):
-        inside, both_ends = error / p[at(BAND)], (Where.NODES, Where.END)
-        found += [limit("settling band", inside, -spec.band, spec.band, w, (settled,)) for w in both_ends]
+        inside, both_ends = error / p[at(BAND_PARAMETER)], (Where.NODES, Where.END)
+        found += [path_limit("settling band", inside, -spec.band, spec.band, w, (settled,)) for w in both_ends]
     beyond = error if reference.is_step else ca.vertcat(error, -error)
-    found += below(Overshoot, beyond, Where.NODES, both)
-    found += below(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,))
-    found += below(PeakControl, ca.vertcat(control, -control), Where.NODES, both)
+    found += upper_limits(Overshoot, beyond, Where.NODES, both)
+    found += upper_limits(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,))
+    found += upper_limits(PeakControl, ca.vertcat(control, -control), Where.NODES, both)
     if loop.pid.limits:
         ends = [space.parameters.value(f"pid.{n}") for n in ("lower", "upper")]
         if np.isfinite(ends).any():
-            found.append(limit("the command's clip", control, ends[0], ends[1], Where.NODES, both))
+            found.append(path_limit("the command's clip", control, ends[0], ends[1], Where.NODES, both))
     return found
 
 
@@ -326,7 +342,12 @@ def _sensitivity_limit(
     if not spec.concerns(MaxSensitivity):
         return []
     grid = np.unique(
-        np.concatenate([_grid(loop, averaged, space.draw(np.full(len(space.names), k)), space) for k in (0.2, 0.8)])
+        np.concatenate(
+            [
+                _sensitivity_frequencies(loop, averaged, space.from_unit(np.full(len(space.names), k)), space)
+                for k in (0.2, 0.8)
+            ]
+        )
     )
     terms = sensitivity_terms(loop, grid, averaged)
     q = ca.SX.sym("q", len(parameters))
@@ -335,16 +356,16 @@ def _sensitivity_limit(
     return [Limit("MaxSensitivity", ca.Function("limit", [q], [value]), 1.0, math.inf, Where.PARAMETERS)]
 
 
-def _grid(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) -> Array:
+def _sensitivity_frequencies(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) -> Array:
     """Frequencies around those of the loop's modes, where the sensitivity peaks."""
-    own = Space(averaged, space.names).filled(point)
+    own = Space(averaged, space.names).parameters_at(point)
     full = frequency_grid(loop.open_loop(own), 40)
     return np.asarray(full[(full > 30 * full[0]) & (full < full[-1] / 30)], dtype=float)
 
 
 def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:
     q = ca.SX.sym("q", len(parameters))
-    terms = {kind.__name__: spec.weight(kind) for kind in (SettlingTime, *KINDS)}
+    terms = {kind.__name__: spec.weight(kind) for kind in (SettlingTime, *EXACT_REQUIREMENTS)}
     return tuple(
         Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
         for n, weight in terms.items()

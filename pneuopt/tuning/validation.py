@@ -8,13 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.disturbance import disturbed
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import AT_LEAST, KINDS, PERCENT, Requirement, most, name
+from pneuopt.evaluation.requirements import (
+    MINIMUM_REQUIREMENTS,
+    PERCENT_METRICS,
+    REQUIREMENT_KINDS,
+    Requirement,
+    metric_name,
+    upper_limit,
+)
 from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification, specify
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.simulator import Simulator
@@ -23,9 +31,8 @@ from pneuopt.tuning.space import Space
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-QUANTILE = 95.0  # [%]
-LOWER = tuple(kind.__name__ for kind in AT_LEAST)  # metrics of which the smallest is the worst
+SUMMARY_PERCENTILE = 95.0  # [%]
+LARGER_IS_BETTER = tuple(kind.__name__ for kind in MINIMUM_REQUIREMENTS)  # metrics of which the smallest is the worst
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,20 +109,22 @@ def validate_design(
     require(len(scenarios) > 0, "no fresh plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)")
     spec = specify(minimise, subject_to)
     steps = [references] if isinstance(references, Step) else list(references)
-    loop = disturbed(loop, steps)
+    loop = add_disturbances(loop, steps)
     full = loop.parameters | parameters.select(n for n in parameters if n in loop.parameters)
-    values = _simulated(loop, steps, full, spec, scenarios)
+    values = _simulate_plants(loop, steps, full, spec, scenarios)
     plants = [str(n) for n in values]
-    worst = {str(n): plants[_order(row.to_numpy(dtype=float), str(n))[-1]] for n, row in values.iterrows()}
+    worst = {str(n): plants[_rank_order(row.to_numpy(dtype=float), str(n))[-1]] for n, row in values.iterrows()}
     named = list(dict.fromkeys(worst.values()))
     certified = evaluate(
         loop, steps, full, scenarios={n: scenarios[n] for n in named}, band=spec.band, envelope=spec.envelope
     )
     certified = certified.loc[list(values.index), certified.columns[len(steps) :]]
-    return DesignValidation(_summary(values, worst, _by_plant(certified, named, len(steps)), spec), values.T, certified)
+    return DesignValidation(
+        _summary(values, worst, _worst_by_plant(certified, named, len(steps)), spec), values.T, certified
+    )
 
 
-def _simulated(
+def _simulate_plants(
     loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
 ) -> "pd.DataFrame":
     """Metrics by compiled simulation, the worst over the references."""
@@ -124,28 +133,28 @@ def _simulated(
     simulator = Simulator(loop, steps, Space(parameters, ()), scenarios, spec)
     rows = simulator.table(np.zeros(0), spec)
     found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
-    shown = [kind.__name__ for kind in KINDS if kind.__name__ in spec.kinds]
-    return _by_plant(found.loc[shown, found.columns[len(steps) :]], list(scenarios), len(steps))
+    shown = [kind.__name__ for kind in REQUIREMENT_KINDS if kind.__name__ in spec.kinds]
+    return _worst_by_plant(found.loc[shown, found.columns[len(steps) :]], list(scenarios), len(steps))
 
 
-def _by_plant(metrics: "pd.DataFrame", plants: Sequence[str], references: int) -> "pd.DataFrame":
+def _worst_by_plant(metrics: "pd.DataFrame", plants: Sequence[str], references: int) -> "pd.DataFrame":
     """Metrics of one plant after another, so many references each, as the worst of each plant; NaN is the worst."""
     import pandas as pd
 
     found = {}
     for number, plant in enumerate(plants):
         own = metrics.iloc[:, number * references : (number + 1) * references]
-        found[plant] = {n: _worst(row.to_numpy(dtype=float), str(n)) for n, row in own.iterrows()}
+        found[plant] = {n: _worst_value(row.to_numpy(dtype=float), str(n)) for n, row in own.iterrows()}
     return pd.DataFrame(found, index=metrics.index)
 
 
-def _worst(values: Array, metric: str) -> float:
-    return float(values[_order(values, metric)[-1]])
+def _worst_value(values: Array, metric: str) -> float:
+    return float(values[_rank_order(values, metric)[-1]])
 
 
-def _order(values: Array, metric: str) -> NDArray[np.intp]:
+def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
     """From the best to the worst; what is no number is the worst."""
-    cost = -values if metric in LOWER else values
+    cost = -values if metric in LARGER_IS_BETTER else values
     return np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
 
 
@@ -154,35 +163,35 @@ def _summary(
 ) -> "pd.DataFrame":
     import pandas as pd
 
-    limits, proven = {name(q): _limit(q) for q in spec.limits}, certified.to_dict()
+    limits, proven = {metric_name(q): _metric_limit(q) for q in spec.limits}, certified.to_dict()
     rows = {}
     for metric, plant in worst.items():
         given, limit = values.loc[metric].to_numpy(dtype=float), limits.get(metric, math.nan)
         rows[metric] = {
             "median": _quantile(given, metric, 50.0),
-            "p95": _quantile(given, metric, QUANTILE),
-            "worst": _worst(given, metric),
+            "p95": _quantile(given, metric, SUMMARY_PERCENTILE),
+            "worst": _worst_value(given, metric),
             "worst_plant": plant,
             "certified": float(proven[plant][metric]),
             "limit": limit,
-            "violations": int(np.sum(~_kept(given, limit, metric))),
+            "violations": int(np.sum(~_keeps_limit(given, limit, metric))),
         }
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
 def _quantile(values: Array, metric: str, percent: float) -> float:
     """The value of the plant that so many do not exceed."""
-    return float(values[_order(values, metric)[math.ceil(len(values) * percent / 100) - 1]])
+    return float(values[_rank_order(values, metric)[math.ceil(len(values) * percent / 100) - 1]])
 
 
-def _limit(requirement: Requirement) -> float:
+def _metric_limit(requirement: Requirement) -> float:
     """As the metric counts: percent where it does, a margin itself."""
-    if isinstance(requirement, AT_LEAST):
-        return 1 / most(requirement)
-    return most(requirement) * (100 if name(requirement) in PERCENT else 1)
+    if isinstance(requirement, MINIMUM_REQUIREMENTS):
+        return 1 / upper_limit(requirement)
+    return upper_limit(requirement) * (100 if metric_name(requirement) in PERCENT_METRICS else 1)
 
 
-def _kept(values: Array, limit: float, metric: str) -> NDArray[np.bool_]:
+def _keeps_limit(values: Array, limit: float, metric: str) -> NDArray[np.bool_]:
     if math.isnan(limit):
         return np.isfinite(values)
-    return np.asarray(values >= limit if metric in LOWER else values <= limit)
+    return np.asarray(values >= limit if metric in LARGER_IS_BETTER else values <= limit)

@@ -12,18 +12,18 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli.app import app
-from pneuopt.cli.app import identify as identifying
-from pneuopt.cli.app import tune as looping
+from pneuopt.cli.app import identify_command as identifying
+from pneuopt.cli.app import tune_command as looping
 from pneuopt.cli.show_fits import show_estimates
-from pneuopt.cli.terminal import screen
+from pneuopt.cli.terminal import make_console
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
 from pneuopt.logs.experiments import read_log
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
+from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.solution import Code, Status
 from pneuopt.tuning.tune import TuningResult, tune
 
 
@@ -90,7 +90,7 @@ def test_open_ends_and_what_is_not_told_are_no_numbers(capsys: pytest.CaptureFix
     ends = {"a.open": (2.0, math.nan, 1.5, math.inf, ""), "b.blind": (7.0, math.nan, -math.inf, math.inf, "not told")}
     columns = ["value", "stderr", "ci_low", "ci_high", "note"]
     table = pd.DataFrame.from_dict(ends, orient="index", columns=columns).assign(unit="N")
-    show_estimates(screen(), table)
+    show_estimates(make_console(), table)
     first, second = capsys.readouterr().out.splitlines()[-3:-1]
     assert first.split() == ["a.open", "2", "above", "1.5", "N"]
     assert second.split() == ["b.blind", "-", "not", "determined", "N", "not", "told"]

@@ -5,13 +5,13 @@ import pytest
 from rich.console import Console
 
 from pneuopt.cli.show_loops import metric_units, show_dither, show_gains, show_metrics
-from pneuopt.cli.terminal import screen
+from pneuopt.cli.terminal import make_console
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.evaluation.dither_verdict import DitherEffect, DitherVerdict, Usefulness
 from pneuopt.evaluation.requirements import (
-    KINDS,
+    REQUIREMENT_KINDS,
     MaxComplementarySensitivity,
     Overshoot,
     PhaseMargin,
@@ -42,7 +42,7 @@ def test_metrics_stand_beside_what_is_allowed() -> None:
 
 def test_every_kind_of_requirement_is_shown() -> None:
     units = metric_units(ClosedLoop(FirstOrder().system(), PID()))
-    assert {kind.__name__ for kind in KINDS} <= set(units)
+    assert {kind.__name__ for kind in REQUIREMENT_KINDS} <= set(units)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_dithers_verdict_is_shown_with_its_reasons(capsys: pytest.CaptureFixtu
     table = pd.DataFrame({"without": {"Ripple": 0.0}, "with": {"Ripple": 1e-3}})
     effect = DitherEffect(0.001, 159.0)
     verdict = DitherVerdict(Usefulness.USELESS, ("nothing changes", "price: air"), table, effect, "the same gains", "V")
-    show_dither(screen(), verdict)
+    show_dither(make_console(), verdict)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "the dither of 0.001 V at 159 Hz is useless, against the same gains"
     assert [line.strip() for line in lines[1:]] == ["nothing changes", "price: air"]
@@ -78,7 +78,7 @@ def test_a_dithers_verdict_is_shown_with_its_reasons(capsys: pytest.CaptureFixtu
 def test_a_limit_cycle_is_shown_where_there_is_one(amplitude: float, capsys: pytest.CaptureFixture[str]) -> None:
     rows = {"SettlingTime": 0.1, "LimitCycleAmplitude": amplitude, "LimitCycleFrequency": 2.0, "AirUse": 1.5}
     loop = ClosedLoop(FirstOrder().system(), PID())
-    show_metrics(screen(), pd.DataFrame({"0 to 1": rows}), loop)
+    show_metrics(make_console(), pd.DataFrame({"0 to 1": rows}), loop)
     out = capsys.readouterr().out
     assert ("LimitCycleFrequency" in out) == (amplitude > 0)
     assert "l(ANR)" in out

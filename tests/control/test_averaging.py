@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt.control.averaging import averaged, mean_start, ripple
+from pneuopt.control.averaging import average_dither, mean_start, ripple
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -55,23 +55,23 @@ def test_the_null_opening_of_a_land_is_the_amplitude_over_pi(X: float) -> None:
     """Up to ten times the rounding, 64 phases (32 nodes of Gauss and Chebyshev) give the integral within 3e-6 X/pi."""
     p, phases = dither(X, 100.0), np.linspace(-pi, pi, 20001)[:-1]
     exact = np.mean([(x + hypot(x, 0.08)) / 2 for x in X * np.sin(phases)])
-    assert rate(averaged(lands(0.0, 0.08, both=False), p), 0.0, p) == pytest.approx(exact, abs=3e-6 * X / pi)
-    sharp = averaged(lands(0.0, 1e-6, both=False), p, nodes=256)
+    assert rate(average_dither(lands(0.0, 0.08, both=False), p), 0.0, p) == pytest.approx(exact, abs=3e-6 * X / pi)
+    sharp = average_dither(lands(0.0, 1e-6, both=False), p, nodes=256)
     assert rate(sharp, 0.0, p) == pytest.approx(X / pi, rel=1e-4)
 
 
 @pytest.mark.parametrize("X", [0.25, 0.4, 1.0])
 def test_dither_opens_a_dead_zone(X: float) -> None:
     p = dither(X, 100.0)
-    mean = averaged(lands(0.2, 2e-3), p, nodes=512)
+    mean = average_dither(lands(0.2, 2e-3), p, nodes=512)
     assert mean.linearise(np.zeros(1), {}, p).B[0, 0] == pytest.approx(2 / pi * acos(0.2 / X), rel=2e-3)
     assert lands(0.2, 2e-3).linearise(np.zeros(1), {}, p).B[0, 0] < 1e-4
 
 
 def test_the_offset_and_the_amplitude_stay_parameters() -> None:
     p = dither(0.4, 100.0)
-    mean = averaged(lands(0.2, 0.02), p)
-    half = averaged(lands(0.2, 0.02), p.with_values({"dither.amplitude": 0.2}))
+    mean = average_dither(lands(0.2, 0.02), p)
+    half = average_dither(lands(0.2, 0.02), p.with_values({"dither.amplitude": 0.2}))
     for u in (-0.3, 0.05):
         moved = p | ParameterSet({"dither.offset": Parameter(0.1, "1")})
         assert rate(mean, u, moved) == pytest.approx(rate(mean, u + 0.1, p), rel=1e-12)
@@ -83,7 +83,7 @@ def test_the_offset_and_the_amplitude_stay_parameters() -> None:
 def test_a_triangle_opens_a_dead_zone_by_the_time_that_it_spends_beyond(X: float) -> None:
     """Its values are spread evenly: at null the slope is ``1 - x0/X``, where a sine has ``(2/pi) acos(x0/X)``."""
     p = dither(X, 100.0)
-    mean = averaged(lands(0.2, 2e-3), p, nodes=512, waveform=Waveform.TRIANGLE)
+    mean = average_dither(lands(0.2, 2e-3), p, nodes=512, waveform=Waveform.TRIANGLE)
     assert mean.linearise(np.zeros(1), {}, p).B[0, 0] == pytest.approx(1 - 0.2 / X, rel=5e-3)
 
 
@@ -96,7 +96,7 @@ def test_a_relay_under_dither_becomes_its_distribution(waveform: Waveform, law: 
     relay = define(
         [level], [command], [level], ParameterSet(), lambda _t, x, u, _p: ({"level": ca.sign(u["command"])}, dict(x))
     )
-    mean = averaged(relay, dither(0.5, 100.0), nodes=256, waveform=waveform)
+    mean = average_dither(relay, dither(0.5, 100.0), nodes=256, waveform=waveform)
     for share in (-0.7, -0.2, 0.0, 0.4, 0.9):
         assert rate(mean, 0.5 * share, dither(0.5, 100.0)) == pytest.approx(law(share), abs=2 / 128), share
 
@@ -120,13 +120,13 @@ def test_an_averaged_loop_under_a_triangle_is_the_moving_average_of_the_resolved
     begun = mean_start(ripple(loop, p), start)
     sine = replace(loop, dither=Dither(100.0))
     off = []
-    for mean in (averaged(loop, p), averaged(sine, p)):
+    for mean in (average_dither(loop, p), average_dither(sine, p)):
         run = simulate(mean, inputs, p, initial=begun, rtol=1e-8)
         off.append(np.abs(np.interp(at, run.t, run["level"]) - over).max())
     assert off[0] < 2e-3
     assert off[1] > 5 * off[0]
     with pytest.raises(InputError, match="the loop's dither is a triangle"):
-        averaged(loop, p, waveform=Waveform.SINE)
+        average_dither(loop, p, waveform=Waveform.SINE)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
@@ -136,7 +136,7 @@ def test_coulomb_friction_under_a_ripple_of_speed_follows_the_arcsine(share: flo
     values = {"friction.coulomb": 30.0, "friction.viscous": 0.0, "friction.smoothing": 1e-5, "load.mass": 2.0}
     p = drive.parameters.with_values(values) | dither(500.0, 160.0, "N")
     V = abs(ripple(drive, p, nodes=512)["speed"])
-    mean = averaged(drive, p, nodes=512)
+    mean = average_dither(drive, p, nodes=512)
     x = [share * V if q.name == "speed" else 0.0 for q in mean.states]
     full = mean.parameters | p.select(n for n in p if n in mean.parameters)
     acceleration = float(mean.ode(0, x, [0.0], [q.value for q in full.values()])[0][1])
@@ -160,7 +160,7 @@ def test_the_ripple_of_a_linear_plant_is_its_frequency_response_and_its_mean_is_
     linear, w = plant.linearise(np.zeros(2), {}, p), 2j * pi * 20.0
     expected = 2.0 * np.linalg.solve(w * np.eye(2) - linear.A, linear.B[:, 0])
     assert list(ripple(plant, p).values()) == pytest.approx(expected.tolist(), rel=1e-9)
-    mean = averaged(plant, p).linearise(np.zeros(2), {}, p)
+    mean = average_dither(plant, p).linearise(np.zeros(2), {}, p)
     for found, given in zip((mean.A, mean.B), (linear.A, linear.B), strict=True):
         np.testing.assert_allclose(found, given, rtol=1e-9, atol=1e-9)
 
@@ -170,7 +170,7 @@ def test_lap_averaging_of_r25_lowers_the_loops_gain(volts: float, gain: float) -
     """Golden: more leak at null, more damping; unit feedback of 20 V/(m/s) around the drive."""
     drive, p = r25()
     plant, given = drive.system(), p | dither(volts, 1000.0 / (2 * pi), "V")
-    mean = averaged(plant, given) if volts else plant
+    mean = average_dither(plant, given) if volts else plant
     x, rest = np.array(list(drive.rest(p).states.values())), drive.rest(p).inputs
     linear = mean.linearise(x, rest, given)
     A, B, C = linear.A[1:, 1:], linear.B[1:], linear.C[1:2, 1:]  # without the position
@@ -193,9 +193,9 @@ def test_an_averaged_loop_is_the_moving_average_of_the_dithered_one() -> None:
     begun = mean_start(ripple(loop, p, nodes=32), start)
     missed = {}
     for label, model, x, q in (
-        ("averaged", averaged(loop, p, nodes=32), begun, p),
-        ("plant", ClosedLoop(averaged(loop.plant, p, nodes=32), loop.pid), begun, p),
-        ("started beside", averaged(loop, p, nodes=32), start, p),
+        ("averaged", average_dither(loop, p, nodes=32), begun, p),
+        ("plant", ClosedLoop(average_dither(loop.plant, p, nodes=32), loop.pid), begun, p),
+        ("started beside", average_dither(loop, p, nodes=32), start, p),
         ("ignored", loop, start, p.with_values({"dither.amplitude": 0.0})),
     ):
         run = simulate(model, few, q.select(n for n in q if n in model.parameters), initial=x, rtol=1e-8)
@@ -208,16 +208,16 @@ def test_what_cannot_be_averaged_is_refused() -> None:
     plant = FirstOrder().system()
     p = plant.parameters | dither(1.0, 100.0, "V")
     with pytest.raises(InputError, match=r"dither.amplitude > 0"):
-        averaged(plant, plant.parameters)
+        average_dither(plant, plant.parameters)
     with pytest.raises(InputError, match=r"dither.frequency > 0"):
-        averaged(plant, p.with_values({"dither.frequency": 0.0}))
+        average_dither(plant, p.with_values({"dither.frequency": 0.0}))
     with pytest.raises(InputError, match="nodes must be at least 8, got 4"):
-        averaged(plant, p, nodes=4)
+        average_dither(plant, p, nodes=4)
     with pytest.raises(UnknownNameError, match="unknown input 'voltage'; did you mean 'valve_voltage'"):
-        averaged(plant, p, actuated="voltage")
+        average_dither(plant, p, actuated="voltage")
     with pytest.raises(UnknownNameError, match="unknown state or input 'sped'; did you mean 'speed'"):
-        averaged(plant, p, at={"sped": 1.0})
+        average_dither(plant, p, at={"sped": 1.0})
     with pytest.raises((InputError, ModelError), match="needs a loop with dither"):
-        averaged(ClosedLoop(plant, PID()), p)
+        average_dither(ClosedLoop(plant, PID()), p)
     with pytest.raises((InputError, ModelError), match=r"the controller is sampled; average the plant"):
-        averaged(ClosedLoop(plant, PID(sample_time=1e-3), Dither()), p)
+        average_dither(ClosedLoop(plant, PID(sample_time=1e-3), Dither()), p)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pneuopt.control.bumpless import take_over
+from pneuopt.control.bumpless import bumpless_transfer
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
@@ -42,7 +42,7 @@ def test_the_command_goes_on_where_it_is(name: str) -> None:
     new = old.with_values(NEW | ({"feedforward.gain": 90.0} if loop.feedforward else {}))
     run = simulate(loop, fed(11), old, t_out=[0.0, 9.999 * H])
     x = np.array([run[q.name][-1] for q in loop.states])
-    moved = take_over(loop, x, old, new, reference=0.1)
+    moved = bumpless_transfer(loop, x, old, new, reference=0.1)
     commands = {}
     for label, state, gains in (("on", x, old), ("jumped", x, new), ("bumpless", moved, new)):
         after = simulate(loop, fed(301), gains, initial=state)
@@ -56,7 +56,7 @@ def test_a_form_takes_over_in_its_own_gains() -> None:
     loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(H, form=Form.STANDARD))
     old = loop.parameters.with_values({"pid.Kp": 100.0, "pid.Ti": 0.1})
     x = loop.initial(old, reference=0.1)
-    moved = take_over(loop, x, old, old.with_values({"pid.Kp": 300.0, "pid.b": 0.0}), reference=0.1)
+    moved = bumpless_transfer(loop, x, old, old.with_values({"pid.Kp": 300.0, "pid.b": 0.0}), reference=0.1)
     k = [q.name for q in loop.states].index("pid.integral")
     assert moved[k] - x[k] == pytest.approx(300.0 * 0.1)
     np.testing.assert_array_equal(np.delete(moved, k), np.delete(x, k))
@@ -65,4 +65,4 @@ def test_a_form_takes_over_in_its_own_gains() -> None:
 def test_a_state_of_another_loop_is_refused() -> None:
     loop = LOOPS["sampled"]
     with pytest.raises(InputError, match=r"x has shape \(3,\), the loop has 6 states"):
-        take_over(loop, np.zeros(3), loop.parameters, loop.parameters)
+        bumpless_transfer(loop, np.zeros(3), loop.parameters, loop.parameters)

@@ -21,9 +21,9 @@ from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.two_phase import is_linear
 
 
@@ -34,10 +34,10 @@ def test_nothing_is_integrated_within_it(second_order: System, error: float) -> 
     values = {"pid.Ki": 3.0, "pid.Kp": 0.0, "pid.dead_band": 0.1}
     loop = ClosedLoop(second_order, PID(dead_band=True))
     x = np.array([-error, 0.0, 0.0, 0.0])
-    rates = loop.system().ode(0.0, x, [0.0], loop.numbers(loop.parameters.with_values(values)))[0]
+    rates = loop.system().ode(0.0, x, [0.0], loop.parameter_vector(loop.parameters.with_values(values)))[0]
     assert float(rates[2]) == pytest.approx(3.0 * beyond)
     loop = ClosedLoop(second_order, PID(2e-3, dead_band=True))
-    p = loop.numbers(loop.parameters.with_values(values))
+    p = loop.parameter_vector(loop.parameters.with_values(values))
     after = np.array(loop.update(0.0, [-error, 0, 0, 0, 0, 0], [0.0], p)).ravel()
     assert after[2] == pytest.approx(2e-3 * 3.0 * beyond)
 
@@ -45,7 +45,7 @@ def test_nothing_is_integrated_within_it(second_order: System, error: float) -> 
 def test_a_clipped_command_unwinds_the_integral_within_it(second_order: System) -> None:
     loop = ClosedLoop(second_order, PID(1e-3, dead_band=True), Dither(60.0))
     values = {"pid.dead_band": 0.1, "pid.Ki": 3.0, "pid.Kp": 0.0, "pid.upper": 1.0, "pid.lower": -1.0, "pid.Tt": 0.1}
-    p = loop.numbers(loop.parameters.with_values(values))
+    p = loop.parameter_vector(loop.parameters.with_values(values))
     after = np.array(loop.update(0.0, [0.05, 0, 2.0, 0, 0, 0], [0.0], p)).ravel()
     assert after[2] == pytest.approx(2.0 + 1e-3 / 0.1 * (1.0 - 2.0))
 
@@ -80,12 +80,14 @@ def friction_loop(sample_time: float | None) -> tuple[ClosedLoop, ParameterSet]:
 
 @pytest.mark.parametrize("sample_time", [None, 2e-3])
 def test_gradients_are_those_of_finite_differences(
-    sample_time: float | None, check_slopes: Callable[[Linearised, np.ndarray], None]
+    sample_time: float | None, check_slopes: Callable[[LinearisedProblem, np.ndarray], None]
 ) -> None:
     """It bends, but does not jump: derivatives hold on either side, the band's own too."""
     loop, given = friction_loop(sample_time)
-    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], span(loop, given))
-    posed = Linearised(simulator, differentiated(simulator), specify(SettlingTime(), [Overshoot(0.1)]), 60, 1.0)
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], search_space(loop, given))
+    posed = LinearisedProblem(
+        simulator, sensitivity_rollout(simulator), specify(SettlingTime(), [Overshoot(0.1)]), 60, 1.0
+    )
     z = np.array([0.4, 0.5, 0.4, 0.2037])
     (point,) = posed.evaluate(z[None])
     assert np.abs(point.slopes[:, 2]).max() > 0
@@ -96,7 +98,7 @@ def test_gradients_are_those_of_finite_differences(
 def test_search_and_certificate_agree(sample_time: float | None) -> None:
     loop, given = friction_loop(sample_time)
     step = Step(0.2, horizon=0.6)
-    simulator = Simulator(loop, [step], span(loop, given))
+    simulator = Simulator(loop, [step], search_space(loop, given))
     (claimed,) = simulator.table(np.array([200.0, 4000.0, 2e-3]), specify(SettlingTime()))
     certified = evaluate(loop, step, given)[step.label]
     assert np.isfinite(certified["SettlingTime"])

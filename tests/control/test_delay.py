@@ -19,9 +19,9 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.condensed import Condensed
-from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 
 GAINS = {"pid.Kp": 0.18, "pid.Ki": 0.9, "pid.Kd": 0.008, "pid.Tf": 0.01}
@@ -69,7 +69,7 @@ def friction_loop() -> tuple[ClosedLoop, ParameterSet]:
 @pytest.mark.parametrize("step", [Step(0.1, horizon=0.6), Step(0.1, at=0.05, initial=0.05, horizon=0.6)])
 def test_search_and_certificate_agree(step: Step) -> None:
     loop, given = friction_loop()
-    simulator, spec = Simulator(loop, [step], span(loop, given)), specify(SettlingTime(), [MaxSensitivity(2.0)])
+    simulator, spec = Simulator(loop, [step], search_space(loop, given)), specify(SettlingTime(), [MaxSensitivity(2.0)])
     (claimed,) = simulator.table(np.array([200.0, 3000.0, 0.0]), spec)
     certified = evaluate(loop, step, given)[step.label]
     assert np.isfinite(certified["SettlingTime"])
@@ -77,11 +77,13 @@ def test_search_and_certificate_agree(step: Step) -> None:
         assert claimed[name] == pytest.approx(certified[name], rel=2e-3, abs=2e-4), name
 
 
-def test_gradients_are_those_of_finite_differences(check_slopes: Callable[[Linearised, np.ndarray], None]) -> None:
+def test_gradients_are_those_of_finite_differences(
+    check_slopes: Callable[[LinearisedProblem, np.ndarray], None],
+) -> None:
     loop, given = friction_loop()
-    simulator = Simulator(loop, [STEP, Step(0.1, at=0.05, initial=0.05, horizon=0.3)], span(loop, given))
+    simulator = Simulator(loop, [STEP, Step(0.1, at=0.05, initial=0.05, horizon=0.3)], search_space(loop, given))
     spec = specify(SettlingTime(), [Overshoot(0.1), MaxSensitivity(1.6)])
-    posed = Linearised(simulator, differentiated(simulator), spec, 60, 1.0)
+    posed = LinearisedProblem(simulator, sensitivity_rollout(simulator), spec, 60, 1.0)
     z = np.array([0.3, 0.3, 0.2, 0.2037])
     check_slopes(posed, z)
 
@@ -90,7 +92,7 @@ def test_a_tuning_reckons_with_it() -> None:
     """Tuned without the delay the loop overshoots once it is there; tuned with it, it keeps the limit."""
     loop, given = friction_loop()
     ignorant = ClosedLoop(loop.plant, PID(5e-3))
-    quick = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
+    quick = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
     limits = [Overshoot(0.05)]
     knowing = tune(loop, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)
     blind = tune(ignorant, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pneuopt.control.disturbance import disturbed
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
@@ -93,14 +93,14 @@ def test_each_search_claims_what_is_certified(method: Method) -> None:
 
 def test_zero_disturbance_is_the_plant_as_it_was() -> None:
     loop, p = axis()
-    other = disturbed(loop, [PUSH])
+    other = add_disturbances(loop, [PUSH])
     x, u = np.array([0.1, 0.3]), {"force": 20.0}
     ours, theirs = (model.plant.linearise(x, u, p) for model in (loop, other))
     np.testing.assert_array_equal(ours.A, theirs.A)
     assert other.inputs[-1].name == "disturbance.load.force"
     assert other.inputs[-1].unit == "N"
-    assert disturbed(other, [PUSH]) is other
-    assert disturbed(loop, [Step(1.0)]) is loop
+    assert add_disturbances(other, [PUSH]) is other
+    assert add_disturbances(loop, [Step(1.0)]) is loop
 
 
 @pytest.mark.parametrize(

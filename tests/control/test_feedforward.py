@@ -20,9 +20,9 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.two_phase import is_linear
 
 Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -73,10 +73,10 @@ def test_at_rest_and_in_steady_motion_it_adds_nothing(second_order: System, samp
     x = loop.initial(p, reference=0.5)
     np.testing.assert_allclose(x[:-1], plain.initial(p, reference=0.5), atol=1e-12)
     if sample_time is not None:
-        x = np.array(loop.update(0.0, x, [0.5], loop.numbers(p))).ravel()
+        x = np.array(loop.update(0.0, x, [0.5], loop.parameter_vector(p))).ravel()
         assert x[-2] == pytest.approx(0.5 * 86.34 / 1270.12)
         return
-    rates = loop.system().ode(0.0, x, [0.5], loop.numbers(p))[0]
+    rates = loop.system().ode(0.0, x, [0.5], loop.parameter_vector(p))[0]
     np.testing.assert_allclose(np.array(rates).ravel(), 0.0, atol=1e-9)
 
 
@@ -89,12 +89,14 @@ def friction_loop(sample_time: float | None) -> tuple[ClosedLoop, ParameterSet]:
 
 @pytest.mark.parametrize("sample_time", [None, 2e-3])
 def test_gradients_are_those_of_finite_differences(
-    sample_time: float | None, check_slopes: Callable[[Linearised, np.ndarray], None]
+    sample_time: float | None, check_slopes: Callable[[LinearisedProblem, np.ndarray], None]
 ) -> None:
     loop, given = friction_loop(sample_time)
     steps = [Step(0.1, horizon=0.3), Step(0.1, at=0.05, initial=0.05, horizon=0.3)]
-    simulator = Simulator(loop, steps, span(loop, given))
-    posed = Linearised(simulator, differentiated(simulator), specify(SettlingTime(), [Overshoot(0.1)]), 60, 1.0)
+    simulator = Simulator(loop, steps, search_space(loop, given))
+    posed = LinearisedProblem(
+        simulator, sensitivity_rollout(simulator), specify(SettlingTime(), [Overshoot(0.1)]), 60, 1.0
+    )
     z = np.array([0.4, 0.3, 0.5, 0.2037])
     check_slopes(posed, z)
 
@@ -103,7 +105,7 @@ def test_gradients_are_those_of_finite_differences(
 def test_search_and_certificate_agree(sample_time: float | None) -> None:
     loop, given = friction_loop(sample_time)
     step = Step(0.2, horizon=0.6)
-    simulator = Simulator(loop, [step], span(loop, given))
+    simulator = Simulator(loop, [step], search_space(loop, given))
     (claimed,) = simulator.table(np.array([200.0, 300.0, 0.03]), specify(SettlingTime()))
     certified = evaluate(loop, step, given)[step.label]
     for name in ("SettlingTime", "Overshoot", "PeakControl"):

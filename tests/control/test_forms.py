@@ -24,7 +24,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.batch_margins import robustness
+from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.margins import frequency_response, sensitivity_terms
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
@@ -34,9 +34,9 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.condensed import Condensed
-from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 
 Run = Callable[[ClosedLoop, ParameterSet, float, float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -145,10 +145,13 @@ def test_whatever_its_form_the_same_law_runs(
     w = np.geomspace(0.1, 400.0, 30)
     L = [frequency_response(loop.open_loop(p), w) for loop, p in pairs]
     np.testing.assert_allclose(L[0], L[1], rtol=1e-10)
-    terms = [sensitivity_terms(loop, w, p)(loop.numbers(p)).full() for loop, p in pairs]
+    terms = [sensitivity_terms(loop, w, p)(loop.parameter_vector(p)).full() for loop, p in pairs]
     np.testing.assert_allclose(terms[0], terms[1], rtol=1e-10)
     only = ("MaxSensitivity", "NoiseGain")
-    reads = [robustness(loop, w)(loop.numbers(p)[None], np.zeros((1, 2)), np.zeros(1), only) for loop, p in pairs]
+    reads = [
+        batch_margin_function(loop, w)(loop.parameter_vector(p)[None], np.zeros((1, 2)), np.zeros(1), only)
+        for loop, p in pairs
+    ]
     for name in only:
         np.testing.assert_allclose(reads[0][name], reads[1][name], rtol=1e-9)
     tables = [evaluate(loop, Step(0.5, horizon=0.4), p) for loop, p in pairs]
@@ -173,19 +176,19 @@ def friction_loop(form: Form, sample_time: float | None) -> tuple[ClosedLoop, Pa
 
 @pytest.mark.parametrize(("form", "sample_time"), [(Form.STANDARD, None), (Form.SERIES, 2e-3)])
 def test_gradients_are_those_of_finite_differences(
-    form: Form, sample_time: float | None, check_slopes: Callable[[Linearised, np.ndarray], None]
+    form: Form, sample_time: float | None, check_slopes: Callable[[LinearisedProblem, np.ndarray], None]
 ) -> None:
     loop, freed = friction_loop(form, sample_time)
-    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], span(loop, freed))
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], search_space(loop, freed))
     spec = specify(SettlingTime(), [Overshoot(0.1), MaxSensitivity(1.6)])
-    posed = Linearised(simulator, differentiated(simulator), spec, 60, 1.0)
+    posed = LinearisedProblem(simulator, sensitivity_rollout(simulator), spec, 60, 1.0)
     z = np.array([0.4, 0.3, 0.5, 0.6, 0.2037])
     check_slopes(posed, z)
 
 
 def test_it_is_tuned_in_its_own_gains() -> None:
     loop, freed = friction_loop(Form.STANDARD, 2e-3)
-    quick = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
+    quick = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
     best = tune(loop, Step(0.1, horizon=0.3), freed, minimise=SettlingTime(), subject_to=[Overshoot(0.1)], method=quick)
     assert best.status.converged
     assert set(best.parameters.free_names) == {"pid.Kp", "pid.Ti", "pid.Td", "pid.N"}
@@ -205,7 +208,7 @@ def test_bad_gains_of_a_form_are_named(second_order: System) -> None:
     for name, unit in (("pid.Ti", "s"), ("pid.Td", "s"), ("pid.N", "1")):
         freed = loop.parameters.with_values({name: 1.0}).with_bounds({name: (0.0, 20.0)}).freed(name)
         with pytest.raises(InputError, match=rf"{name}: its lower bound must be positive, got 0 {unit}"):
-            span(loop, freed)
+            search_space(loop, freed)
 
 
 @pytest.mark.parametrize(("form", "gain"), [(Form.STANDARD, "pid.Kp"), (Form.SERIES, "pid.K")])

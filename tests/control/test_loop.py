@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from pneuopt.control.dither import Dither
-from pneuopt.control.linear_loop import delayed
+from pneuopt.control.linear_loop import pade_delay_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import System, define
@@ -102,10 +102,10 @@ def test_sampling_faster_approaches_the_continuous_loop(second_order: System, ru
 def test_analogue_dither_moves_between_samples(second_order: System) -> None:
     loop = ClosedLoop(second_order, PID(sample_time=1e-2), Dither(100.0, analogue=True))
     values = {"pid.upper": 0.5, "dither.amplitude": 0.3, "dither.offset": 0.4}
-    p = loop.numbers(loop.parameters.with_values(values))
+    p = loop.parameter_vector(loop.parameters.with_values(values))
     x = np.array(loop.update(0.0, loop.initial(loop.parameters), [0.0], p)).ravel()
     assert x[-1] == pytest.approx(0.4)
-    sent = [float(loop.held().ode(t, x, [0.0], p)[1][-1]) for t in (0.0, 0.0025, 0.0075)]
+    sent = [float(loop.hold_system().ode(t, x, [0.0], p)[1][-1]) for t in (0.0, 0.0025, 0.0075)]
     assert sent == pytest.approx([0.4, 0.5, 0.1])
 
 
@@ -131,10 +131,10 @@ def test_without_limits_nothing_is_clipped(second_order: System, run: Run) -> No
 def test_derivatives_agree_with_finite_differences(second_order: System, pid: PID) -> None:
     loop = ClosedLoop(second_order, pid, Dither(60.0))
     values = {**TUNED, "pid.lower": -9.0, "pid.upper": 9.0, "dither.amplitude": 0.2}
-    model, p = loop.discrete(2), loop.numbers(loop.parameters.with_values(values))
+    model, p = loop.discrete(2), loop.parameter_vector(loop.parameters.with_values(values))
     n = len(model.states)
     z = ca.MX.sym("z", n + len(p))
-    after, y = model.sample(ca.MX(0.003), ca.MX(5e-3), z[:n], ca.MX(0.7), z[n:])
+    after, y = model.advance_sample(ca.MX(0.003), ca.MX(5e-3), z[:n], ca.MX(0.7), z[n:])
     f = ca.Function("f", [z], [ca.vertcat(after, y)])
     jacobian = ca.Function("J", [z], [ca.jacobian(f(z), z)])
     point = np.concatenate([np.linspace(0.1, 0.4, n), p])
@@ -158,7 +158,7 @@ def test_rest_at_another_reference_and_without_integral(second_order: System) ->
     x = loop.initial(loop.parameters, reference=0.5)
     dc = 1270.12 / (1270.12 + 86.34)
     np.testing.assert_allclose(x, [0.5 * dc, 0, 0, 0.5 * (1 - dc)], atol=1e-12)
-    rate = loop.system().ode(0, x, [0.5], loop.numbers(loop.parameters))[0]
+    rate = loop.system().ode(0, x, [0.5], loop.parameter_vector(loop.parameters))[0]
     np.testing.assert_allclose(np.array(rate).ravel(), 0.0, atol=1e-9)
 
 
@@ -174,9 +174,9 @@ def test_a_given_state_is_taken_over_without_a_bump(axis: System, pid: PID) -> N
     p = loop.parameters.with_values({"pid.Kp": 7.0, "pid.Kd": 0.3, "pid.b": 0.6})
     x = loop.initial(p, [0.1, 0.2], reference=0.2, command=5.0)
     if pid.sample_time is not None:
-        x = np.array(loop.update(0.0, x, [0.2, 0.0], loop.numbers(p))).ravel()
-    model = loop.held() if pid.sample_time is not None else loop.system()
-    assert float(model.ode(0, x, [0.2, 0.0], loop.numbers(p))[1][-1]) == pytest.approx(5.0)
+        x = np.array(loop.update(0.0, x, [0.2, 0.0], loop.parameter_vector(p))).ravel()
+    model = loop.hold_system() if pid.sample_time is not None else loop.system()
+    assert float(model.ode(0, x, [0.2, 0.0], loop.parameter_vector(p))[1][-1]) == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("pid", [PID(), PID(sample_time=1e-3)])
@@ -217,7 +217,7 @@ def test_the_open_loop_is_controller_times_plant(second_order: System) -> None:
         sampled = pid.sample_time is not None
         exact = expected((1 - np.exp(-s * h)) / h if sampled else s) * np.exp(-s * dead_time)
         np.testing.assert_allclose(frequency_response(L, w), exact, rtol=0.02)
-        nearly = expected(s / (1 + s * h / 2) if sampled else s) * delayed(w, dead_time)
+        nearly = expected(s / (1 + s * h / 2) if sampled else s) * pade_delay_response(w, dead_time)
         np.testing.assert_allclose(frequency_response(L, w), nearly, rtol=1e-10)
 
 
@@ -279,6 +279,6 @@ def test_sampled_and_continuous_loops_are_asked_the_right_thing(second_order: Sy
     with pytest.raises(ModelError, match=r"use discrete\(\), or held\(\)"):
         ClosedLoop(second_order, PID(sample_time=1e-3)).system()
     with pytest.raises(ModelError, match=r"use system\(\)"):
-        ClosedLoop(second_order, PID()).held()
+        ClosedLoop(second_order, PID()).hold_system()
     with pytest.raises(ModelError, match=r"use system\(\)"):
         _ = ClosedLoop(second_order, PID()).update

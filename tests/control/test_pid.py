@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt.control.pid import PID, ratio
+from pneuopt.control.pid import PID, unit_ratio
 from pneuopt.quantities.errors import InputError, UnitError
 from pneuopt.quantities.parameters import Quantity
 
@@ -25,12 +25,12 @@ GAINS = {"Kp": 2.0, "Ki": 9.0, "Kd": 0.05, "Tf": 0.004, "b": 0.7, "c": 0.4, "Tt"
     ],
 )
 def test_units_of_gains_are_simplified(above: str, below: str, expected: str) -> None:
-    assert ratio(above, below) == expected
+    assert unit_ratio(above, below) == expected
 
 
 def test_an_unreadable_unit_is_refused() -> None:
     with pytest.raises(UnitError, match=r"cannot read the unit 'm\*\*2'"):
-        ratio("V", "m**2")
+        unit_ratio("V", "m**2")
 
 
 @pytest.mark.parametrize("sample_time", [0.0, -1e-3, inf])

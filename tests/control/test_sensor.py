@@ -7,7 +7,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import define
-from pneuopt.evaluation.batch_margins import robustness
+from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.instruments import Sensor
 from pneuopt.evaluation.margins import frequency_response, margins
@@ -24,12 +24,12 @@ from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 LAG = 5e-3
-QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
+QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
 
 
 def first_order(sample_time: float | None = None) -> ClosedLoop:
@@ -45,8 +45,8 @@ def test_the_open_loop_has_the_sensors_pole() -> None:
     expected = gain / (T * s + 1) * (2 + 30 / s) / (LAG * s + 1)
     ours = frequency_response(loop.open_loop(p), w)
     assert ours == pytest.approx(np.array([expected(1j * v) for v in w]), rel=1e-9)
-    x, numbers = np.zeros((1, len(loop.plant.states))), loop.numbers(p)[None]
-    found = robustness(loop, np.geomspace(1.0, 1e3, 2000))(numbers, x, np.zeros(1), ("MaxSensitivity",))
+    x, numbers = np.zeros((1, len(loop.plant.states))), loop.parameter_vector(p)[None]
+    found = batch_margin_function(loop, np.geomspace(1.0, 1e3, 2000))(numbers, x, np.zeros(1), ("MaxSensitivity",))
     assert found["MaxSensitivity"][0] == pytest.approx(margins(loop.open_loop(p)).max_sensitivity, rel=1e-4)
 
 
@@ -182,8 +182,8 @@ def test_an_encoders_margins_are_those_of_the_sampled_loop(h: float, filter_time
     L = control.sample_system(plant, h, "zoh")(z) * slope / (1 + filter_time * slope) * (300 + 4000 / slope)
     ours = loop.open_loop(given)
     assert margins(ours).max_sensitivity == pytest.approx(np.max(1 / np.abs(1 + L)), rel=0.02)
-    x, numbers = np.zeros((1, 2)), loop.numbers(given)[None]
-    found = robustness(loop, np.geomspace(1.0, 1e3, 2000))(numbers, x, np.zeros(1), ("MaxSensitivity",))
+    x, numbers = np.zeros((1, 2)), loop.parameter_vector(given)[None]
+    found = batch_margin_function(loop, np.geomspace(1.0, 1e3, 2000))(numbers, x, np.zeros(1), ("MaxSensitivity",))
     assert found["MaxSensitivity"][0] == pytest.approx(margins(ours).max_sensitivity, rel=1e-4)
 
 
@@ -191,7 +191,7 @@ def test_an_encoders_margins_are_those_of_the_sampled_loop(h: float, filter_time
 def test_search_and_certificate_count_alike(step: Step) -> None:
     loop = encoder_loop(Encoder(2e-5, LAG))
     given = loop.parameters.with_values(SPEED_GAINS).with_bounds({"pid.Kp": (50.0, 600.0)}).freed("pid.Kp")
-    (claimed,) = Simulator(loop, [step], span(loop, given)).table(np.array([300.0]), specify(SettlingTime()))
+    (claimed,) = Simulator(loop, [step], search_space(loop, given)).table(np.array([300.0]), specify(SettlingTime()))
     certified = evaluate(loop, step, given)[step.label]
     assert np.isfinite(certified["SettlingTime"])
     for name in ("SettlingTime", "Overshoot", "PeakControl", "MaxSensitivity"):

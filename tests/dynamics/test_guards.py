@@ -8,7 +8,7 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.guards import Contact, Guard
+from pneuopt.dynamics.guards import Contact, ValidityLimit
 from pneuopt.dynamics.simulate import contacts, simulate
 from pneuopt.dynamics.system import System, define, names
 from pneuopt.evaluation.instruments import Sensor
@@ -110,7 +110,9 @@ def test_an_emptied_chamber_is_told_with_the_law_of_its_expansion() -> None:
 def escaping() -> System:
     x = Quantity("level", "m")
     tank = define([x], [], [x], ParameterSet(), lambda _t, x, _u, _p: ({"level": x["level"] ** 2}, dict(x)))
-    return replace(tank, guards=(Guard("level", lambda _: 4.0, 1, "the tank spilled", "air is pumped"),))
+    return replace(
+        tank, validity_limits=(ValidityLimit("level", lambda _: 4.0, 1, "the tank spilled", "air is pumped"),)
+    )
 
 
 def test_a_run_that_stops_names_what_it_met_before() -> None:

@@ -8,26 +8,25 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.dynamics.compiled.compiler import compiler
+from pneuopt.dynamics.compiled.compiler import find_compiler
 from pneuopt.dynamics.simulate import StickSlipResult, simulate, simulate_stick_slip
 from pneuopt.dynamics.stick_slip import EventKind
-from pneuopt.dynamics.system import DIRECTION, System, define
+from pneuopt.dynamics.system import FRICTION_DIRECTION, System, define
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 BREAK_AWAY, STANDSTILL, REVERSAL = EventKind
 STRIBECK = {"friction.coulomb": 30.0, "friction.static": 45.0, "friction.stribeck_velocity": 0.02}
 
@@ -42,7 +41,7 @@ def held(force: float, seconds: float, n: int = 2) -> Trajectory:
 
 def pulled(friction: FrictionModel) -> System:
     """A mass at the end of a spring (2000 N/m) whose other end moves at 10 mm/s; outputs the friction force, too."""
-    own = friction.parameters.prefixed("friction")
+    own = friction.parameters.with_prefix("friction")
     mass = ParameterSet({"load.mass": Parameter(2.0, "kg")})
     states = (Quantity("position", "m"), Quantity("speed", "m/s"), Quantity("end", "m"))
 
@@ -268,7 +267,7 @@ def test_hundreds_of_events_a_second_are_quick() -> None:
     begin = perf_counter()
     run = simulate_stick_slip(loop, inputs, p)
     assert len(run.events) == 240
-    assert perf_counter() - begin < (5.0 if compiler() else 40.0)
+    assert perf_counter() - begin < (5.0 if find_compiler() else 40.0)
 
 
 def test_tolerances_converge() -> None:
@@ -311,7 +310,11 @@ def test_what_cannot_stick_is_refused() -> None:
 def test_a_run_that_escapes_says_when_and_where() -> None:
     speed, direction = Quantity("speed", "m/s"), Parameter(0.0, "1")
     runaway = define(
-        [speed], [], [], ParameterSet({DIRECTION: direction}), lambda _t, x, _u, _p: ({"speed": x["speed"] ** 2}, {})
+        [speed],
+        [],
+        [],
+        ParameterSet({FRICTION_DIRECTION: direction}),
+        lambda _t, x, _u, _p: ({"speed": x["speed"] ** 2}, {}),
     )
     with pytest.raises(ConvergenceError, match=r"stopped after t = 0\.\d* s, where speed .* m/s") as caught:
         simulate(runaway, Trajectory([0.0, 0.2, 0.3, 1.0], {}), ParameterSet(), initial={"speed": 2.5})
@@ -324,8 +327,8 @@ def test_a_model_that_is_undefined_says_so() -> None:
         states,
         [],
         [],
-        ParameterSet({DIRECTION: Parameter(0.0, "1")}),
-        lambda _t, x, _u, p: ({"speed": -p[DIRECTION], "level": -ca.sqrt(x["level"]) - 1}, {}),
+        ParameterSet({FRICTION_DIRECTION: Parameter(0.0, "1")}),
+        lambda _t, x, _u, p: ({"speed": -p[FRICTION_DIRECTION], "level": -ca.sqrt(x["level"]) - 1}, {}),
     )
     with pytest.raises(ConvergenceError, match="not defined there"):
         simulate(root, Trajectory([0.0, 0.5, 1.5], {}), ParameterSet(), initial={"level": 1.0})
@@ -337,7 +340,7 @@ def test_a_plant_without_a_speed_is_refused() -> None:
         [level],
         [],
         [],
-        ParameterSet({DIRECTION: Parameter(0.0, "1")}),
+        ParameterSet({FRICTION_DIRECTION: Parameter(0.0, "1")}),
         lambda _t, x, _u, _p: ({"level": x["level"]}, {}),
     )
     with pytest.raises(ModelError, match="needs a plant with a state 'speed'"):

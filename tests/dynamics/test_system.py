@@ -7,10 +7,11 @@ from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
 from pneuopt.dynamics.hooks import Log
-from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, discretise, vector
+from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, discretise, parameter_vector
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.trajectories import Trajectory
 
 SPRING = ParameterSet(
     {"stiffness": Parameter(30.0, "N/m"), "damping": Parameter(2.0, "N*s/m"), "mass": Parameter(2.0, "kg")}
@@ -29,7 +30,7 @@ def spring_mass() -> System:
 
 
 def test_the_vectors_follow_the_declarations_not_the_mapping() -> None:
-    xdot, y = spring_mass().ode(0, [0.1, 0.2], [7.0], vector(SPRING, SPRING))
+    xdot, y = spring_mass().ode(0, [0.1, 0.2], [7.0], parameter_vector(SPRING, SPRING))
     assert np.array(xdot).ravel().tolist() == pytest.approx([0.2, (7 - 3 - 0.4) / 2])
     assert np.array(y).ravel().tolist() == pytest.approx([0.1, 3.6])
 
@@ -75,8 +76,8 @@ def exact(x: Array, force: float, h: float) -> Array:
 
 def step_once(system: DiscreteSystem, x: Array, force: float, h: float) -> Array:
     t, dt, state, u, p = (ca.MX.sym(n, system.step.size1_in(i)) for i, n in enumerate("thxup"))
-    sample = ca.Function("sample", [t, dt, state, u, p], list(system.sample(t, dt, state, u, p)))
-    return np.array(sample(0, h, x, [force], vector(SPRING, SPRING))[0]).ravel()
+    sample = ca.Function("sample", [t, dt, state, u, p], list(system.advance_sample(t, dt, state, u, p)))
+    return np.array(sample(0, h, x, [force], parameter_vector(SPRING, SPRING))[0]).ravel()
 
 
 def test_rk4_has_order_four() -> None:
@@ -149,4 +150,4 @@ def test_without_a_finder_it_starts_from_what_was_logged() -> None:
 
 
 def test_missing_values_keep_the_default() -> None:
-    assert vector(SPRING, ParameterSet({"mass": Parameter(4.0, "kg")})).tolist() == [30.0, 2.0, 4.0]
+    assert parameter_vector(SPRING, ParameterSet({"mass": Parameter(4.0, "kg")})).tolist() == [30.0, 2.0, 4.0]

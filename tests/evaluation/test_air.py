@@ -8,7 +8,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.evaluation.air import NORMAL_DENSITY, consumption
+from pneuopt.evaluation.air import ANR_DENSITY, air_consumption
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.requirements import AirUse, SettlingTime
 from pneuopt.evaluation.specification import specify
@@ -17,9 +17,9 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.readings import watched
+from pneuopt.tuning.readings import loop_pieces
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 
 STEP = Step(0.1, horizon=0.4, start={"position": 0.2, "pressure_b": 3.5e5})
 
@@ -44,22 +44,22 @@ def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave() -
     full = (plant.parameters | p).select(plant.parameters)
     states, u = run.matrix([q.name for q in plant.states]).T, np.full((1, len(t)), 1.0)
     flow, spool = (np.asarray(r) for r in plant.meter.map(len(t))(0, states, u, [full.value(n) for n in full]))
-    litres = consumption(t, flow, spool, 0.0)["AirUse"][0]
+    litres = air_consumption(t, flow, spool, 0.0)["AirUse"][0]
     area = np.pi / 4 * p.value("cylinder.bore") ** 2
     volume = p.value("cylinder.dead_volume_a") + area * run["position"][-1]
     gained = (run["pressure_a"][-1] - run["pressure_a"][0]) * volume / (287.0 * p.value("ambient.temperature"))
     assert run["position"][-1] == pytest.approx(0.25, abs=1e-4)
-    assert litres == pytest.approx(1e3 * gained / NORMAL_DENSITY, rel=2e-3)
+    assert litres == pytest.approx(1e3 * gained / ANR_DENSITY, rel=2e-3)
     np.testing.assert_allclose(spool[0], run["valve.spool"], atol=1e-12)
 
 
 def test_a_closed_valve_draws_nothing_and_travel_counts_to_and_fro() -> None:
     t = np.linspace(0.0, 1.0, 1001)
-    found = consumption(t, np.zeros((1, 1001)), 0.1 * np.sin(2 * np.pi * 5 * t)[None], 0.0)
+    found = air_consumption(t, np.zeros((1, 1001)), 0.1 * np.sin(2 * np.pi * 5 * t)[None], 0.0)
     assert found["AirUse"][0] == 0.0
     assert found["ValveTravel"][0] == pytest.approx(4 * 0.1 * 5, rel=1e-4)
-    later = consumption(t, np.ones((1, 1001)), np.zeros((1, 1001)), 0.5)["AirUse"][0]
-    assert later == pytest.approx(0.5e3 / NORMAL_DENSITY)
+    later = air_consumption(t, np.ones((1, 1001)), np.zeros((1, 1001)), 0.5)["AirUse"][0]
+    assert later == pytest.approx(0.5e3 / ANR_DENSITY)
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.6])
@@ -67,7 +67,7 @@ def test_the_search_counts_the_air_that_the_certificate_counts(amplitude: float)
     loop, p = driven(amplitude)
     freed = p.with_bounds({"pid.Kp": (1.0, 4.0)}).freed("pid.Kp")
     spec = specify({SettlingTime(): 1.0, AirUse(): 1.0})
-    claimed = Simulator(loop, [STEP], span(loop, freed), spec=spec).table(np.array([2.0]), spec)[0]["AirUse"]
+    claimed = Simulator(loop, [STEP], search_space(loop, freed), spec=spec).table(np.array([2.0]), spec)[0]["AirUse"]
     certified = evaluate(loop, STEP, p)[STEP.label]
     assert claimed == pytest.approx(certified["AirUse"], rel=0.01)
     assert certified["ValveTravel"] > 0
@@ -83,7 +83,7 @@ def test_dither_costs_air_and_travel() -> None:
 def test_the_meter_is_no_output_and_watched_only_where_air_is_asked_for() -> None:
     loop, p = driven()
     assert set(respond(loop, STEP, p).names) == {q.name for q in (*loop.states, *loop.outputs)}
-    plain, metered = (watched(loop, with_meter=asked).step for asked in (False, True))
+    plain, metered = (loop_pieces(loop, with_meter=asked).step for asked in (False, True))
     assert metered.numel_out(1) - plain.numel_out(1) == 2
 
 
@@ -91,5 +91,5 @@ def test_air_of_a_plant_that_draws_none_is_refused() -> None:
     loop = ClosedLoop(FirstOrder().system(), PID())
     given = loop.parameters.with_bounds({"pid.Kp": (0.5, 2.0)}).freed("pid.Kp")
     with pytest.raises(InputError, match="AirUse counts the supply's air, and this plant has none"):
-        Simulator(loop, [Step(1.0)], span(loop, given), spec=specify(AirUse(max=1.0)))
+        Simulator(loop, [Step(1.0)], search_space(loop, given), spec=specify(AirUse(max=1.0)))
     assert "AirUse" not in evaluate(loop, Step(1.0), given).index

@@ -9,7 +9,7 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.dither_verdict import DitherEffect, Usefulness, dither_effect, explained, judge_dither
+from pneuopt.evaluation.dither_verdict import DitherEffect, Usefulness, dither_effect, explain_effect, judge_dither
 from pneuopt.models.catalog import r25, t32
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
@@ -93,10 +93,10 @@ def test_a_spool_that_lags_and_a_dead_zone_that_swallows_are_said() -> None:
     loop, p = coarse(0.2, 160.0)
     found = dither_effect(loop, STEP, p)
     lag = 1 / abs(1 - (160 / 80) ** 2 + 1j * 1.6 * 160 / 80)  # second order, 80 Hz, damping 0.8
-    assert found.passed == pytest.approx(lag, rel=1e-3)
+    assert found.valve_gain == pytest.approx(lag, rel=1e-3)
     assert found.spool == pytest.approx(0.04 * lag, rel=1e-3)
     assert found.force < 0.01
-    text = " ".join(explained(loop, found, p))
+    text = " ".join(explain_effect(loop, found, p))
     assert "within its dead zone of 0.05" in text
     assert "80 Hz bandwidth" in text
 
@@ -115,14 +115,14 @@ def test_a_triangle_moves_what_its_fundamental_does() -> None:
 def test_a_dither_beyond_the_commands_limits_is_said_to_be_cut(amplitude: float, offset: float, cut: bool) -> None:
     loop, p = paper()
     given = p.with_values({"dither.amplitude": amplitude, "dither.offset": offset})
-    text = " ".join(explained(loop, DitherEffect(amplitude, 160.0), given))
+    text = " ".join(explain_effect(loop, DitherEffect(amplitude, 160.0), given))
     assert ("the peaks are cut" in text) == cut
 
 
 def test_the_valves_own_span_counts_too() -> None:
     loop, p = paper()
     given = p.with_values({"pid.lower": -20.0, "pid.upper": 20.0, "dither.amplitude": 6.0})
-    assert "the valve ends at -5 and 5 V" in " ".join(explained(loop, DitherEffect(6.0, 160.0), given))
+    assert "the valve ends at -5 and 5 V" in " ".join(explain_effect(loop, DitherEffect(6.0, 160.0), given))
 
 
 def test_another_plant_is_judged_by_its_response_alone() -> None:

@@ -22,7 +22,7 @@ from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code
+from pneuopt.quantities.status import Code
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.tune import tune
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from pneuopt.control.dither import Waveform
@@ -12,10 +11,10 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.limit_cycle import find_limit_cycle
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 T = np.linspace(0.0, 4.0, 2001)
 
 
@@ -43,7 +42,7 @@ def test_a_triangles_and_a_crawls_peaks_are_their_own() -> None:
     assert found is not None
     assert (found.frequency, found.amplitude) == pytest.approx((2.5, 0.02), rel=0.02)
     assert found.stick_share == pytest.approx(0.6, abs=0.02)
-    assert found.told("m/s").startswith("a limit cycle of +-0.02 m/s at 2.5 Hz, at a standstill 6")
+    assert found.describe("m/s").startswith("a limit cycle of +-0.02 m/s at 2.5 Hz, at a standstill 6")
 
 
 def test_van_der_pols_cycle_has_its_known_period() -> None:
@@ -70,7 +69,7 @@ def test_noise_is_no_limit_cycle_however_it_is_filtered(lag: int) -> None:
 @pytest.mark.parametrize("damping", [0.3, 0.05, 0.01])
 def test_a_ringing_that_dies_out_is_none(damping: float) -> None:
     w = 2 * np.pi * 5.0
-    assert find_limit_cycle(T, 1 - np.exp(-damping * w * T) * np.cos(w * T), least=1e-9) is None
+    assert find_limit_cycle(T, 1 - np.exp(-damping * w * T) * np.cos(w * T), min_amplitude=1e-9) is None
 
 
 @pytest.mark.parametrize(
@@ -108,7 +107,7 @@ def test_an_integrals_hunting_under_lugre_friction_is_found_and_ends_without_the
     for Ki in (6000.0, 0.0):
         p = loop.parameters.with_values({**values, **gains, "pid.Ki": Ki})
         run = simulate(loop, inputs, p, rtol=1e-7)
-        cycles.append(find_limit_cycle(t, run["position"], least=1e-4))
+        cycles.append(find_limit_cycle(t, run["position"], min_amplitude=1e-4))
     assert cycles[0] is not None
     assert cycles[0].amplitude > 1e-3
     assert cycles[1] is None

@@ -12,7 +12,7 @@ from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import Linearisation, System
-from pneuopt.evaluation.batch_margins import _responses, robustness
+from pneuopt.evaluation.batch_margins import _partial_fraction_response, batch_margin_function
 from pneuopt.evaluation.margins import (
     frequency_grid,
     frequency_response,
@@ -107,13 +107,15 @@ def test_sensitivity_terms_are_the_loops_sensitivity(second_order: System, sampl
     terms = sensitivity_terms(loop, w, loop.parameters)
     tuned = loop.parameters.with_values({"pid.Kp": 0.2, "pid.Ki": 1.1, "pid.Kd": 0.009, "pid.Tf": 0.02})
     L = frequency_response(loop.open_loop(tuned), w)
-    np.testing.assert_allclose(np.array(terms(loop.numbers(tuned))).ravel(), np.abs(1 + L) ** 2, rtol=1e-10)
+    np.testing.assert_allclose(np.array(terms(loop.parameter_vector(tuned))).ravel(), np.abs(1 + L) ** 2, rtol=1e-10)
 
 
 def test_sensitivity_terms_have_exact_derivatives(second_order: System) -> None:
     loop = ClosedLoop(second_order, PID())
     f = sensitivity_terms(loop, [1.0, 30.0, 300.0], loop.parameters)
-    p = loop.numbers(loop.parameters.with_values({"pid.Kp": 0.2, "pid.Ki": 1.1, "pid.Kd": 0.009, "pid.Tf": 0.02}))
+    p = loop.parameter_vector(
+        loop.parameters.with_values({"pid.Kp": 0.2, "pid.Ki": 1.1, "pid.Kd": 0.009, "pid.Tf": 0.02})
+    )
     z = ca.SX.sym("p", len(p))
     jacobian = np.array(ca.Function("J", [z], [ca.jacobian(f(z), z)])(p))
     steps = 1e-5 * np.diag(np.where(np.isinf(p), 0.0, p))
@@ -158,8 +160,8 @@ def test_many_sensitivities_are_those_of_one_loop_after_another(measured: str, s
         (loop.parameters | rig.fixed("*")).with_values({"pid.Kp": Kp, "pid.Ki": 40.0, "pid.Kd": 0.1, "pid.Tf": 0.01})
         for Kp in (1.0, 3.0, 10.0, 20.0, 60.0)
     ]
-    numbers = np.array([loop.numbers(p) for p in sets])
-    found = robustness(loop, omega)(numbers, points, commands, ("MaxSensitivity",))["MaxSensitivity"]
+    numbers = np.array([loop.parameter_vector(p) for p in sets])
+    found = batch_margin_function(loop, omega)(numbers, points, commands, ("MaxSensitivity",))["MaxSensitivity"]
     fine = np.geomspace(1, 1e4, 20001)
     for p, x, command, Ms in zip(sets, points, commands, found, strict=True):
         L = frequency_response(loop.open_loop(p, x, {loop.command.name: command}), fine)
@@ -169,7 +171,9 @@ def test_many_sensitivities_are_those_of_one_loop_after_another(measured: str, s
 def test_systems_without_a_basis_of_modes_are_solved_instead() -> None:
     chain = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     omega = np.array([0.1, 1.0, 10.0])
-    found = _responses(np.stack([chain, chain - np.eye(3)]), np.eye(3)[[2, 2]], np.eye(3)[[0, 0]], omega)(omega)
+    found = _partial_fraction_response(
+        np.stack([chain, chain - np.eye(3)]), np.eye(3)[[2, 2]], np.eye(3)[[0, 0]], omega
+    )(omega)
     assert_allclose(found, [1 / (1j * omega) ** 3, 1 / (1j * omega + 1) ** 3], rtol=1e-9)
 
 
@@ -211,8 +215,8 @@ def test_margins_on_a_grid_are_those_of_one_loop_after_another(second_order: Sys
         loop.parameters.with_values(dict(zip(("pid.Kp", "pid.Ki", "pid.Kd", "pid.Tf"), g, strict=True))) for g in gains
     ]
     only = ("MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin", "NoiseGain")
-    p, x = np.array([loop.numbers(s) for s in sets]), np.zeros((len(sets), 2))
-    found = robustness(loop, np.geomspace(0.1, 1e4, 2000))(p, x, np.zeros(len(sets)), only)
+    p, x = np.array([loop.parameter_vector(s) for s in sets]), np.zeros((len(sets), 2))
+    found = batch_margin_function(loop, np.geomspace(0.1, 1e4, 2000))(p, x, np.zeros(len(sets)), only)
     exact = [margins(loop.open_loop(s)) for s in sets]
     assert np.isfinite([m.gain_margin for m in exact]).any()
     assert_allclose(found["GainMargin"], [m.gain_margin for m in exact], rtol=1e-3)
@@ -228,8 +232,8 @@ def test_margins_on_a_grid_are_those_of_one_loop_after_another(second_order: Sys
 
 def test_without_gain_there_is_no_crossing(second_order: System) -> None:
     loop = ClosedLoop(second_order, PID())
-    p = loop.numbers(loop.parameters.with_values({"pid.Kp": 0.0, "pid.Ki": 0.0, "pid.Kd": 0.0, "pid.Tf": 0.1}))
-    found = robustness(loop, [1.0, 10.0, 100.0])(
+    p = loop.parameter_vector(loop.parameters.with_values({"pid.Kp": 0.0, "pid.Ki": 0.0, "pid.Kd": 0.0, "pid.Tf": 0.1}))
+    found = batch_margin_function(loop, [1.0, 10.0, 100.0])(
         p[None], np.zeros((1, 2)), np.zeros(1), ("GainMargin", "PhaseMargin", "NoiseGain")
     )
     assert {n: v.tolist() for n, v in found.items()} == {
@@ -247,9 +251,9 @@ def test_the_grids_peaks_are_refined_where_the_loop_rings(damping: float) -> Non
     rng, names = np.random.default_rng(0), ("pid.Kp", "pid.Ki", "pid.Kd", "pid.Tf")
     rows = rng.uniform((0.01, 0.01, 0.0, 0.005), (3.0, 20.0, 0.05, 0.05), (40, 4)).tolist()
     sets = [loop.parameters.with_values({**plant, **dict(zip(names, row, strict=True))}) for row in rows]
-    p, x = np.array([loop.numbers(s) for s in sets]), np.zeros((len(sets), 2))
+    p, x = np.array([loop.parameter_vector(s) for s in sets]), np.zeros((len(sets), 2))
     only = ("MaxSensitivity", "MaxComplementarySensitivity")
-    found = robustness(loop, np.geomspace(0.1, 1e3, 150))(p, x, np.zeros(len(sets)), only)
+    found = batch_margin_function(loop, np.geomspace(0.1, 1e3, 150))(p, x, np.zeros(len(sets)), only)
     exact = [margins(loop.open_loop(s)) for s in sets]
     calm = np.array([m.stable and m.max_sensitivity < 20 for m in exact])
     assert calm.sum() >= 20

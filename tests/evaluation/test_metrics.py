@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.metrics import About, batch_metrics, step_metrics
+from pneuopt.evaluation.metrics import BandCentre, batch_metrics, step_metrics
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -106,10 +106,10 @@ def test_settling_does_not_hang_on_the_grid(stride: int) -> None:
 
 def test_the_band_lies_where_it_was_asked_for() -> None:
     y = 0.97 * (1 - np.exp(-T))
-    about = {a: step_metrics(T, y, 1.0, 0.0, band=0.05, about=a, final=0.97)["SettlingTime"] for a in About}
-    assert about[About.FINAL] == pytest.approx(np.log(20), abs=1e-4)
-    assert about[About.REFERENCE] == pytest.approx(-np.log(0.02 / 0.97), abs=1e-4)
-    assert np.isnan(step_metrics(T, y, 1.0, 0.0, band=0.02, about=About.REFERENCE)["SettlingTime"])
+    about = {a: step_metrics(T, y, 1.0, 0.0, band=0.05, band_centre=a, final=0.97)["SettlingTime"] for a in BandCentre}
+    assert about[BandCentre.FINAL] == pytest.approx(np.log(20), abs=1e-4)
+    assert about[BandCentre.REFERENCE] == pytest.approx(-np.log(0.02 / 0.97), abs=1e-4)
+    assert np.isnan(step_metrics(T, y, 1.0, 0.0, band=0.02, band_centre=BandCentre.REFERENCE)["SettlingTime"])
 
 
 def test_a_loop_that_hunts_or_creeps_never_settles() -> None:
@@ -118,30 +118,32 @@ def test_a_loop_that_hunts_or_creeps_never_settles() -> None:
     for y in (hunting, creeping):
         assert np.isnan(step_metrics(T, y, 1.0, 0.0)["SettlingTime"])
     assert np.isnan(step_metrics(T, creeping, 1.0, 0.0, final=1.0)["RiseTime"])
-    assert step_metrics(T, creeping, 1.0, 0.0, about=About.REFERENCE)["SteadyStateError"] == pytest.approx(88.0)
+    assert step_metrics(T, creeping, 1.0, 0.0, band_centre=BandCentre.REFERENCE)["SteadyStateError"] == pytest.approx(
+        88.0
+    )
     backwards = step_metrics(T, -response(), 1.0, 0.0)
     assert np.isnan(backwards["OvershootFinal"])
     assert backwards["Undershoot"] > 90
 
 
-@pytest.mark.parametrize("about", list(About))
+@pytest.mark.parametrize("about", list(BandCentre))
 @pytest.mark.parametrize("final", [None, 1.0])
-def test_what_is_in_the_band_only_at_the_very_end_has_not_settled(about: About, final: float | None) -> None:
+def test_what_is_in_the_band_only_at_the_very_end_has_not_settled(about: BandCentre, final: float | None) -> None:
     """A ramp through the band ends in it; so does a limit cycle that a horizon cuts at the right moment."""
     for end, settles in ((1.0, False), (4.0, True)):
         t = np.linspace(0.0, end, 2001)
         ramp = np.minimum(1.0, 0.02 + t)
-        settled = step_metrics(t, ramp, 1.0, 0.0, about=about, final=final)["SettlingTime"]
+        settled = step_metrics(t, ramp, 1.0, 0.0, band_centre=about, final=final)["SettlingTime"]
         assert settled == (pytest.approx(0.96, abs=1e-3) if settles else pytest.approx(np.nan, nan_ok=True))
     hunting = 1.0 + 0.5 * np.sin(2 * np.pi * 4 * T / T[-1])
-    assert np.isnan(step_metrics(T, hunting, 1.0, 0.0, about=about, final=1.0)["SettlingTime"])
+    assert np.isnan(step_metrics(T, hunting, 1.0, 0.0, band_centre=about, final=1.0)["SettlingTime"])
 
 
 def test_under_dither_two_periods_in_the_band_are_asked_for() -> None:
     t, period = np.linspace(0.0, 1.0, 1001), 0.1
     for begins, settles in ((0.75, True), (0.82, False)):
         y = np.where(t < begins, 0.5, 1.0) + 0.01 * np.sin(2 * np.pi * t / period)
-        settled = step_metrics(t, y, 1.0, 0.0, about=About.REFERENCE, dither_period=period)["SettlingTime"]
+        settled = step_metrics(t, y, 1.0, 0.0, band_centre=BandCentre.REFERENCE, dither_period=period)["SettlingTime"]
         assert np.isfinite(settled) == settles
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from pneuopt.evaluation.requirements import (
     IAE,
-    KINDS,
+    REQUIREMENT_KINDS,
     ControlRate,
     GainMargin,
     MaxComplementarySensitivity,
@@ -20,46 +20,51 @@ from pneuopt.evaluation.requirements import (
     SettlingTime,
     SteadyStateError,
     StepEnvelope,
-    most,
-    name,
-    read,
-    told,
+    describe_value,
+    metric_name,
+    requirement_values,
+    upper_limit,
 )
 from pneuopt.quantities.errors import InputError
 
 
 def test_metrics_in_percent_become_fractions() -> None:
     metrics = {"SettlingTime": 0.3, "Overshoot": 5.0, "SteadyStateError": 2.0, "PeakControl": 4.0, "Undershoot": 0.1}
-    assert read(metrics) == {"SettlingTime": 0.3, "Overshoot": 0.05, "SteadyStateError": 0.02, "PeakControl": 4.0}
+    assert requirement_values(metrics) == {
+        "SettlingTime": 0.3,
+        "Overshoot": 0.05,
+        "SteadyStateError": 0.02,
+        "PeakControl": 4.0,
+    }
 
 
 def test_a_margin_counts_by_its_reciprocal() -> None:
     """A gain margin below one is the factor down that makes a loop oscillate: 0.5 is as good as 2."""
-    values = read(
+    values = requirement_values(
         {"GainMargin": np.array([2.0, 0.5, 4.0, math.inf]), "PhaseMargin": np.array([50.0, -50.0, 0.0, math.inf])}
     )
     np.testing.assert_allclose(values["GainMargin"], [0.5, 0.5, 0.25, 0.0])
     np.testing.assert_allclose(values["PhaseMargin"], [0.02, 0.02, math.inf, 0.0])
-    assert math.isnan(read({"PhaseMargin": math.nan})["PhaseMargin"])
+    assert math.isnan(requirement_values({"PhaseMargin": math.nan})["PhaseMargin"])
 
 
 @given(st.floats(1.001, 100.0), st.floats(1.001, 100.0))
 def test_a_margin_is_kept_where_it_is_large_enough(least: float, margin: float) -> None:
     for requirement, metric in ((GainMargin(least), "GainMargin"), (PhaseMargin(least), "PhaseMargin")):
-        kept = read({metric: margin})[metric] <= most(requirement) * (1 + 1e-12)
+        kept = requirement_values({metric: margin})[metric] <= upper_limit(requirement) * (1 + 1e-12)
         assert kept == (margin >= least * (1 - 1e-12)) or margin == pytest.approx(least, rel=1e-9)
 
 
 def test_limits_are_told_as_they_were_written() -> None:
-    assert told(PhaseMargin(45.0), 1 / 30) == ("30", "at least 45")
-    assert told(GainMargin(2.0), 0.0) == ("inf", "at least 2")
-    assert told(IAE(0.1), 0.125) == ("0.125", "allowed 0.1")
+    assert describe_value(PhaseMargin(45.0), 1 / 30) == ("30", "at least 45")
+    assert describe_value(GainMargin(2.0), 0.0) == ("inf", "at least 2")
+    assert describe_value(IAE(0.1), 0.125) == ("0.125", "allowed 0.1")
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if k is not StepEnvelope])
+@pytest.mark.parametrize("kind", [k for k in REQUIREMENT_KINDS if k is not StepEnvelope])
 def test_without_a_bound_nothing_is_forbidden(kind: type[Requirement]) -> None:
-    assert most(kind()) == math.inf  # type: ignore[call-arg]
-    assert name(kind()) == kind.__name__  # type: ignore[call-arg]
+    assert upper_limit(kind()) == math.inf  # type: ignore[call-arg]
+    assert metric_name(kind()) == kind.__name__  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
@@ -27,7 +26,6 @@ from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 FRICTION = {"friction.coulomb": 30.0, "friction.static": 45.0, "friction.viscous": 40.0, "load.mass": 3.0}
 REAL = {"position": Sensor(lag=5e-4, noise=1e-6, resolution=1e-5)}
 
@@ -89,7 +87,7 @@ def test_readings_lag_are_noisy_and_rounded_as_said() -> None:
 def test_play_keeps_its_distance_and_forgets_nothing_inside(commands: list[float], width: float) -> None:
     actuator, spool = Actuator(hysteresis=width), 0.0
     for command in commands:
-        before, spool = spool, actuator.follow(command, spool)
+        before, spool = spool, actuator.apply_hysteresis(command, spool)
         assert abs(command - spool) <= width / 2 + 1e-12
         if abs(command - before) <= width / 2:
             assert spool == before

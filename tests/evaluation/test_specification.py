@@ -38,7 +38,7 @@ def test_the_tightest_limit_counts() -> None:
 def test_violated_names_what_is_not_kept_nan_included() -> None:
     spec = specify(SettlingTime(max=1.0), [Overshoot(0.1), MaxSensitivity(1.6), GainMargin(2.0), PhaseMargin(45.0)])
     values = {"SettlingTime": math.nan, "Overshoot": 0.1, "MaxSensitivity": 1.7, "GainMargin": 0.6, "PhaseMargin": 0.02}
-    assert [type(q) for q in spec.violated(values)] == [SettlingTime, MaxSensitivity, GainMargin]
+    assert [type(q) for q in spec.violations(values)] == [SettlingTime, MaxSensitivity, GainMargin]
 
 
 def test_tightening_leaves_room_inside() -> None:
@@ -49,7 +49,7 @@ def test_tightening_leaves_room_inside() -> None:
         GainMargin(3.0),
         StepEnvelope(TUBE),
     ]
-    spec = specify(SettlingTime(band=0.02, max=1.0), limits).tightened(0.03, 1e-4)
+    spec = specify(SettlingTime(band=0.02, max=1.0), limits).tighten(0.03, 1e-4)
     assert spec.band == pytest.approx(0.0194)
     assert spec.limit(Overshoot) == pytest.approx(0.097)
     assert spec.limit(MaxSensitivity) == pytest.approx(1.6 * (1 - 1e-4))

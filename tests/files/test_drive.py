@@ -26,8 +26,8 @@ from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.solution import Code, Status
 
 AXIS = """# my axis, 2024
 [drive]

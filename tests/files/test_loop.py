@@ -18,7 +18,7 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code, Status
+from pneuopt.quantities.status import Code, Status
 
 PLANT = SecondOrder().system()
 STANDARD = """[pid]
@@ -61,7 +61,7 @@ def test_a_form_is_tuned_in_its_own_gains(tmp_path: Path) -> None:
     given = tuning.parameters
     assert given.free_names == ("pid.Ti", "feedforward.gain")
     assert (given["pid.Ti"].lower, given["pid.Ti"].upper, given.value("pid.dead_band")) == (0.05, 2.0, 2e-3)
-    assert vars(tuning.loop.parallel(given)) == pytest.approx({"Kp": 2.0, "Ki": 4.0, "Kd": 0.5, "Tf": 0.025})
+    assert vars(tuning.loop.parallel_form(given)) == pytest.approx({"Kp": 2.0, "Ki": 4.0, "Kd": 0.5, "Tf": 0.025})
     result = Tuned(given.with_values({"pid.Ti": 0.25, "feedforward.gain": 2.5}))
     write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", result)
     again = read_tuning(tmp_path / "tuned.toml", PLANT).parameters
@@ -71,7 +71,7 @@ def test_a_form_is_tuned_in_its_own_gains(tmp_path: Path) -> None:
 def test_the_series_form_is_read(tmp_path: Path) -> None:
     text = STANDARD.replace('"standard"', '"series"').replace("Kp =", "K =").replace("N = 10", 'Tf = "20 ms"')
     tuning = read_tuning(written(tmp_path, text), PLANT)
-    assert tuning.loop.parallel(tuning.parameters) == to_parallel(SeriesForm(2.0, 0.5, 0.25, 0.02))
+    assert tuning.loop.parallel_form(tuning.parameters) == to_parallel(SeriesForm(2.0, 0.5, 0.25, 0.02))
 
 
 @pytest.mark.parametrize(

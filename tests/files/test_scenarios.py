@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from pneuopt.cli.app import app
 from pneuopt.evaluation.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
-from pneuopt.files.scenarios import read_fresh, read_scenarios
+from pneuopt.files.scenarios import read_scenarios, read_validation_scenarios
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.linear import SecondOrder
@@ -98,7 +98,7 @@ def test_fresh_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> Non
     text = '[scenarios.samples]\ncount = 3\n"load.mass" = "30 %"\n[scenarios.tolerances]\n"pid.Kp" = "1 %"'
     path.write_text(text, encoding="utf-8")
     said = read_toml(path).unwrap()["scenarios"]
-    seen, fresh = (found(said, "tuning.toml", RIG) for found in (read_scenarios, read_fresh))
+    seen, fresh = (found(said, "tuning.toml", RIG) for found in (read_scenarios, read_validation_scenarios))
     assert len(fresh) == 200
     masses = [v["load.mass"] for v in fresh.values() if "load.mass" in v]
     factors = [v["pid.Kp"] for v in fresh.values() if "pid.Kp" in v]

@@ -49,7 +49,7 @@ def test_a_study_names_its_files_axes_and_metrics(file: Path) -> None:
     pressure, mass = axes(file, STUDY)
     assert (pressure.name, pressure.unit) == ("supply.pressure", "bar(g)")
     assert pressure.points == (501325.0, 601325.0, 601325.0)
-    assert pressure.shown(pressure.points).tolist() == [4.0, 5.0, 5.0]
+    assert pressure.in_axis_unit(pressure.points).tolist() == [4.0, 5.0, 5.0]
     assert (mass.points, mass.unit) == ((2.0, 4.0, 6.0, 8.0), "kg")
     study = read_study(file)
     assert study.drive.resolve() == (file.parent / "fit.toml").resolve()

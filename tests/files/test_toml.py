@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from pneuopt.files.toml import Places, read_toml
+from pneuopt.files.toml import FileLocations, read_toml
 from pneuopt.quantities.errors import InputError
 
 
@@ -33,7 +33,7 @@ def test_places_are_found_whatever_the_style_of_the_table() -> None:
 rod = 2
 leak.lower = 0
 """
-    places = Places("drive.toml", text)
+    places = FileLocations("drive.toml", text)
     found = {
         ("cylinder", "rod"): 3,
         ("cylinder", "bore"): 4,
@@ -41,9 +41,11 @@ leak.lower = 0
         ("valve", "leak"): 7,
         ("valve", ""): 5,
     }
-    assert {name: places.at(*name) for name in found} == {name: f"drive.toml:{line}" for name, line in found.items()}
-    assert places.at("valve", "span") == "drive.toml:5"
-    assert places.at("load", "mass") == str(places) == "drive.toml"
+    assert {name: places.location(*name) for name in found} == {
+        name: f"drive.toml:{line}" for name, line in found.items()
+    }
+    assert places.location("valve", "span") == "drive.toml:5"
+    assert places.location("load", "mass") == str(places) == "drive.toml"
     inline = 'load = { mass = "5 kg" }\nsupply.pressure = "6 bar(g)"'
-    assert Places("d", inline).at("load", "mass") == "d:1"
-    assert Places("d", inline).at("supply", "pressure") == "d:2"
+    assert FileLocations("d", inline).location("load", "mass") == "d:1"
+    assert FileLocations("d", inline).location("supply", "pressure") == "d:2"

@@ -39,7 +39,7 @@ from pneuopt.models.friction import Coulomb, PressureDependent
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code, Status
+from pneuopt.quantities.status import Code, Status
 
 PLANT = SecondOrder().system()
 TUNING = """# my loop, 2024

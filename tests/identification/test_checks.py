@@ -11,9 +11,10 @@ from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.trajectories import Trajectory
 
 NOISE = 2e-5  # [m]
 RIG = ForceDrive(Coulomb())
@@ -153,7 +154,7 @@ def test_what_a_model_doubts_is_warned_of_and_stands_in_the_status() -> None:
     def doubting(logs: Mapping[str, Log]) -> Sequence[str]:
         return [f"{name}: {log.parameters.value('load.mass'):g} kg?" for name, log in logs.items()]
 
-    system = replace(RIG.system(), doubter=doubting)
+    system = replace(RIG.system(), log_warning_hook=doubting)
     t = np.arange(400) * 1e-3
     motion = {"force": 100 * np.cos(20 * t), "position": 0.02 * np.sin(20 * t) + 1e-6 * np.sin(1e5 * t)}
     log = Experiment(Trajectory(t, motion), name="run").with_conditions({"load.mass": 7.0})

@@ -1,10 +1,11 @@
 import numpy as np
 
-from pneuopt.identification.excitation import missing, motion, remedy
+from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.trajectories import Trajectory
 
 VALUES = ForceDrive(LuGre()).parameters  # 5 kg, 30 N, Stribeck velocity 20 mm/s
 T = np.arange(0, 4, 1e-3)
@@ -15,38 +16,38 @@ def seen(speed: Array) -> Experiment:
 
 
 def test_a_sine_excites_everything() -> None:
-    found = motion([seen(0.3 * np.sin(2 * np.pi * T))], {}, VALUES, VALUES)
+    found = summarise_motion([seen(0.3 * np.sin(2 * np.pi * T))], {}, VALUES, VALUES)
     assert found is not None
     assert 0.45 < found.forward < 0.55
     assert 6 <= found.reversals <= 8
     assert abs(found.acceleration - 0.3 * 2 * np.pi / np.sqrt(2)) < 0.1
     free = [f"friction.{n}" for n in ("coulomb", "static", "viscous", "stribeck_velocity", "bristle_stiffness")]
-    assert all(missing(name, [*free, "load.mass", "load.force"], found) is None for name in free)
+    assert all(missing_excitation(name, [*free, "load.mass", "load.force"], found) is None for name in free)
 
 
 def test_what_is_lacking_counts_only_where_it_confuses() -> None:
-    found = motion([seen(np.full(T.size, 0.2))], {}, VALUES, VALUES)
+    found = summarise_motion([seen(np.full(T.size, 0.2))], {}, VALUES, VALUES)
     both = ["friction.coulomb", "friction.viscous", "load.force"]
     for name, words in (("friction.viscous", "too near for a slope"), ("load.force", "moves forwards only")):
-        lack = missing(name, both, found)
+        lack = missing_excitation(name, both, found)
         assert lack is not None
         assert words in lack[0]
-    assert missing("friction.viscous", ["friction.viscous"], found) is None
-    assert missing("load.force[run 1]", ["load.force[run 1]"], found) is None
-    assert missing("valve.leak", ["valve.leak"], found) is None
-    bristle = missing("friction.bristle_damping", ["friction.bristle_damping"], found)
+    assert missing_excitation("friction.viscous", ["friction.viscous"], found) is None
+    assert missing_excitation("load.force[run 1]", ["load.force[run 1]"], found) is None
+    assert missing_excitation("valve.leak", ["valve.leak"], found) is None
+    bristle = missing_excitation("friction.bristle_damping", ["friction.bristle_damping"], found)
     assert bristle is not None
     assert bristle[0].startswith("the motion never reverses")
-    assert missing("load.mass", ["load.mass"], found) is not None
+    assert missing_excitation("load.mass", ["load.mass"], found) is not None
 
 
 def test_states_stand_in_for_a_speed_that_is_not_logged() -> None:
     log = Experiment(Trajectory(T, {"position": T}), name="log")
-    assert motion([log], {}, VALUES, VALUES) is None
-    found = motion([log], {"log": Trajectory(T, {"speed": np.full(T.size, -0.1)})}, VALUES, VALUES)
+    assert summarise_motion([log], {}, VALUES, VALUES) is None
+    found = summarise_motion([log], {"log": Trajectory(T, {"speed": np.full(T.size, -0.1)})}, VALUES, VALUES)
     assert found is not None
     assert found.forward == 0
-    assert missing("friction.viscous", ["friction.viscous", "friction.coulomb"], None) is None
+    assert missing_excitation("friction.viscous", ["friction.viscous", "friction.coulomb"], None) is None
 
 
 def test_the_remedy_suits_the_pair() -> None:

@@ -12,9 +12,10 @@ from pneuopt.identification.identify import IdentificationResult, identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.trajectories import Trajectory
 
 TIME = np.arange(0, 1.5, 1e-3)
 SWING = 60 * np.sin(2 * np.pi * 2 * TIME) + 40 * np.sin(2 * np.pi * 5 * TIME)
@@ -44,8 +45,8 @@ def test_what_a_rich_log_tells_is_foreseen() -> None:
     system = ForceDrive(Coulomb()).system()
     verdict, result = identifiability(system, [log], free), identify(system, [log], free)
     assert str(verdict) == str(result.verdict) == "the logs tell every free parameter"
-    assert verdict.untold == ()
-    assert verdict.together == ()
+    assert verdict.unidentifiable == ()
+    assert verdict.indistinguishable == ()
     ratio = verdict.table["stderr"] / result.estimates["stderr"]
     assert ratio.between(0.8, 1.25).all(), ratio
     assert (verdict.table["inflation"] >= 1).all()
@@ -58,7 +59,7 @@ def test_offset_and_coulomb_asymmetry_only_count_together() -> None:
     free = ("load.mass", "load.force", "friction.coulomb", "friction.viscous", "friction.coulomb_asymmetry")
     sharp = truth.with_values({"friction.smoothing": 1e-4, "friction.asymmetry_width": 1e-4})
     verdict = identifiability(system, [log], sharp.freed(*free))
-    assert verdict.together == (("load.force", "friction.coulomb_asymmetry"),)
+    assert verdict.indistinguishable == (("load.force", "friction.coulomb_asymmetry"),)
     assert "load.force and friction.coulomb_asymmetry only count together" in str(verdict)
     assert "turn the axis round" in str(verdict)
 
@@ -68,13 +69,13 @@ def test_speeds_that_hardly_differ_refuse_slope_and_curve() -> None:
     rig = MotionDrive(Stribeck(), chamber=False)
     free = rig.parameters.freed("friction.coulomb", "friction.static", "friction.stribeck_velocity", "friction.viscous")
     poor = identifiability(rig.system(), [rubbed([0.005, -0.005, 0.01, -0.01])], free)
-    assert {"friction.static", "friction.stribeck_velocity", "friction.viscous"} <= set(poor.untold)
+    assert {"friction.static", "friction.stribeck_velocity", "friction.viscous"} <= set(poor.unidentifiable)
     assert "nearly all speeds lie between 0.005 and 0.01 m/s" in str(poor)
     assert "log speeds from 0.005 to beyond 0.05 m/s" in str(poor)
     rich = identifiability(rig.system(), [rubbed([0.001, -0.002, 0.01, -0.02, 0.1, -0.2])], free)
-    assert "friction.viscous" not in rich.untold
+    assert "friction.viscous" not in rich.unidentifiable
     alone = rig.parameters.freed("friction.viscous")
-    assert identifiability(rig.system(), [rubbed([0.005, -0.01])], alone).untold == ()
+    assert identifiability(rig.system(), [rubbed([0.005, -0.01])], alone).unidentifiable == ()
 
 
 def test_without_reversals_bristles_are_refused_and_never_a_number() -> None:
@@ -84,14 +85,14 @@ def test_without_reversals_bristles_are_refused_and_never_a_number() -> None:
     system = ForceDrive(LuGre()).system()
     verdict = identifiability(system, [late], free)
     bristles = {"friction.bristle_stiffness", "friction.bristle_damping"}
-    assert bristles <= set(verdict.untold)
+    assert bristles <= set(verdict.unidentifiable)
     assert "the motion never reverses, so that the bristles are hardly seen; log presliding" in str(verdict)
     result = identify(system, [late], free)
     rows = result.estimates.loc[sorted(bristles)]
     assert np.isnan(rows[["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
     assert (rows["note"] == "not told").all()
     assert result.verdict is not None
-    assert "the motion never reverses" in result.verdict.worded()["reasons"]["friction.bristle_stiffness"]
+    assert "the motion never reverses" in result.verdict.to_dict()["reasons"]["friction.bristle_stiffness"]
 
 
 def test_a_mass_that_hardly_accelerates_is_refused() -> None:
@@ -103,7 +104,7 @@ def test_a_mass_that_hardly_accelerates_is_refused() -> None:
     log = Experiment(Trajectory(t, channels), {"position": 1e-5, "speed": 1e-4})
     free = ForceDrive(Coulomb()).parameters.with_values({"load.mass": 1.0}).freed("load.mass", "friction.coulomb")
     verdict = identifiability(ForceDrive(Coulomb()).system(), [log], free)
-    assert "load.mass" in verdict.untold
+    assert "load.mass" in verdict.unidentifiable
     assert "weigh the load and fix its mass" in str(verdict)
 
 
@@ -115,7 +116,7 @@ def test_a_parameter_without_effect_is_named() -> None:
     rig = MotionDrive(Stribeck(), chamber=False)
     fast = rubbed([0.3, -0.3, 0.5, -0.5])
     verdict = identifiability(rig.system(), [fast], rig.parameters.freed("friction.coulomb", "friction.static"))
-    assert "friction.static" in verdict.untold
+    assert "friction.static" in verdict.unidentifiable
 
 
 def test_a_failure_names_the_worst_place() -> None:

@@ -10,16 +10,17 @@ import pytest
 from scipy.stats import binom
 
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
-from pneuopt.dynamics.system import Symbols, System, define, discretise, names, vector
+from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector
 from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.status import Code
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.solution import Code
 
 TRUTH = {
     "load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0, "friction.static": 42.0,
@@ -35,7 +36,7 @@ def generated(
     """A noisy log from rest, by 40 steps of RK4 a sample; never the estimator's own steps."""
     sampled, rng = discretise(system), np.random.default_rng(seed)
     known = {n: v for n, v in truth.items() if n in system.parameters}
-    p = vector(system.parameters, system.parameters.with_values(known))
+    p = parameter_vector(system.parameters, system.parameters.with_values(known))
     u, h = np.column_stack(list(inputs.values())), np.append(np.diff(t), t[-1] - t[-2])
     x0 = np.zeros((1, len(system.states)))
     y = Rollout(Pieces(sampled.step)).run(x0, u[None], p, t[None], h[None], substeps=40).y[0]
@@ -231,7 +232,7 @@ def doubled() -> System:
         return rates, {"position": x["position"], "speed": x["speed"]}
 
     parameters = base.parameters | ParameterSet({"twin": Parameter(0.0, "N*s/m")})
-    return define(base.states, base.inputs, base.outputs, parameters, rhs, base.start_finder)
+    return define(base.states, base.inputs, base.outputs, parameters, rhs, base.start_hook)
 
 
 def test_twins_never_get_an_interval_and_spoil_no_other() -> None:

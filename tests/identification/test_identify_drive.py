@@ -89,7 +89,7 @@ def test_dead_zone_and_critical_ratio_are_found_with_friction() -> None:
 
 def test_friction_from_the_force_of_the_logged_pressures_comes_near(log: po.Experiment) -> None:
     drive, truth = b32()
-    force = drive.push(log.trajectory, truth)
+    force = drive.air_force(log.trajectory, truth)
     p = numbers(truth)
     areas = np.pi / 4 * p["cylinder.bore"] ** 2 * np.array([1, 1 - (p["cylinder.rod"] / p["cylinder.bore"]) ** 2])
     gauge = log.trajectory.matrix(["pressure_a", "pressure_b"]) - p["ambient.pressure"]

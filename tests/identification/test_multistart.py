@@ -8,18 +8,18 @@ import pytest
 
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Start
-from pneuopt.dynamics.system import discretise, vector
+from pneuopt.dynamics.system import discretise, parameter_vector
 from pneuopt.identification import multistart as starting
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.identify import identify
-from pneuopt.identification.problem import Problem
+from pneuopt.identification.problem import EstimationProblem
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.solution import Code
 from pneuopt.shooting.transcription import Transcription
 
 VELOCITY = "friction.stribeck_velocity"
@@ -31,11 +31,11 @@ def free(friction: FrictionModel) -> ParameterSet:
     return own.freed(*(n for n in TRUTH if n in own))
 
 
-def posed(friction: FrictionModel) -> Problem:
+def posed(friction: FrictionModel) -> EstimationProblem:
     """Half a second of a pushed drive that turns, sticks and slips."""
     system, t = ForceDrive(friction).system(), np.arange(500) * 1e-3
     force = 60 * np.sin(2 * np.pi * 4 * t)
-    p = vector(
+    p = parameter_vector(
         system.parameters, system.parameters.with_values({n: v for n, v in TRUTH.items() if n in free(friction)})
     )
     run = Rollout(discretise(system).pieces).run(
@@ -43,14 +43,14 @@ def posed(friction: FrictionModel) -> Problem:
     )
     position = run.y[0, :, 0] + 1e-5 * np.random.default_rng(3).standard_normal(500)
     log = Experiment(Trajectory(t, {"force": force, "position": position}), {"position": 1e-5}, name="run")
-    return Problem(system, tuple(check_logs(system, [log], free(friction))), free(friction), LeastSquares())
+    return EstimationProblem(system, tuple(check_logs(system, [log], free(friction))), free(friction), LeastSquares())
 
 
 def test_the_first_start_costs_nothing_more() -> None:
     problem = posed(Stribeck())
-    first = next(starting.attempts(problem))
+    first = next(starting.multistart(problem))
     assert first.label == problem.candidates()[0].label
-    assert first.tried == (VELOCITY,)
+    assert first.trial_parameters == (VELOCITY,)
 
 
 def test_the_others_settle_with_their_guess_held_and_come_by_cost(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +64,7 @@ def test_the_others_settle_with_their_guess_held_and_come_by_cost(monkeypatch: p
     monkeypatch.setattr(starting, "solve_least_squares", spied)
     problem = posed(Stribeck())
     candidates = problem.candidates()
-    _, *settled = starting.attempts(problem)
+    _, *settled = starting.multistart(problem)
     order = [candidates[i].parameters[VELOCITY] for i in np.argsort(costs)]
     assert [s.parameters[VELOCITY] for s in settled] == order
     assert all(s.label.endswith("settled") and s.states["run"].names == ("position", "speed") for s in settled)
@@ -72,11 +72,11 @@ def test_the_others_settle_with_their_guess_held_and_come_by_cost(monkeypatch: p
 
 
 def test_without_guesses_the_candidates_are_tried_as_they_are() -> None:
-    assert [s.label for s in starting.attempts(posed(Coulomb()))] == ["equation error"]
+    assert [s.label for s in starting.multistart(posed(Coulomb()))] == ["equation error"]
 
 
 def test_an_interruption_keeps_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(problem: Problem, _confirms: Callable[[], bool]) -> Iterator[Start]:
+    def interrupted(problem: EstimationProblem, _confirms: Callable[[], bool]) -> Iterator[Start]:
         wrong = problem.candidates()[0]
         yield Start(wrong.states, {**wrong.parameters, "friction.coulomb": 3.0})
         raise KeyboardInterrupt
@@ -100,7 +100,7 @@ def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.M
         if armed:
             raise KeyboardInterrupt
 
-    def two(problem: Problem, _confirms: Callable[[], bool]) -> Iterator[Start]:
+    def two(problem: EstimationProblem, _confirms: Callable[[], bool]) -> Iterator[Start]:
         good = problem.candidates()[0]
         yield good
         armed.append(True)

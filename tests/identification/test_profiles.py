@@ -67,7 +67,7 @@ def test_a_weakly_told_stribeck_velocity_has_unequal_sides() -> None:
     assert found.low < 0.025 < found.high
     below, above = math.log(found.estimate / found.low), math.log(found.high / found.estimate)
     assert max(below, above) > 1.15 * min(below, above)
-    assert "m/s to" in found.told
+    assert "m/s to" in found.sentence
     wider = profile(system, [log], result, "friction.stribeck_velocity", level=0.99)
     assert wider.low < found.low < found.high < wider.high
 

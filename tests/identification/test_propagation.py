@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from pneuopt.identification.identify import identify
-from pneuopt.identification.propagation import Values, derived, propagated
+from pneuopt.identification.propagation import ParameterValues, propagate_deviations, propagate_error
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import Stribeck
@@ -23,11 +23,11 @@ def log(seed: int) -> Experiment:
     return Experiment(Trajectory(np.arange(300) * 1e-2, {"speed": speed, "force": force}), {"force": 0.5}, name="map")
 
 
-def ratio(p: Values) -> float:
+def ratio(p: ParameterValues) -> float:
     return p["friction.static"] / p["friction.coulomb"]
 
 
-def slow(p: Values) -> float:
+def slow(p: ParameterValues) -> float:
     """Friction at 10 mm/s [N]."""
     rise = p["friction.static"] - p["friction.coulomb"]
     g = p["friction.coulomb"] + rise * math.exp(-((0.01 / p["friction.stribeck_velocity"]) ** 2))
@@ -39,7 +39,7 @@ def test_figures_made_of_estimates_spread_as_they_say() -> None:
     free = KNOWN.freed("friction.coulomb", "friction.static", "friction.stribeck_velocity", "friction.viscous")
     fits = [identify(RIG.system(), [log(seed)], free) for seed in range(40)]
     for function, truth in ((ratio, 1.4), (slow, 30 + 12 * math.exp(-0.16) + 0.6)):
-        found = [derived(fit, function) for fit in fits]
+        found = [propagate_error(fit, function) for fit in fits]
         inside = sum(d.ci_low <= truth <= d.ci_high for d in found)
         assert inside >= 34
         drawn, stated = np.std([d.value for d in found]), np.mean([d.stderr for d in found])
@@ -49,14 +49,14 @@ def test_figures_made_of_estimates_spread_as_they_say() -> None:
 
 def test_it_is_the_delta_method() -> None:
     fit = identify(RIG.system(), [log(0)], KNOWN.freed("friction.coulomb", "friction.static"))
-    found, C = derived(fit, ratio), fit.covariance.to_numpy()
+    found, C = propagate_error(fit, ratio), fit.covariance.to_numpy()
     s, c = (fit.estimates["value"][n] for n in ("friction.static", "friction.coulomb"))
     order = list(fit.covariance.index)
     g = np.zeros(2)
     g[order.index("friction.static")], g[order.index("friction.coulomb")] = 1 / c, -s / c**2
     assert found.value == pytest.approx(s / c)
     assert found.stderr == pytest.approx(math.sqrt(g @ C @ g), rel=1e-5)
-    values, spread = propagated(fit, lambda p: [ratio(p), 7.0])
+    values, spread = propagate_deviations(fit, lambda p: [ratio(p), 7.0])
     assert values.tolist() == [found.value, 7.0]
     assert spread.tolist() == [found.stderr, 0.0]
 
@@ -67,5 +67,5 @@ def test_what_hangs_on_a_parameter_without_an_interval_has_none() -> None:
     blind.loc["friction.static"] = math.nan
     blind["friction.static"] = math.nan
     object.__setattr__(fit, "covariance", blind)
-    assert math.isnan(derived(fit, ratio).stderr)
-    assert derived(fit, lambda p: 2 * p["friction.coulomb"]).stderr > 0
+    assert math.isnan(propagate_error(fit, ratio).stderr)
+    assert propagate_error(fit, lambda p: 2 * p["friction.coulomb"]).stderr > 0

@@ -8,9 +8,10 @@ from pneuopt.identification.select_model import ModelSelection, select_model
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import FrictionModel, friction_ladder
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.trajectories import Trajectory
 
 FREE = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity", "friction.*_asymmetry")
 PAIR = ("friction.coulomb", "friction.viscous", "friction.*_asymmetry")

@@ -6,7 +6,8 @@ import pytest
 
 from pneuopt.logs.doctor import examine
 from pneuopt.logs.experiments import Experiment, read_log
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.trajectories import Trajectory
 
 DATA = Path(__file__).parents[2] / "data"
 T = np.arange(4000) * 1e-3

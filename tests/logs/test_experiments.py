@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pneuopt.logs.experiments import CHANNELS, Experiment, differentiate, read_log, resample, split
 from pneuopt.quantities.errors import InputError, LogError, UnitError, UnknownNameError
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import ATMOSPHERE, scale_of
+from pneuopt.quantities.units import ATMOSPHERE, si_conversion
 
 HEADER = "time [s],position [mm]\n"
 BODY = "\n".join(f"{k / 10},{k}" for k in range(12)) + "\n"
@@ -264,7 +264,7 @@ def test_a_written_log_reads_back(
     rows = [f"{k / 8!r}{delimiter}{'' if v is None else repr(v)}".replace(".", decimal) for k, v in enumerate(raw)]
     text = f"time [s]{delimiter}{channel} [{unit}]\n" + "\n".join(rows) + "\n"
     run = read_log(written(tmp_path_factory.mktemp("log"), text))
-    factor, offset = scale_of(unit, CHANNELS[channel])
+    factor, offset = si_conversion(unit, CHANNELS[channel])
     expected = [np.nan if v is None else factor * v + offset for v in raw]
     np.testing.assert_allclose(run.trajectory[channel], expected, rtol=1e-14, equal_nan=True)
 

@@ -3,7 +3,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import signal
 
 from pneuopt.control.dither import Dither
@@ -11,17 +10,17 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import Linearisation, vector
+from pneuopt.dynamics.system import Linearisation, parameter_vector
 from pneuopt.models import catalog
 from pneuopt.models.friction import Viscous
 from pneuopt.models.paper2015 import OperatingPoint, second_order
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import CRITICAL_RATIO, IsentropicNozzle, Iso6358, Smoothing
 from pneuopt.models.pneumatic.valve import Spool
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 K_S = 20.0  # [V s/m] transducer
 SPEED, AIR = 1, slice(2, 4)  # places in the state of a drive without spool lag
 LOWER, UPPER = -5.0, 5.0
@@ -275,7 +274,7 @@ def b32_by_hand(x: Array, u: float) -> Array:
 
 def test_b32_is_its_text() -> None:
     drive, p = catalog.b32()
-    rng, values = np.random.default_rng(3), vector(drive.parameters, p)
+    rng, values = np.random.default_rng(3), parameter_vector(drive.parameters, p)
     scale = np.array([1.0, 100.0, 1e7, 1e7, 100.0])
     for _ in range(300):
         x = rng.uniform([0.0, -0.5, 1.05e5, 1.05e5, -0.6], [0.2, 0.5, 6.9e5, 6.9e5, 0.6])
@@ -292,7 +291,7 @@ def test_t32_starts_as_its_text_says() -> None:
     assert rest.states["pressure_a"] == pytest.approx(1e5 + A_b / A_a * 2.5e5, rel=1e-12)
     assert rest.states["position"] == pytest.approx(0.05)
     x = {**rest.states, "valve.spool": 0.2, "valve.spool_rate": 3.0, "speed": 0.1, "friction.bristle": 1e-4}
-    rates = np.asarray(drive.system().ode(0, list(x.values()), [2.0], vector(drive.parameters, p))[0]).ravel()
+    rates = np.asarray(drive.system().ode(0, list(x.values()), [2.0], parameter_vector(drive.parameters, p))[0]).ravel()
     w = 2 * np.pi * 80
     assert rates[5] == pytest.approx(w**2 * (2.0 / 5 - 0.2) - 1.6 * w * 3.0)
     z_rate = 0.1 - 1e5 * 0.1 * 1e-4 / (40 + 30 * np.exp(-25.0))

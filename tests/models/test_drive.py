@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import System, vector
+from pneuopt.dynamics.system import System, parameter_vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.load import Load
@@ -29,7 +29,7 @@ def test_derivatives_are_the_central_differences(name: str) -> None:
     sizes = [system.ode.size1_in(i) for i in range(4)]
     symbols = [ca.SX.sym(f"i{i}", n) for i, n in enumerate(sizes)]
     jacobian = ca.Function("J", symbols, [ca.jacobian(ca.vertcat(*system.ode(*symbols)), ca.vertcat(*symbols[1:]))])
-    p = vector(system.parameters, system.parameters)
+    p = parameter_vector(system.parameters, system.parameters)
     nominal = [np.array([q.nominal for q in group]) for group in (system.states, system.inputs)]
     for _ in range(4):
         x, u = (0.3 * n * rng.standard_normal(len(n)) for n in nominal)
@@ -74,7 +74,7 @@ def test_newtons_law() -> None:
     p = with_values(
         system, load__mass=2.0, load__force=3.0, load__stiffness=100.0, load__rest_position=0.1, friction__viscous=5.0
     )
-    xdot, y = system.ode(0, [0.3, 0.4], [50.0], vector(system.parameters, p))
+    xdot, y = system.ode(0, [0.3, 0.4], [50.0], parameter_vector(system.parameters, p))
     assert np.array(xdot).ravel().tolist() == pytest.approx([0.4, (50 - 3 - 100 * 0.2 - 5 * 0.4) / 2])
     assert np.array(y).ravel().tolist() == pytest.approx([0.3, 0.4])
 
@@ -121,7 +121,8 @@ def test_gauge_pressure_is_what_raises_friction() -> None:
     p = with_values(system, friction__coulomb_pressure_a=2e-5, ambient__pressure=1e5)
     x = [0.0, 0.5]
     at_ambient, above = (
-        np.array(system.ode(0, x, [0.0, pa, 1e5], vector(system.parameters, p))[0]).ravel()[1] for pa in (1e5, 5e5)
+        np.array(system.ode(0, x, [0.0, pa, 1e5], parameter_vector(system.parameters, p))[0]).ravel()[1]
+        for pa in (1e5, 5e5)
     )
     assert at_ambient - above == pytest.approx(2e-5 * 4e5 / p.value("load.mass"))
 
@@ -132,7 +133,7 @@ def test_a_rig_measures_pressure_force_friction_and_offset() -> None:
         system, rig__area=5e-4, rig__area_bias=0.01, rig__force_offset=2.0, ambient__pressure=1e5,
         friction__coulomb=4.0, friction__viscous=10.0, friction__coulomb_pressure_a=1e-5,
     )  # fmt: skip
-    y = float(system.ode(0, [], [0.1, 4e5], vector(system.parameters, p))[1])
+    y = float(system.ode(0, [], [0.1, 4e5], parameter_vector(system.parameters, p))[1])
     assert y == pytest.approx(5e-4 * 1.01 * 3e5 + (4 + 3 + 1) + 2)
     assert system.states == ()
 

@@ -17,8 +17,8 @@ from pneuopt.models.friction import (
     Viscous,
     stribeck_curve,
 )
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
-from pneuopt.quantities.trajectories import Array
 
 STATIC: dict[str, FrictionModel] = {"viscous": Viscous(), "coulomb": Coulomb(), "stribeck": Stribeck()}
 MODELS: dict[str, FrictionModel] = {

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names, vector
+from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names, parameter_vector
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent
-from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder, delayed
+from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder, delay_inputs
 from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
@@ -92,7 +92,7 @@ def test_derivatives_agree_with_finite_differences(plant: Plant) -> None:
     rng = np.random.default_rng(3)
     scale = np.array([1e-4 if n == "friction.bristle" else 0.05 for n in names(system.states)])
     x, u = rng.normal(size=len(scale)) * scale, np.array([0.7])
-    p = vector(system.parameters, system.parameters)
+    p = parameter_vector(system.parameters, system.parameters)
     z = [ca.SX.sym(k, n) for k, n in (("x", len(x)), ("u", 1), ("p", len(p)))]
     rate = system.ode(0, *z)[0]
     jacobian = ca.Function("jacobian", z, [ca.jacobian(rate, ca.vertcat(*z))])
@@ -136,7 +136,7 @@ def test_without_friction_force_the_plant_is_linear() -> None:
 
 
 def rolled(system: DiscreteSystem, u: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
-    p = vector(system.parameters, system.parameters)
+    p = parameter_vector(system.parameters, system.parameters)
     x, ys, xs = np.zeros(len(system.states)), [], []
     for k, row in enumerate(u):
         if system.update is not None:
@@ -153,7 +153,7 @@ def test_a_sampled_delay_shifts_by_whole_samples(samples: int) -> None:
     rng = np.random.default_rng(1)
     u = rng.normal(size=(40, 1))
     plant = discretise(FirstOrder().system())
-    prompt, late = rolled(plant, u, 0.01)[0], rolled(delayed(plant, samples), u, 0.01)[0]
+    prompt, late = rolled(plant, u, 0.01)[0], rolled(delay_inputs(plant, samples), u, 0.01)[0]
     assert late[samples:] == pytest.approx(prompt[:-samples], abs=1e-15)
     assert np.all(late[: samples + 1] == 0.0)
 
@@ -161,7 +161,7 @@ def test_a_sampled_delay_shifts_by_whole_samples(samples: int) -> None:
 def test_a_sampled_delay_reaches_the_controllers_update() -> None:
     loop = ClosedLoop(FirstOrder().system(), PID(sample_time=0.01)).discrete(2)
     u = np.sin(np.arange(30.0))[:, None]
-    prompt, late = rolled(loop, u, 0.01)[0], rolled(delayed(loop, 3, ("reference",)), u, 0.01)[0]
+    prompt, late = rolled(loop, u, 0.01)[0], rolled(delay_inputs(loop, 3, ("reference",)), u, 0.01)[0]
     assert late[3:] == pytest.approx(prompt[:-3], abs=1e-15)
 
 
@@ -171,9 +171,9 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ModelError, match="PressureDependent needs pressures"):
         SecondOrder(friction=PressureDependent(Coulomb()))
     with pytest.raises(ModelError, match="at least 1 sample, got 0"):
-        delayed(discretise(FirstOrder().system()), 0)
+        delay_inputs(discretise(FirstOrder().system()), 0)
     with pytest.raises(UnknownNameError, match="did you mean 'valve_voltage'"):
-        delayed(discretise(FirstOrder().system()), 1, ("valve_volt",))
+        delay_inputs(discretise(FirstOrder().system()), 1, ("valve_volt",))
     with pytest.raises(InputError, match=r"plant.dead_time.*outside its bounds"):
         FirstOrder(pade_order=1).system().parameters.with_values({"plant.dead_time": 0.0})
 

@@ -95,8 +95,8 @@ def test_lag_and_delay_settle_on_the_truth() -> None:
 def test_a_drive_behind_its_sensors_still_rests() -> None:
     drive, parameters = b32()
     system = with_sensors(drive.system(), offset=["pressure_a"], delay=["position"], lag=["pressure_b"])
-    assert system.rest_finder is not None
-    rest = system.rest_finder(parameters, {"position": 0.05})
+    assert system.rest_hook is not None
+    rest = system.rest_hook(parameters, {"position": 0.05})
     x, u = (
         np.array([part.get(n, 0.0) for n in names(q)])
         for part, q in zip(rest, (system.states, system.inputs), strict=True)

@@ -10,7 +10,7 @@ import pytest
 from benchmark_tuning import Clock, Run, Study
 from numpy.typing import NDArray
 
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 
 
 def test_a_run_that_never_settles_is_the_worst() -> None:
@@ -41,7 +41,7 @@ def test_differential_evolution_uses_its_time_though_its_members_are_alike() -> 
                 raise StopIteration
             return 1.0 + 1e-6 * points[:, 0]
 
-    benchmark_tuning.evolve(Flat(), span(*benchmark_tuning.posed(5)), 0, {})  # type: ignore[arg-type]
+    benchmark_tuning.evolve(Flat(), search_space(*benchmark_tuning.posed(5)), 0, {})  # type: ignore[arg-type]
     assert calls == 9
 
 

@@ -8,7 +8,7 @@ from pneuopt.quantities.errors import (
     PneuoptError,
     UnitError,
     UnknownNameError,
-    check_known,
+    check_names,
     require,
 )
 
@@ -26,14 +26,14 @@ def test_a_solver_failure_is_no_input_error() -> None:
 
 def test_an_unknown_name_offers_the_nearest() -> None:
     with pytest.raises(UnknownNameError, match=r"run_01: unknown channel 'postion'; did you mean 'position'\?"):
-        check_known("channel", ["speed", "postion"], {"speed", "position"}, "run_01")
+        check_names("channel", ["speed", "postion"], {"speed", "position"}, "run_01")
 
 
 def test_without_a_near_name_all_are_listed() -> None:
     with pytest.raises(UnknownNameError, match="unknown channel 'xyz'; known: position, speed"):
-        check_known("channel", ["xyz"], ["speed", "position"])
+        check_names("channel", ["xyz"], ["speed", "position"])
     with pytest.raises(UnknownNameError, match="known: none"):
-        check_known("channel", ["xyz"], [])
+        check_names("channel", ["xyz"], [])
 
 
 def test_convergence_error_carries_the_solution() -> None:

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.output import check_outputs, write_json, write_records, write_text
+from pneuopt.quantities.output import check_output_paths, write_json, write_records, write_text
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -49,12 +49,12 @@ def test_a_document_is_plain_json(tmp_path: Path) -> None:
 def test_outputs_are_refused_before_the_work(tmp_path: Path) -> None:
     given = tmp_path / "drive.toml"
     given.touch()
-    check_outputs([tmp_path / "fit.toml", None, tmp_path / "fit.json"], [given])
+    check_output_paths([tmp_path / "fit.toml", None, tmp_path / "fit.json"], [given])
     with pytest.raises(InputError, match=r"drive\.toml: is an input of this command"):
-        check_outputs([tmp_path / "." / "drive.toml"], [given])
+        check_output_paths([tmp_path / "." / "drive.toml"], [given])
     with pytest.raises(InputError, match="named for two outputs"):
-        check_outputs([tmp_path / "a", tmp_path / "a"], [given])
+        check_output_paths([tmp_path / "a", tmp_path / "a"], [given])
     with pytest.raises(InputError, match="the folder does not exist"):
-        check_outputs([tmp_path / "none" / "a"], [given])
+        check_output_paths([tmp_path / "none" / "a"], [given])
     with pytest.raises(InputError, match="is a folder"):
-        check_outputs([tmp_path], [given])
+        check_output_paths([tmp_path], [given])

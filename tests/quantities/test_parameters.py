@@ -95,4 +95,4 @@ def test_it_travels_between_processes() -> None:
 @given(st.lists(st.sampled_from(list(RIG)), unique=True))
 def test_selecting_keeps_the_order_asked_for(names: list[str]) -> None:
     assert list(RIG.select(names)) == names
-    assert list(RIG.select(names).prefixed("rig")) == [f"rig.{n}" for n in names]
+    assert list(RIG.select(names).with_prefix("rig")) == [f"rig.{n}" for n in names]

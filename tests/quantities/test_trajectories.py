@@ -54,7 +54,7 @@ def test_copies_with_other_columns_rows_and_grids() -> None:
     assert RUN.with_columns({"force": [0, 0, 0]})["force"].sum() == 0
     assert RUN.select(["force"]).names == ("force",)
     assert RUN.rows(1, 3).t.tolist() == [1.0, 3.0]
-    assert RUN.at([-1.0, 0.5, 2.0, 9.0])["force"].tolist() == [1.0, 1.5, 2.5, 3.0]
+    assert RUN.interpolate([-1.0, 0.5, 2.0, 9.0])["force"].tolist() == [1.0, 1.5, 2.5, 3.0]
     assert RUN["force"].tolist() == [1.0, 2.0, 3.0]
 
 
@@ -70,4 +70,4 @@ def test_it_tabulates_and_travels_between_processes() -> None:
 def test_interpolating_onto_its_own_grid_changes_nothing(steps: list[float]) -> None:
     t = np.cumsum(steps)
     run = Trajectory(t, {"position": np.sin(t)})
-    assert_array_equal(run.at(t)["position"], run["position"])
+    assert_array_equal(run.interpolate(t)["position"], run["position"])

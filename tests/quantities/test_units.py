@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pneuopt.quantities.errors import UnitError
-from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, scale_of, write_value
+from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, si_conversion, write_value
 
 
 @pytest.mark.parametrize(
@@ -115,11 +115,11 @@ def test_own_dimension() -> None:
 
 
 def test_scale_of_a_column() -> None:
-    assert scale_of("mm", "m") == (1e-3, 0.0)
-    assert scale_of("kPa(g)", "Pa(a)") == (1e3, ATMOSPHERE)
-    assert scale_of("degC", "K") == (1.0, 273.15)
+    assert si_conversion("mm", "m") == (1e-3, 0.0)
+    assert si_conversion("kPa(g)", "Pa(a)") == (1e3, ATMOSPHERE)
+    assert si_conversion("degC", "K") == (1.0, 273.15)
     with pytest.raises(UnitError, match=r"log\.csv: unknown unit 'mmm'"):
-        scale_of("mmm", "m", where="log.csv")
+        si_conversion("mmm", "m", where="log.csv")
 
 
 UNITS = ["m", "s", "kg", "N", "N*s/m", "V*s/m", "m^3/(s*Pa)", "N/Pa", "1", "1/s", "Hz", "rad/s", "m/s", "Pa", "V"]

@@ -4,11 +4,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from pneuopt.quantities.trajectories import Array
-from pneuopt.shooting.arrow import STATE_FLOOR, Arrow, indistinct, scaled_inverse
+from pneuopt.quantities.arrays import Array
+from pneuopt.shooting.arrow import (
+    STATE_REGULARISATION,
+    ArrowEquations,
+    indistinguishable_parameters,
+    positive_definite_inverse,
+)
 
 
-def random_problem(m: int, n: int, k: int, seed: int, spread: float = 1.0) -> tuple[Arrow, Array, Array]:
+def random_problem(m: int, n: int, k: int, seed: int, spread: float = 1.0) -> tuple[ArrowEquations, Array, Array]:
     """Normal equations of random residuals, each of one node or of two neighbours, and of the parameters; and dense."""
     rng = np.random.default_rng(seed)
     rows = []
@@ -27,7 +32,7 @@ def random_problem(m: int, n: int, k: int, seed: int, spread: float = 1.0) -> tu
     here = np.arange(m)
     coupling = np.zeros((m, n, n))
     coupling[:-1] = blocks[here[:-1], :, here[1:], :]
-    arrow = Arrow(
+    arrow = ArrowEquations(
         blocks[here, :, here, :],
         coupling,
         H[: m * n, m * n :].reshape(m, n, k),
@@ -51,7 +56,7 @@ def test_a_step_is_the_dense_solution(m: int, n: int, k: int, seed: int, damping
     step = reduced.step(keep)
     assert step is not None
     moving = np.concatenate([np.ones(m * n, dtype=bool), keep])
-    damped = H + damping * np.diag(np.diag(H)) + STATE_FLOOR * np.diag(np.arange(len(H)) < m * n)
+    damped = H + damping * np.diag(np.diag(H)) + STATE_REGULARISATION * np.diag(np.arange(len(H)) < m * n)
     expected = np.zeros(len(H))
     expected[moving] = -np.linalg.solve(damped[np.ix_(moving, moving)], g[moving])
     found = np.concatenate([step.nodes.ravel(), step.parameters])
@@ -66,11 +71,13 @@ def test_the_schur_complement_is_what_the_parameters_alone_know(m: int, n: int, 
     arrow, H, _ = random_problem(m, n, k, seed)
     reduced = arrow.eliminate(0.0)
     assert reduced is not None
-    H = H + STATE_FLOOR * np.diag(np.arange(len(H)) < m * n)
+    H = H + STATE_REGULARISATION * np.diag(np.arange(len(H)) < m * n)
     dense = np.linalg.inv(H)[m * n :, m * n :]
-    assert indistinct(reduced.schur, arrow.corner).size == 0
-    assert_allclose(scaled_inverse(reduced.schur), dense, rtol=1e-6, atol=1e-9 * np.abs(dense).max())
-    assert_allclose(reduced.eliminated.reshape(m * n, k), np.linalg.solve(H[: m * n, : m * n], H[: m * n, m * n :]))
+    assert indistinguishable_parameters(reduced.schur, arrow.corner).size == 0
+    assert_allclose(positive_definite_inverse(reduced.schur), dense, rtol=1e-6, atol=1e-9 * np.abs(dense).max())
+    assert_allclose(
+        reduced.node_sensitivity.reshape(m * n, k), np.linalg.solve(H[: m * n, : m * n], H[: m * n, m * n :])
+    )
 
 
 def test_stiff_links_keep_their_digits() -> None:
@@ -98,23 +105,23 @@ def test_what_is_not_positive_definite_gives_no_step() -> None:
 def test_an_inverse_ignores_units_but_not_rank() -> None:
     units = np.outer(*2 * [np.array([1e-8, 1.0, 1e9])])
     matrix = np.array([[2.0, 0.5, 0.1], [0.5, 2.0, 0.3], [0.1, 0.3, 2.0]])
-    assert_allclose(scaled_inverse(matrix * units) * units, np.linalg.inv(matrix), rtol=1e-12)
-    assert scaled_inverse(np.zeros((0, 0))).shape == (0, 0)
+    assert_allclose(positive_definite_inverse(matrix * units) * units, np.linalg.inv(matrix), rtol=1e-12)
+    assert positive_definite_inverse(np.zeros((0, 0))).shape == (0, 0)
 
 
 @pytest.mark.parametrize("units", [1.0, 1e6])
 def test_the_indistinct_are_named(units: float) -> None:
     J = np.random.default_rng(0).standard_normal((20, 4)) * np.array([1.0, units, 1.0, 1.0])
-    assert indistinct(J.T @ J, J.T @ J).tolist() == []
+    assert indistinguishable_parameters(J.T @ J, J.T @ J).tolist() == []
     J[:, 3] = 2 * J[:, 1]
-    assert indistinct(J.T @ J, J.T @ J).tolist() == [1, 3]
+    assert indistinguishable_parameters(J.T @ J, J.T @ J).tolist() == [1, 3]
 
 
 def test_what_rounding_has_eaten_is_indistinct() -> None:
     """Of a corner of 1e14, a Schur complement of 1e-2 is noise; and a weak direction of 1e-7 is, under 1e8."""
-    assert indistinct(np.diag([1.0, 1e-2]), np.diag([1.0, 1e14])).tolist() == [1]
+    assert indistinguishable_parameters(np.diag([1.0, 1e-2]), np.diag([1.0, 1e14])).tolist() == [1]
     weak = np.array([[1.0, 1 - 1e-7], [1 - 1e-7, 1.0]])
-    assert indistinct(weak, np.eye(2)).tolist() == []
-    assert indistinct(weak, 1e8 * np.eye(2)).tolist() == [0, 1]
-    assert indistinct(np.full((2, 2), np.nan), np.eye(2)).tolist() == [0, 1]
-    assert indistinct(np.zeros((0, 0)), np.zeros((0, 0))).tolist() == []
+    assert indistinguishable_parameters(weak, np.eye(2)).tolist() == []
+    assert indistinguishable_parameters(weak, 1e8 * np.eye(2)).tolist() == [0, 1]
+    assert indistinguishable_parameters(np.full((2, 2), np.nan), np.eye(2)).tolist() == [0, 1]
+    assert indistinguishable_parameters(np.zeros((0, 0)), np.zeros((0, 0))).tolist() == []

@@ -8,12 +8,12 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.trajectories import Array
-from pneuopt.shooting.full_space import FullSpace, prepare, solve_from, solve_full_space
-from pneuopt.shooting.solution import Code
-from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, every
+from pneuopt.quantities.status import Code
+from pneuopt.shooting.full_space import FullSpace, prepare_full_space, solve_from, solve_full_space
+from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, regular_nodes
 
 H = 0.02
 
@@ -50,7 +50,7 @@ def measured(n: int, bias: float, seed: int) -> tuple[Array, Array]:
 
 def phase(name: str, force: Array, nodes: int, **fields: object) -> Phase:
     n = len(force)
-    return Phase(name, H * np.arange(n), np.full(n, H), force[:, None], every(n, nodes), **fields)  # type: ignore[arg-type]
+    return Phase(name, H * np.arange(n), np.full(n, H), force[:, None], regular_nodes(n, nodes), **fields)  # type: ignore[arg-type]
 
 
 def two_logs(nodes: int = 7) -> Transcription:
@@ -146,8 +146,8 @@ def settling(band: float, gain: float = 4.0, least: float = 0.0) -> Transcriptio
     times = ParameterSet({"Ts": Parameter(1.0, "s", 0.01, 3.0, free=True), "rest": Parameter(1.0, "s")})
     grid, ones = np.arange(40) / 40, np.ones((40, 1))
     phases = (
-        Phase("transient", grid, np.full(40, 1 / 40), ones, every(40, 1), start=np.zeros(1), duration="Ts"),
-        Phase("settled", grid, np.full(40, 1 / 40), ones, every(40, 1), follows=True, duration="rest"),
+        Phase("transient", grid, np.full(40, 1 / 40), ones, regular_nodes(40, 1), start=np.zeros(1), duration="Ts"),
+        Phase("settled", grid, np.full(40, 1 / 40), ones, regular_nodes(40, 1), follows=True, duration="rest"),
     )
     t, x, u, p = (ca.SX.sym(k) for k in "txup")
     speed = ca.Function("speed", [t, x, u, p], [x])
@@ -172,7 +172,7 @@ def test_a_free_duration_gives_the_exact_settling_time(band: float) -> None:
 
 def test_a_prepared_problem_takes_other_values_of_fixed_parameters() -> None:
     problem = settling(0.02)
-    again = solve_from(prepare(problem), problem.parameters.with_values({"gain": 8.0}))
+    again = solve_from(prepare_full_space(problem), problem.parameters.with_values({"gain": 8.0}))
     assert again.parameters.value("Ts") == pytest.approx(math.log(50) / 8, rel=1e-5)
 
 
@@ -197,7 +197,7 @@ def test_nan_is_named_by_state_and_phase() -> None:
 
     states = [Quantity("position", "m"), Quantity("pressure", "Pa(a)")]
     system = discretise(define(states, [], states[1:], parameters, rhs))
-    run = Phase("run 7", np.arange(3.0), np.ones(3), np.zeros((3, 0)), every(3, 1), guess=np.zeros((3, 2)))
+    run = Phase("run 7", np.arange(3.0), np.ones(3), np.zeros((3, 0)), regular_nodes(3, 1), guess=np.zeros((3, 2)))
     status = solve_full_space(Transcription(system, parameters, (run,))).status
     assert status.code is Code.DIVERGED
     assert "state 'pressure' in phase 'run 7'" in status.message

@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, least_squares
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.trajectories import Array
+from pneuopt.quantities.status import Code
 from pneuopt.shooting.full_space import solve_full_space
 from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.solution import Code
-from pneuopt.shooting.transcription import Phase, Residuals, Transcription, every
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 H = 0.02
 NOISE, FINE_NOISE = 1e-3, 5e-6
@@ -65,7 +65,7 @@ def two_logs(seed: int = 0, nodes: int = 7, **toy: bool) -> Transcription:
         t: Array = H * np.arange(n, dtype=float)
         known = np.isfinite(y)
         guess = np.column_stack([np.interp(t, t[known], y[known]), np.zeros(n)])  # as without a start finder
-        phases.append(Phase(name, t, np.full(n, H), force[:, None], every(n, nodes), guess=guess))
+        phases.append(Phase(name, t, np.full(n, H), force[:, None], regular_nodes(n, nodes), guess=guess))
         residuals.append(Residuals(i, ("position",), y[:, None], np.array([NOISE])))
     biases = {f"bias[{n}]": Parameter(0.0, "N", -5, 5, free=True) for n in "ab"}
     return Transcription(system, system.parameters | ParameterSet(biases), tuple(phases), tuple(residuals))
@@ -336,32 +336,32 @@ def position(fit: Fit, name: str) -> int:
 def test_a_good_fit_is_silent_about_nothing() -> None:
     fit = solve_least_squares(two_logs())
     assert fit.solution.status.converged
-    assert fit.silent == ()
-    assert fit.borrowed is None
+    assert fit.unidentifiable == ()
+    assert fit.prior_covariance is None
 
 
 def test_what_is_not_felt_is_silent_and_held_it_adds_nothing() -> None:
     problem = two_logs(extra=True)
     problem = replace(problem, parameters=problem.parameters.fixed("factor").freed("idle"))
-    assert solve_least_squares(problem).silent == ("idle",)
+    assert solve_least_squares(problem).unidentifiable == ("idle",)
     fit = held(problem, "idle", 1.0)
     assert fit.solution.status.converged
-    assert fit.silent == ()
+    assert fit.unidentifiable == ()
     assert not fit.at_bound.any()
-    assert fit.borrowed is not None
-    assert_allclose(fit.borrowed, 0.0, atol=1e-20)
+    assert fit.prior_covariance is not None
+    assert_allclose(fit.prior_covariance, 0.0, atol=1e-20)
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])
 def test_of_two_that_only_count_together_one_is_silent_and_the_other_borrows_all(factor: float) -> None:
     problem = two_logs(extra=True)
-    assert set(solve_least_squares(problem).silent) < {"damping", "factor"}
+    assert set(solve_least_squares(problem).unidentifiable) < {"damping", "factor"}
     fit = held(problem, "factor", factor)
     assert fit.solution.status.converged
     assert fit.solution.parameters.value("damping") * factor == pytest.approx(TRUTH["damping"], rel=0.05)
-    assert fit.borrowed is not None
+    assert fit.prior_covariance is not None
     assert fit.covariance is not None
-    borrowed, own = np.diag(fit.borrowed), np.diag(fit.covariance)
+    borrowed, own = np.diag(fit.prior_covariance), np.diag(fit.covariance)
     at = position(fit, "damping")
     # damping times factor is known: ten times the factor, as many times less damping
     assert np.sqrt(borrowed[at]) == pytest.approx(10 * fit.solution.parameters.value("damping"), rel=1e-3)

@@ -8,12 +8,12 @@ from pneuopt.dynamics.system import System, discretise
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre
 from pneuopt.models.load import Load
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.trajectories import Array
 from pneuopt.shooting.equations import normal_equations
-from pneuopt.shooting.segments import Correction, Segments, segment, start_nodes, substeps_for, tightness
-from pneuopt.shooting.transcription import Phase, Residuals, Transcription, every
+from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, segment, stable_substeps, start_nodes
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 FREE = ("friction.coulomb", "load.mass")
 
@@ -22,7 +22,7 @@ def phase(name: str, n: int, **fields: object) -> Phase:
     rng = np.random.default_rng(n)
     t: Array = 1e-3 * np.arange(n, dtype=float)
     guess = 0.1 * rng.standard_normal((n, 2))
-    made = Phase(name, t, np.full(n, 1e-3), 30 * rng.standard_normal((n, 1)), every(n, 4), guess=guess)
+    made = Phase(name, t, np.full(n, 1e-3), 30 * rng.standard_normal((n, 1)), regular_nodes(n, 4), guess=guess)
     return replace(made, **fields)  # type: ignore[arg-type]
 
 
@@ -69,7 +69,7 @@ def test_each_segment_knows_its_parameters() -> None:
 
 def test_segments_from_one_trajectory_join_to_it() -> None:
     """From the states of one long run, the segments give that run again: gaps of zero, the same outputs."""
-    whole = segment(posed(phase("a", 21, nodes=every(21, 21))))
+    whole = segment(posed(phase("a", 21, nodes=regular_nodes(21, 21))))
     q = np.array([p.value for p in whole.transcription.parameters.values()])
     (run,) = whole.trajectories(whole.run(start_nodes(whole), q, 5, states=True))
     states = run.matrix(["position", "speed"])
@@ -121,8 +121,8 @@ def test_a_free_duration_is_refused() -> None:
 
 
 def test_kinematic_states_are_kept_tighter() -> None:
-    assert tightness(both(), 0.01).tolist() == [0.01, 1.0]
-    assert tightness(segment(posed(phase("a", 8), free=("load.force",))), 0.1).tolist() == [0.1, 1.0]
+    assert gap_scales(both(), 0.01).tolist() == [0.01, 1.0]
+    assert gap_scales(segment(posed(phase("a", 8), free=("load.force",))), 0.1).tolist() == [0.1, 1.0]
 
 
 @pytest.mark.parametrize("friction", [Coulomb(), LuGre()])
@@ -140,16 +140,16 @@ def test_substeps_follow_the_stiffness(friction: FrictionModel) -> None:
     else:
         fastest = 50.0 / p["friction.smoothing"]  # at rest
     q = np.array([p[name] for name in problem.parameters])
-    assert substeps_for(segments, start_nodes(segments), q) == pytest.approx(1e-3 * fastest / 1.4, abs=1.01)
+    assert stable_substeps(segments, start_nodes(segments), q) == pytest.approx(1e-3 * fastest / 1.4, abs=1.01)
 
 
 def test_a_static_map_needs_one_step_and_has_no_states() -> None:
     system = MotionDrive(Coulomb(), chamber=False).system()
-    made = Phase("a", np.arange(5.0), np.ones(5), np.ones((5, 1)), every(5, 2))
+    made = Phase("a", np.arange(5.0), np.ones(5), np.ones((5, 1)), regular_nodes(5, 2))
     problem = Transcription(discretise(system), system.parameters.freed("friction.coulomb"), (made,))
     segments = segment(problem)
-    assert substeps_for(segments, start_nodes(segments), np.zeros(len(problem.parameters))) == 1
-    assert tightness(segments, 0.01).shape == (0,)
+    assert stable_substeps(segments, start_nodes(segments), np.zeros(len(problem.parameters))) == 1
+    assert gap_scales(segments, 0.01).shape == (0,)
     assert segments.nominal.shape == (0,)
 
 
@@ -159,7 +159,7 @@ def test_a_correction_stands_for_finer_steps() -> None:
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     nodes, free = start_nodes(segments), len(segments.transcription.free)
     coarse, fine = (segments.run(nodes, q, k) for k in (2, 20))
-    correction = Correction(fine.y - coarse.y, fine.x_end - coarse.x_end, fine)
+    correction = IntegrationCorrection(fine.y - coarse.y, fine.x_end - coarse.x_end, fine)
     given = (segments, nodes, q, np.ones(free), np.full(2, 1e-3))
     corrected, exact = normal_equations(*given, 2, correction), normal_equations(*given, 20)
     assert corrected.cost == pytest.approx(exact.cost, rel=1e-9)

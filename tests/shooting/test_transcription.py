@@ -9,13 +9,15 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import ModelError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.shooting.transcription import Cost, Phase, Residuals, Transcription, Where, every, phases_of
+from pneuopt.shooting.transcription import Cost, Phase, Residuals, Transcription, Where, phases_of, regular_nodes
 
 DRIVE = ForceDrive(Coulomb()).system()
 
 
 def phase(name: str = "run", n: int = 10) -> Phase:
-    return Phase(name, np.linspace(0, 0.1 * n, n, endpoint=False), np.full(n, 0.1), np.zeros((n, 1)), every(n, 4))
+    return Phase(
+        name, np.linspace(0, 0.1 * n, n, endpoint=False), np.full(n, 0.1), np.zeros((n, 1)), regular_nodes(n, 4)
+    )
 
 
 def problem(*phases: Phase, parameters: ParameterSet = DRIVE.parameters, **fields: object) -> Transcription:
@@ -23,9 +25,9 @@ def problem(*phases: Phase, parameters: ParameterSet = DRIVE.parameters, **field
 
 
 def test_nodes_at_every_so_many_samples() -> None:
-    assert every(10, 3).tolist() == [0, 3, 6, 9]
-    assert every(10, 100).tolist() == [0]
-    assert every(3, 0).tolist() == [0, 1, 2]
+    assert regular_nodes(10, 3).tolist() == [0, 3, 6, 9]
+    assert regular_nodes(10, 100).tolist() == [0]
+    assert regular_nodes(3, 0).tolist() == [0, 1, 2]
     assert phase().n == 10
 
 
@@ -65,8 +67,8 @@ def test_a_phase_takes_its_own_value_where_there_is_one() -> None:
     posed = problem(phase("a"), phase("b"), parameters=DRIVE.parameters | ParameterSet(own))
     values = np.array([p.value for p in posed.parameters.values()])
     mass = list(DRIVE.parameters).index("load.mass")
-    assert values[posed.gather(posed.phases[0])][mass] == DRIVE.parameters.value("load.mass")
-    assert values[posed.gather(posed.phases[1])][mass] == 7.0
+    assert values[posed.parameter_positions(posed.phases[0])][mass] == DRIVE.parameters.value("load.mass")
+    assert values[posed.parameter_positions(posed.phases[1])][mass] == 7.0
     assert posed.free.tolist() == [len(DRIVE.parameters)]
 
 

@@ -28,7 +28,7 @@ from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies.sweep import INTERRUPTED, grid, sweep
+from pneuopt.studies.sweep import INTERRUPTED_CASE, grid, sweep
 
 RIG = ParameterSet(
     {
@@ -262,7 +262,7 @@ def test_an_interruption_keeps_what_is_done_and_ends_what_runs(functions: Module
     begun = time.perf_counter()
     table = sweep(functions.hung, RIG, masses(1, 2, 3, 4), progress=interrupt)
     assert time.perf_counter() - begun < 30
-    assert table["error"].tolist() == ["", *[INTERRUPTED] * 3]
+    assert table["error"].tolist() == ["", *[INTERRUPTED_CASE] * 3]
     assert table["value"].fillna(-1).tolist() == [1.0, -1, -1, -1]
     assert table["load.mass"].tolist() == [1, 2, 3, 4]
     assert table["seconds"].isna().tolist() == [False, True, True, True]
@@ -271,7 +271,7 @@ def test_an_interruption_keeps_what_is_done_and_ends_what_runs(functions: Module
 def test_a_function_may_interrupt_the_study(functions: ModuleType) -> None:
     with ThreadPoolExecutor(1) as one:
         table = sweep(functions.interrupting, RIG, masses(1, 2, 3), executor=one)
-    assert table["error"].tolist() == ["", INTERRUPTED, INTERRUPTED]
+    assert table["error"].tolist() == ["", INTERRUPTED_CASE, INTERRUPTED_CASE]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends SIGINT to a group of processes")
@@ -310,7 +310,7 @@ def test_systems_travel(name: str, threads: Executor) -> None:
 
     system = SYSTEMS[name]
     copy: System = pickle.loads(pickle.dumps(system))
-    assert (repr(copy), copy.start_finder) == (repr(system), system.start_finder)
+    assert (repr(copy), copy.start_hook) == (repr(system), system.start_hook)
     x, u, p = (np.full(system.ode.size1_in(i), 0.3) for i in (1, 2, 3))
     for ours, theirs in zip(copy.ode(0, x, u, p), system.ode(0, x, u, p), strict=True):
         assert np.array_equal(np.array(ours), np.array(theirs))

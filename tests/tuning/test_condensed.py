@@ -36,17 +36,17 @@ from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code
+from pneuopt.quantities.status import Code
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.confirmed import Confirmed
-from pneuopt.tuning.linearised import Linearised, differentiated
+from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
 
 STEP = Step(1.0, horizon=2.0)
-QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
+QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
 SPEC = specify(SettlingTime(), [Overshoot(0.1), SteadyStateError(0.05), PeakControl(200.0), MaxSensitivity(1.6)])
 
 
@@ -66,9 +66,9 @@ def friction_loop(dither: Dither | None = None) -> tuple[ClosedLoop, ParameterSe
     return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
 
 
-def problem(loop: ClosedLoop, given: ParameterSet, steps: list[Step], scenarios: Scenarios) -> Linearised:
-    simulator = Simulator(loop, steps, span(loop, given), scenarios)
-    return Linearised(simulator, differentiated(simulator), SPEC, 60, 1.0)
+def problem(loop: ClosedLoop, given: ParameterSet, steps: list[Step], scenarios: Scenarios) -> LinearisedProblem:
+    simulator = Simulator(loop, steps, search_space(loop, given), scenarios)
+    return LinearisedProblem(simulator, sensitivity_rollout(simulator), SPEC, 60, 1.0)
 
 
 @pytest.mark.parametrize("dither", [None, Dither(80.0)])
@@ -100,12 +100,12 @@ FURTHER += [GainMargin(), PhaseMargin()]
 def test_further_kinds_are_read_as_the_metrics_and_have_their_slopes(requirement: Requirement) -> None:
     loop, given = friction_loop(Dither(80.0))
     spec = specify({requirement: 1.0})
-    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], span(loop, given), {}, spec)
-    posed = Linearised(simulator, differentiated(simulator), spec, 1000, 1.0)
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], search_space(loop, given), {}, spec)
+    posed = LinearisedProblem(simulator, sensitivity_rollout(simulator), spec, 1000, 1.0)
     n = len(posed.bounds) - 1
     z = np.append(np.full(n, 0.45), 0.5)
     (point,) = posed.evaluate(z[None])
-    measured = simulator.values(simulator.space.draw(z[None, :-1]), spec)[type(requirement).__name__]
+    measured = simulator.values(simulator.space.from_unit(z[None, :-1]), spec)[type(requirement).__name__]
     assert point.merit == pytest.approx(float(measured[0]), rel=5e-3)
     k = int(np.argmax(np.where(point.group == 0, point.values, -np.inf)))
     for i in range(n):
@@ -155,10 +155,10 @@ def test_full_space_refuses_what_it_cannot_see() -> None:
 
 def test_the_best_settling_time_is_the_one_that_is_measured() -> None:
     loop, given = friction_loop()
-    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], span(loop, given), corners(given, {"load.mass": 0.3}))
-    posed = Linearised(simulator, differentiated(simulator), specify(SettlingTime()), 1000, 1.0)
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], search_space(loop, given), corners(given, {"load.mass": 0.3}))
+    posed = LinearisedProblem(simulator, sensitivity_rollout(simulator), specify(SettlingTime()), 1000, 1.0)
     unit = np.array([[0.3, 0.95, 0.0], [0.6, 0.9, 0.0]])
-    measured = simulator.values(simulator.space.draw(unit), specify(SettlingTime()))["SettlingTime"]
+    measured = simulator.values(simulator.space.from_unit(unit), specify(SettlingTime()))["SettlingTime"]
     found = [posed.improve(point) for point in posed.evaluate(posed.start(unit))]
     assert np.isfinite(measured).all()
     for point, expected in zip(found, measured, strict=True):
@@ -209,7 +209,7 @@ def test_limits_are_kept_in_every_corner() -> None:
 
 def test_a_renewal_keeps_what_was_found_before() -> None:
     poor = replace(QUICK, members=5, generations=1, keep=1)
-    once, again = (on_corners([Overshoot(0.05)], replace(poor, renewals=n)).certified for n in (0, 1))
+    once, again = (on_corners([Overshoot(0.05)], replace(poor, restarts=n)).certified for n in (0, 1))
     assert again.loc["Overshoot"].max() <= 5.0
     assert again.loc["SettlingTime"].max() <= 1.001 * once.loc["SettlingTime"].max()
 
@@ -269,11 +269,11 @@ def test_a_working_set_takes_in_the_case_that_it_missed() -> None:
 
 @pytest.mark.parametrize(("friction", "kind"), [(Viscous(), "TwoPhase"), (Stribeck(), "Screening")])
 def test_one_plant_and_few_gains_are_left_to_the_other_methods(friction: Viscous | Stribeck, kind: str) -> None:
-    from pneuopt.tuning.tune import _checked
+    from pneuopt.tuning.tune import _choose_method
 
     loop = ClosedLoop(ForceDrive(friction).system(), PID())
     given = loop.parameters.with_bounds({"pid.Kp": (1.0, 10.0)}).freed("pid.Kp")
-    space, spec = span(loop, given), specify(SettlingTime())
-    assert type(_checked(None, loop, {}, space, spec)).__name__ == kind
+    space, spec = search_space(loop, given), specify(SettlingTime())
+    assert type(_choose_method(None, loop, {}, space, spec)).__name__ == kind
     heavy: Scenarios = {"heavy": {"load.mass": 9.0}}
-    assert type(_checked(None, loop, heavy, space, spec)).__name__ == "Condensed"
+    assert type(_choose_method(None, loop, heavy, space, spec)).__name__ == "Condensed"

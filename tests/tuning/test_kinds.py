@@ -29,16 +29,16 @@ from pneuopt.evaluation.requirements import (
     RiseTime,
     SettlingTime,
     StepEnvelope,
-    most,
-    name,
-    read,
+    metric_name,
+    requirement_values,
+    upper_limit,
 )
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code
+from pneuopt.quantities.status import Code
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
@@ -79,14 +79,14 @@ def column(table: pd.DataFrame, case: str = "0 to 1") -> dict[str, float]:
         PhaseMargin(66.0),
         NoiseGain(1.05),
     ],
-    ids=name,
+    ids=metric_name,
 )
 def test_each_kind_is_a_limit_that_is_certified(limit: Requirement) -> None:
     """Found by the search, kept by the independent simulation, which reads what the search claims."""
     found = tuned(limit)
     assert found.status.converged, found.status
-    certified, kind = column(found.certified), name(limit)
-    assert read(certified)[kind] <= most(limit)
+    certified, kind = column(found.certified), metric_name(limit)
+    assert requirement_values(certified)[kind] <= upper_limit(limit)
     assert column(found.claimed)[kind] == pytest.approx(certified[kind], rel=2e-3, abs=1e-5)
 
 
@@ -112,7 +112,10 @@ def test_each_kind_is_an_objective(kind: type[Requirement]) -> None:
     best = tuned(RiseTime(0.3), minimise=kind())  # type: ignore[call-arg]
     assert best.status.converged, best.status
     loop, given = speed_loop()
-    values = [read(column(evaluate(loop, STEP, given | found.parameters)))[kind.__name__] for found in (best, other)]
+    values = [
+        requirement_values(column(evaluate(loop, STEP, given | found.parameters)))[kind.__name__]
+        for found in (best, other)
+    ]
     assert values[0] <= values[1] * (1 + 1e-3)
 
 

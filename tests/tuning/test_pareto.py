@@ -20,7 +20,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import Method
 from pneuopt.tuning.two_phase import TwoPhase
 
@@ -46,7 +46,9 @@ def test_no_design_is_beaten_by_brute_force(sample_time: float | None) -> None:
     """Of 60 x 60 gains none is better in both by more than 3 % of the settling time, the searches' margin."""
     loop, given = oscillator(sample_time)
     grid = np.stack(np.meshgrid(*(np.linspace(*b, 60) for b in BOUNDS.values())), axis=-1).reshape(-1, 2)
-    values = Simulator(loop, [STEP], span(loop, given)).values(grid, specify(SettlingTime(), [MaxSensitivity(100.0)]))
+    values = Simulator(loop, [STEP], search_space(loop, given)).values(
+        grid, specify(SettlingTime(), [MaxSensitivity(100.0)])
+    )
     good = (values["Overshoot"] <= 0.05) & np.isfinite(values["SettlingTime"])
     found = front(sample_time)
     assert (found["error"] == "").all()

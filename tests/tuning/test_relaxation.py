@@ -21,10 +21,10 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code
+from pneuopt.quantities.status import Code
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import Method, TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
@@ -90,7 +90,7 @@ def test_a_relaxed_limit_is_the_least_on_a_grid_and_its_design_keeps_the_others(
             allowed = {"SettlingTime": 0.35, "Overshoot": 2.0, "PeakControl": 1.2}
             allowed[n] = float(relaxed.loc[n, "needed"]) * (100 if n == "Overshoot" else 1)
             assert all(own[k] <= most for k, most in allowed.items())
-    space = span(loop, given)
+    space = search_space(loop, given)
     grid = np.stack(np.meshgrid(np.linspace(0.02, 0.6, 60), np.linspace(0.5, 8.0, 60)), axis=-1).reshape(-1, 2)
     values = Simulator(loop, [Step(1.0, horizon=1.5)], space).values(grid, specify(SettlingTime()))
     kept = (values["Overshoot"] <= 0.02) & (values["PeakControl"] <= 1.2)

@@ -12,7 +12,7 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PeakControl, SettlingTime
-from pneuopt.evaluation.scenarios import Factor, Scenarios, applied, corners, samples, tolerances
+from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario, corners, samples, tolerances
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
@@ -20,15 +20,15 @@ from pneuopt.models.linear import Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.condensed import Condensed
-from pneuopt.tuning.screening import Judge, Screening, screen
+from pneuopt.tuning.screening import MeritFunction, Screening, run_screening
 from pneuopt.tuning.simulator import Responses, Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 STEP = Step(1.0, horizon=2.0)
 QUICK = Screening(members=10, generations=6, refinements=60)
-GRADIENTS = Condensed(members=8, generations=3, keep=2, iterations=16, renewals=0, polish=4)
+GRADIENTS = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
 
 
 def integrator() -> tuple[ClosedLoop, ParameterSet]:
@@ -94,7 +94,7 @@ def test_a_tolerance_spreads_the_candidate_not_the_start() -> None:
 def test_factors_may_leave_the_bounds() -> None:
     _, given = integrator()
     at_edge = given.with_values({"pid.Kp": 20.0})
-    assert applied(at_edge, {"pid.Kp": Factor(1.01)}).value("pid.Kp") == pytest.approx(20.2)
+    assert apply_scenario(at_edge, {"pid.Kp": Factor(1.01)}).value("pid.Kp") == pytest.approx(20.2)
 
 
 @pytest.mark.parametrize(
@@ -127,12 +127,12 @@ def test_bad_tolerances_are_refused() -> None:
 
 def test_the_search_reads_what_the_certificate_reads_in_every_scenario() -> None:
     loop, given = friction_loop()
-    space, steps = span(loop, given), [Step(0.1, horizon=0.2), Step(-0.2, at=0.05, horizon=0.2)]
+    space, steps = search_space(loop, given), [Step(0.1, horizon=0.2), Step(-0.2, at=0.05, horizon=0.2)]
     scenarios = {**corners(given, {"load.mass": 0.3}), **tolerances(given, {"pid.*": 0.05})}
-    points = space.draw(np.random.default_rng(4).random((1, 3)))
+    points = space.from_unit(np.random.default_rng(4).random((1, 3)))
     found = Simulator(loop, steps, space, scenarios).respond(points, 0.02)
     for k, point in enumerate(points):
-        proof = evaluate(loop, steps, space.filled(point), scenarios=scenarios)
+        proof = evaluate(loop, steps, space.parameters_at(point), scenarios=scenarios)
         for column, case in enumerate(cases(steps, scenarios, space.parameters)):
             for name in ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl"):
                 ours, theirs = found.table(name)[k, column], proof[case.label][name]
@@ -141,26 +141,28 @@ def test_the_search_reads_what_the_certificate_reads_in_every_scenario() -> None
 
 def test_racing_finds_what_facing_every_case_finds_and_runs_less() -> None:
     loop, given = friction_loop()
-    space, references = span(loop, given), [Step(0.1, horizon=0.3)]
+    space, references = search_space(loop, given), [Step(0.1, horizon=0.3)]
     scenarios = samples(given, {"load.mass": 0.3, "friction.coulomb": 0.3}, 5)
     spec = specify(SettlingTime(), [Overshoot(0.05), MaxSensitivity(1.6)])
     simulator, lanes = Simulator(loop, references, space, scenarios), list[int]()
     method = Screening(members=12, generations=4, refinements=0)
-    respond, race = Simulator.respond, Judge.race
+    respond, race = Simulator.respond, MeritFunction.race
 
     def counted(own: Simulator, points: np.ndarray, band: float, wanted: np.ndarray | None = None) -> Responses:
         lanes.append(len(points) * len(own.cases) if wanted is None else int(wanted.sum()))
         return respond(own, points, band, wanted)
 
-    def faced_by_all(judge: Judge, unit: np.ndarray, _: np.ndarray, __: np.ndarray | None) -> tuple[np.ndarray, ...]:
+    def faced_by_all(
+        judge: MeritFunction, unit: np.ndarray, _: np.ndarray, __: np.ndarray | None
+    ) -> tuple[np.ndarray, ...]:
         return race(judge, unit, np.full(len(unit), np.inf), None)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Simulator, "respond", counted)
-        raced = screen(simulator, references, space, spec, method, space.start, lambda _: None)
-        patch.setattr(Judge, "race", faced_by_all)
+        raced = run_screening(simulator, references, space, spec, method, space.start, lambda _: None)
+        patch.setattr(MeritFunction, "race", faced_by_all)
         few, lanes[:] = sum(lanes), []
-        plain = screen(simulator, references, space, spec, method, space.start, lambda _: None)
+        plain = run_screening(simulator, references, space, spec, method, space.start, lambda _: None)
     assert np.array_equal(raced.point, plain.point)
     assert few < 0.8 * sum(lanes)
 
@@ -170,11 +172,11 @@ def test_a_search_sees_what_happens_between_two_samples() -> None:
     loop = ClosedLoop(SecondOrder().system(), PID(sample_time=0.02, limits=False))
     values = {"plant.natural_frequency": 100.0, "plant.damping": 0.2, "pid.Kp": 0.1, "pid.b": 8.0}
     given = loop.parameters.with_values(values | {"pid.Ki": 9.0}).with_bounds({"pid.Ki": (1.0, 30.0)}).freed("pid.Ki")
-    space, step = span(loop, given), Step(0.2, horizon=0.8)
+    space, step = search_space(loop, given), Step(0.2, horizon=0.8)
     points = np.array([[9.0], [10.0]])
     found = Simulator(loop, [step], space).respond(points, 0.02)
     for k, point in enumerate(points):
-        parameters = space.filled(point)
+        parameters = space.parameters_at(point)
         proof, fine = evaluate(loop, step, parameters)[step.label], respond(loop, step, parameters)
         at_samples = fine["speed"][:: round(0.02 / (fine.t[1] - fine.t[0]))]
         assert proof["Overshoot"] > 1.5 * 100 * (at_samples.max() / 0.2 - 1)
@@ -185,10 +187,10 @@ def test_a_search_sees_what_happens_between_two_samples() -> None:
 def test_some_of_the_cases_read_as_they_do_among_all() -> None:
     """Of one reference only, too: the other's grid is not run."""
     loop, given = friction_loop()
-    space, steps = span(loop, given), [Step(0.1, horizon=0.3), Step(-0.2, horizon=0.2)]
+    space, steps = search_space(loop, given), [Step(0.1, horizon=0.3), Step(-0.2, horizon=0.2)]
     whole = Simulator(loop, steps, space, corners(given, {"load.mass": 0.3}))
-    part = whole.only([1, 5])
-    points = space.draw(np.full((2, 3), 0.4))
+    part = whole.select_cases([1, 5])
+    points = space.from_unit(np.full((2, 3), 0.4))
     every, some = (simulator.respond(points, 0.02).table("Overshoot") for simulator in (whole, part))
     assert [len(g.t) for g in part.grids] == [len(whole.grids[1].t)]
     assert some == pytest.approx(every[:, [1, 5]], rel=1e-6)

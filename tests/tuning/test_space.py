@@ -17,7 +17,13 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import POINTS_A_PERIOD, highest, resolving, spacing, span
+from pneuopt.tuning.space import (
+    SAMPLES_A_DITHER_PERIOD,
+    dither_resolution_rate,
+    highest_dither_frequency,
+    sample_spacing,
+    search_space,
+)
 from pneuopt.tuning.tune import tune
 
 STEP = Step(0.1, horizon=0.4)
@@ -36,11 +42,11 @@ def axis(
 def test_samples_follow_the_highest_frequency_that_is_allowed() -> None:
     loop, p = axis(None)
     free = p.with_bounds(WIDE).freed(*WIDE)
-    assert (highest(loop, p), highest(loop, free)) == (80.0, 200.0)
-    assert spacing(loop, STEP, free) <= 1 / (POINTS_A_PERIOD * 200.0) < spacing(loop, STEP, p)
-    assert spacing(*axis(1e-3)[:1], STEP, free) == 1e-3
-    assert resolving(loop, free) == 0.0
-    assert resolving(axis(1e-3, analogue=True)[0], free) >= POINTS_A_PERIOD * 200.0
+    assert (highest_dither_frequency(loop, p), highest_dither_frequency(loop, free)) == (80.0, 200.0)
+    assert sample_spacing(loop, STEP, free) <= 1 / (SAMPLES_A_DITHER_PERIOD * 200.0) < sample_spacing(loop, STEP, p)
+    assert sample_spacing(*axis(1e-3)[:1], STEP, free) == 1e-3
+    assert dither_resolution_rate(loop, free) == 0.0
+    assert dither_resolution_rate(axis(1e-3, analogue=True)[0], free) >= SAMPLES_A_DITHER_PERIOD * 200.0
 
 
 @pytest.mark.parametrize(
@@ -58,12 +64,12 @@ def test_a_search_over_frequency_sees_what_the_certificate_sees(
     loop, p = axis(sample_time, analogue=analogue, waveform=waveform)
     free = p.with_bounds(WIDE).freed(*WIDE)
     spec = specify(SettlingTime(0.05), [Ripple(0.1)])
-    space = span(loop, free)
+    space = search_space(loop, free)
     simulator = Simulator(loop, [STEP], space, spec=spec)
     for frequency in (40.0, 200.0):
         point = np.array([frequency if n.endswith("frequency") else 40.0 for n in space.names])
         claimed = simulator.table(point, spec)[0]
-        certified = evaluate(loop, STEP, space.filled(point), band=0.05)[STEP.label]
+        certified = evaluate(loop, STEP, space.parameters_at(point), band=0.05)[STEP.label]
         assert claimed["SettlingTime"] == pytest.approx(certified["SettlingTime"], abs=1e-3), frequency
         assert claimed["Overshoot"] == pytest.approx(certified["Overshoot"], abs=0.2), frequency
         assert claimed["Ripple"] == pytest.approx(certified["Ripple"], rel=0.1), frequency
@@ -83,10 +89,10 @@ def test_frequency_is_tuned_with_the_rest() -> None:
 def test_a_frequency_of_zero_and_an_amplitude_beyond_the_command_are_refused_before_a_search() -> None:
     loop, p = axis(1e-3)
     with pytest.raises(InputError, match=r"dither.frequency: its lower bound must be positive, got 0 Hz"):
-        span(loop, p.with_bounds({"dither.frequency": (0.0, 100.0)}).freed("dither.frequency"))
+        search_space(loop, p.with_bounds({"dither.frequency": (0.0, 100.0)}).freed("dither.frequency"))
     with pytest.raises(InputError, match=r"dither.amplitude may reach 400 N, but the command ends at -300 and 300 N"):
-        span(loop, p.with_bounds({"dither.amplitude": (0.0, 400.0)}).freed("dither.amplitude"))
+        search_space(loop, p.with_bounds({"dither.amplitude": (0.0, 400.0)}).freed("dither.amplitude"))
     valve = ClosedLoop(PneumaticDrive().system(), PID(sample_time=1e-3), Dither(80.0), measured="speed")
     wide = valve.parameters.with_bounds({"dither.amplitude": (0.0, 8.0)}).freed("dither.amplitude")
     with pytest.raises(InputError, match=r"may reach 8 V, but the valve ends at -5 and 5 V.*lower its upper bound"):
-        span(valve, wide)
+        search_space(valve, wide)

@@ -7,30 +7,33 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from pneuopt.tuning.sqp import SQP, Groups, Point, descend, program
+from pneuopt.quantities.arrays import Array
+from pneuopt.tuning.sqp import SQP, LinearisedPoint, RowGroups, descend, solve_quadratic_program
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
 class Analytic:
     """Rows and slopes as functions of z; a linear objective."""
 
-    def __init__(self, rows: Callable[[Array], tuple[Array, Array]], gradient: Array, groups: Groups, group: Index):
+    def __init__(self, rows: Callable[[Array], tuple[Array, Array]], gradient: Array, groups: RowGroups, group: Index):
         self.rows, self.gradient, self.groups, self.group = rows, gradient, groups, group
         self.bounds, self.scales = np.tile([-5.0, 5.0], (len(gradient), 1)), np.ones(len(gradient))
         self.evaluations = 0
 
-    def evaluate(self, z: Array) -> Sequence[Point]:
+    def evaluate(self, z: Array) -> Sequence[LinearisedPoint]:
         self.evaluations += len(z)
-        return [Point(x, float(self.gradient @ x), self.gradient, *self.rows(x), self.group, self.groups) for x in z]
+        return [
+            LinearisedPoint(x, float(self.gradient @ x), self.gradient, *self.rows(x), self.group, self.groups)
+            for x in z
+        ]
 
-    def improve(self, point: Point) -> Point:
+    def improve(self, point: LinearisedPoint) -> LinearisedPoint:
         return point
 
 
-MINIMAX = Groups(np.ones(1), np.array([-np.inf]))
-PENALTY = Groups(np.array([20.0]), np.zeros(1))
+MINIMAX = RowGroups(np.ones(1), np.array([-np.inf]))
+PENALTY = RowGroups(np.array([20.0]), np.zeros(1))
 
 
 def cb2(x: Array) -> tuple[Array, Array]:
@@ -79,14 +82,14 @@ def test_a_program_solves_the_linear_program_that_scipy_solves() -> None:
     rng = np.random.default_rng(0)
     for _ in range(5):
         n, m, g = 4, 120, 3
-        groups = Groups(np.array([1.0, 5.0, 3.0]), np.array([-np.inf, 0.0, 0.0]))
+        groups = RowGroups(np.array([1.0, 5.0, 3.0]), np.array([-np.inf, 0.0, 0.0]))
         group, slopes, values = rng.integers(g, size=m), rng.normal(size=(m, n)), rng.normal(size=m)
-        point = Point(rng.uniform(0, 1, n), 0.0, rng.normal(size=n), values, slopes, group, groups)
-        step = program(point, np.tile([0.0, 1.0, 0.3], (n, 1)))
+        point = LinearisedPoint(rng.uniform(0, 1, n), 0.0, rng.normal(size=n), values, slopes, group, groups)
+        step = solve_quadratic_program(point, np.tile([0.0, 1.0, 0.3], (n, 1)))
         A = np.hstack([slopes, -np.eye(g)[group]])
         box = [(max(-0.3, -z), min(0.3, 1 - z)) for z in point.z] + [(None, None), (0, None), (0, None)]
         exact = linprog(np.concatenate([point.gradient, groups.weights]), A, -values, bounds=box)
-        assert point.predicted(step) == pytest.approx(exact.fun, abs=1e-3)
+        assert point.predict_merit(step) == pytest.approx(exact.fun, abs=1e-3)
 
 
 def test_a_point_that_is_no_number_is_left() -> None:

@@ -25,10 +25,10 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.models.paper2015 import paper_plant
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.solution import Code
-from pneuopt.tuning.screening import Judge, Screening, screen
+from pneuopt.quantities.status import Code
+from pneuopt.tuning.screening import MeritFunction, Screening, run_screening
 from pneuopt.tuning.simulator import Responses, Simulator
-from pneuopt.tuning.space import span
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
 
@@ -277,10 +277,10 @@ def test_modes_too_fast_for_the_grid_are_refused() -> None:
 def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
     """The points that cannot beat their rivals get a bound; the search finds what it found."""
     loop, parameters = friction_loop()
-    space, references = span(loop, parameters), [Step(0.1, horizon=0.3)]
+    space, references = search_space(loop, parameters), [Step(0.1, horizon=0.3)]
     spec = specify(SettlingTime(), [Overshoot(0.05), MaxSensitivity(1.3)])
     simulator, judged = Simulator(loop, references, space), list[int]()
-    robust = Responses.robust
+    robust = Responses.with_margins
 
     def counting(responses: Responses, rows: np.ndarray) -> dict[str, np.ndarray]:
         judged.append(int(rows.sum()))
@@ -289,27 +289,29 @@ def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
     method = Screening(members=12, generations=3, refinements=0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Responses, "robust", counting)
-        found = screen(simulator, references, space, spec, method, space.start, lambda _: None)
+        found = run_screening(simulator, references, space, spec, method, space.start, lambda _: None)
     assert found.is_complete
     assert found.count == 12 * 4 * 4
     assert sum(judged) < 0.7 * found.count
 
-    def plainly(judge: Judge, unit: np.ndarray, _: np.ndarray, first: np.ndarray | None) -> tuple[np.ndarray, ...]:
+    def plainly(
+        judge: MeritFunction, unit: np.ndarray, _: np.ndarray, first: np.ndarray | None
+    ) -> tuple[np.ndarray, ...]:
         return race(judge, unit, np.full(len(unit), np.inf), first)
 
     with pytest.MonkeyPatch.context() as patch:
-        race = Judge.race
-        patch.setattr(Judge, "race", plainly)
-        plain = screen(simulator, references, space, spec, method, space.start, lambda _: None)
+        race = MeritFunction.race
+        patch.setattr(MeritFunction, "race", plainly)
+        plain = run_screening(simulator, references, space, spec, method, space.start, lambda _: None)
     assert np.array_equal(found.point, plain.point)
 
 
 def test_references_run_together_or_alone_alike() -> None:
     """Few candidates share the lanes across references, the shorter padded; it changes nothing."""
     loop, parameters = friction_loop()
-    space, references = span(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, horizon=0.2)]
+    space, references = search_space(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, horizon=0.2)]
     simulator, spec = Simulator(loop, references, space), specify(SettlingTime(), [MaxSensitivity(1.5)])
-    points = space.draw(np.random.default_rng(3).random((9, 4)))
+    points = space.from_unit(np.random.default_rng(3).random((9, 4)))
     many = simulator.values(points, spec)
     for k, point in enumerate(points):
         for name, value in simulator.values(point[None], spec).items():
@@ -319,11 +321,11 @@ def test_references_run_together_or_alone_alike() -> None:
 
 def test_the_search_reads_what_the_certificate_reads() -> None:
     loop, parameters = friction_loop()
-    space, steps = span(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, at=0.05, horizon=0.3)]
-    points = space.draw(np.random.default_rng(4).random((4, 4)))
+    space, steps = search_space(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, at=0.05, horizon=0.3)]
+    points = space.from_unit(np.random.default_rng(4).random((4, 4)))
     found = Simulator(loop, steps, space).respond(points, 0.02)
     for k, point in enumerate(points):
-        proof = evaluate(loop, steps, space.filled(point))
+        proof = evaluate(loop, steps, space.parameters_at(point))
         for column, step in enumerate(steps):
             for name in ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl"):
                 ours, theirs = found.table(name)[k, column], proof[step.label][name]
@@ -335,7 +337,7 @@ def test_margins_under_dither_do_not_depend_on_its_phase(sample_time: float | No
     """Records that end a quarter of a period apart, where friction falls with speed: one figure, the search's too."""
     loop, parameters = friction_loop(sample_time)
     given = parameters.with_values({"dither.amplitude": 40.0, "pid.Kp": 200.0, "pid.Ki": 5000.0})
-    space, found = span(loop, given), list[float]()
+    space, found = search_space(loop, given), list[float]()
     for quarter in range(4):
         step = Step(0.05, horizon=0.4 + quarter * 0.25 / 80.0 if sample_time is None else 0.4 + quarter * 3e-3)
         proof = evaluate(loop, step, given)[step.label]["MaxSensitivity"]
@@ -348,8 +350,8 @@ def test_margins_under_dither_do_not_depend_on_its_phase(sample_time: float | No
 
 def test_printed_gains_come_first_and_neighbours_differ_in_one_last_place() -> None:
     loop, parameters = friction_loop()
-    space = span(loop, parameters)
-    printed = space.printed(np.array([123.456, 9999.96, 0.0, -12.3456]), 4)
+    space = search_space(loop, parameters)
+    printed = space.round_point(np.array([123.456, 9999.96, 0.0, -12.3456]), 4)
     assert printed.tolist() == [123.5, 10000.0, 0.0, -12.35]
     near = space.neighbours(np.array([123.5, 10000.0, 0.0, -12.35]), 4)
     assert near.tolist() == [

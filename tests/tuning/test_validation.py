@@ -9,7 +9,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PhaseMargin, SettlingTime
-from pneuopt.evaluation.scenarios import applied, samples, tolerances
+from pneuopt.evaluation.scenarios import apply_scenario, samples, tolerances
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
@@ -76,7 +76,7 @@ def test_the_smallest_margin_is_the_worst() -> None:
 def test_gains_off_by_a_tolerance_are_fresh_plants_too() -> None:
     loop, design = integrator()
     drawn = tolerances(design, {"pid.Kp": 0.1}, 40, seed=2)
-    gains = np.array([applied(design, values).value("pid.Kp") for values in drawn.values()])
+    gains = np.array([apply_scenario(design, values).value("pid.Kp") for values in drawn.values()])
     assert np.all(np.abs(gains / 5.0 - 1) <= 0.1)
     assert np.ptp(gains) > 0.5
     found = validate_design(loop, STEPS[0], design, minimise=SettlingTime(), scenarios=drawn)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import casadi as ca
 
 RATES = ("segment", "sample", "call")
-OPERATORS = {
+C_OPERATORS = {
     ca.OP_ASSIGN: "{0}",
     ca.OP_ADD: "{0} + {1}",
     ca.OP_SUB: "{0} - {1}",
@@ -25,16 +25,16 @@ OPERATORS = {
     ca.OP_INV: "ALL(1.0) / {0}",
     ca.OP_CONSTPOW: "v_pow({0}, {1})",
 }
-UNARY = (
+UNARY_FUNCTIONS = (
     "sqrt exp log log1p expm1 sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh erf fabs floor ceil sign not"
 )
-BINARY = "pow atan2 hypot fmod copysign fmin fmax lt le eq ne and or if_else_zero"
-FUNCTIONS = {getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}})" for name in UNARY.split()}
-FUNCTIONS |= {getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}}, {{1}})" for name in BINARY.split()}
+BINARY_FUNCTIONS = "pow atan2 hypot fmod copysign fmin fmax lt le eq ne and or if_else_zero"
+C_FUNCTIONS = {getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}})" for name in UNARY_FUNCTIONS.split()}
+C_FUNCTIONS |= {getattr(ca, f"OP_{name.upper()}"): f"v_{name}({{0}}, {{1}})" for name in BINARY_FUNCTIONS.split()}
 DIVISIONS = (ca.OP_DIV, ca.OP_INV)
 
 
-class Kernel(NamedTuple):
+class CFunction(NamedTuple):
     """One Function to emit.
 
     Parameters
@@ -61,26 +61,26 @@ class Instruction(NamedTuple):
     constant: float
 
 
-class Value(NamedTuple):
+class CValue(NamedTuple):
     """A number in C, and how often it changes."""
 
     rate: int
     text: str
 
 
-def emit(kernel: Kernel, rates: Mapping[str, int]) -> tuple[str, int]:
+def write_c(kernel: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
     """C functions ``NAME_segment``, ``NAME_sample`` and ``NAME_call`` on a struct ``Segment *s``.
 
     Parameters
     ----------
-    kernel : Kernel
+    c_function : Kernel
     rates : mapping of str to int
         How often each input changes: an index into `RATES`.
 
     Returns
     -------
     text : str
-    kept : int
+    storage : int
         How many values the struct's member ``NAME_kept`` has to hold.
 
     Raises
@@ -88,23 +88,23 @@ def emit(kernel: Kernel, rates: Mapping[str, int]) -> tuple[str, int]:
     NotImplementedError
         For an operation that has no form here.
     """
-    writer = _Writer(kernel, rates)
+    writer = _CWriter(kernel, rates)
     functions = []
     for rate, statements in zip(RATES, writer.statements, strict=True):
         body = "".join(f"  {line}\n" for line in statements)
         functions.append(f"static void {kernel.name}_{rate}(Segment *s) {{\n{body}}}\n")
-    return "\n".join(functions), len(writer.kept)
+    return "\n".join(functions), len(writer.storage)
 
 
-class _Writer:
+class _CWriter:
     """The statements of one kernel."""
 
-    def __init__(self, kernel: Kernel, rates: Mapping[str, int]) -> None:
-        self.kernel, self.rates = kernel, rates
+    def __init__(self, kernel: CFunction, rates: Mapping[str, int]) -> None:
+        self.c_function, self.rates = kernel, rates
         self.statements: tuple[list[str], ...] = tuple([] for _ in RATES)
-        self.kept: dict[str, str] = {}  # what a rarer rate hands on, and its place
-        self.values: dict[int, Value] = {}
-        self.reciprocals: dict[int, Value] = {}
+        self.storage: dict[str, str] = {}  # what a rarer rate hands on, and its place
+        self.values: dict[int, CValue] = {}
+        self.reciprocals: dict[int, CValue] = {}
         instructions = list(_instructions(kernel.function))
         self.divisors = Counter(i.sources[-1] for i in instructions if i.operation in DIVISIONS)
         for instruction in instructions:
@@ -113,48 +113,48 @@ class _Writer:
     def _add(self, i: Instruction) -> None:
         if i.operation == ca.OP_OUTPUT:
             result = self._read(self.values[i.sources[0]], len(RATES) - 1)
-            self.statements[-1].append(f"s->{self.kernel.outputs[i.target[0]]}[{i.target[1]}] = {result};")
+            self.statements[-1].append(f"s->{self.c_function.outputs[i.target[0]]}[{i.target[1]}] = {result};")
             return
         if i.operation == ca.OP_INPUT:
-            name = self.kernel.inputs[i.sources[0]]
-            value = Value(self.rates[name], f"s->{name}[{i.sources[1]}]")
+            name = self.c_function.inputs[i.sources[0]]
+            value = CValue(self.rates[name], f"s->{name}[{i.sources[1]}]")
         elif i.operation == ca.OP_CONST:
-            value = Value(0, f"ALL({_literal(i.constant)})")
+            value = CValue(0, f"ALL({_literal(i.constant)})")
         else:
-            value = self._computed(i)
+            value = self._compute(i)
         self.values[i.target[0]] = value
 
-    def _computed(self, i: Instruction) -> Value:
+    def _compute(self, i: Instruction) -> CValue:
         values, operation = [self.values[k] for k in i.sources], i.operation
         if operation in DIVISIONS:
             rarer = values[-1].rate < max(v.rate for v in values)
             if operation == ca.OP_INV or rarer or self.divisors[i.sources[-1]] > 1:
                 values[-1] = self._reciprocal(i.sources[-1])
                 operation = ca.OP_ASSIGN if operation == ca.OP_INV else ca.OP_MUL
-        return self._assigned(f"a{i.target[0]}", operation, values)
+        return self._assign(f"a{i.target[0]}", operation, values)
 
-    def _reciprocal(self, divisor: int) -> Value:
+    def _reciprocal(self, divisor: int) -> CValue:
         if divisor not in self.reciprocals:
-            self.reciprocals[divisor] = self._assigned(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
+            self.reciprocals[divisor] = self._assign(f"r{divisor}", ca.OP_INV, [self.values[divisor]])
         return self.reciprocals[divisor]
 
-    def _assigned(self, name: str, operation: int, values: Sequence[Value]) -> Value:
-        form = OPERATORS.get(operation) or FUNCTIONS.get(operation)
+    def _assign(self, name: str, operation: int, values: Sequence[CValue]) -> CValue:
+        form = C_OPERATORS.get(operation) or C_FUNCTIONS.get(operation)
         if form is None:
             raise NotImplementedError(f"CasADi's operation {operation}")
         rate = max(v.rate for v in values)
         expression = form.format(*(self._read(v, rate) for v in values))
         self.statements[rate].append(f"const Lanes {name} = {expression};")
-        return Value(rate, name)
+        return CValue(rate, name)
 
-    def _read(self, value: Value, rate: int) -> str:
+    def _read(self, value: CValue, rate: int) -> str:
         """The value as a statement of this rate sees it."""
         if value.rate == rate or not value.text.isidentifier():
             return value.text
-        if value.text not in self.kept:
-            self.kept[value.text] = f"s->{self.kernel.name}_kept[{len(self.kept)}]"
-            self.statements[value.rate].append(f"{self.kept[value.text]} = {value.text};")
-        return self.kept[value.text]
+        if value.text not in self.storage:
+            self.storage[value.text] = f"s->{self.c_function.name}_kept[{len(self.storage)}]"
+            self.statements[value.rate].append(f"{self.storage[value.text]} = {value.text};")
+        return self.storage[value.text]
 
 
 def _instructions(function: ca.Function) -> Iterator[Instruction]:

@@ -12,13 +12,13 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
-COMPILE_SECONDS = 300
-log = logging.getLogger("pneuopt")
+COMPILER_FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+COMPILE_TIMEOUT = 300
+logger = logging.getLogger("pneuopt")
 
 
 @functools.cache
-def build(source: str, *definitions: str) -> ctypes.CDLL | None:
+def compile_library(source: str, *definitions: str) -> ctypes.CDLL | None:
     """Compile a source, or load its product from the cache; None where that cannot be done, which is said once.
 
     Parameters
@@ -28,25 +28,25 @@ def build(source: str, *definitions: str) -> ctypes.CDLL | None:
     *definitions : str
         Macros, each tried after the one before it failed (``"LANES=1"``); none: the source as it is.
     """
-    cc = compiler()
+    cc = find_compiler()
     if cc is None:
-        say_once("no C compiler found: models run in the CasADi VM, with the same answers, about ten times slower")
+        warn_once("no C compiler found: models run in the CasADi VM, with the same answers, about ten times slower")
         return None
     detail = ""
     for definition in definitions or ("",):
         try:
-            library = _loaded(cc, (*FLAGS, f"-D{definition}") if definition else FLAGS, source)
+            library = _load_library(cc, (*COMPILER_FLAGS, f"-D{definition}") if definition else COMPILER_FLAGS, source)
         except (OSError, subprocess.SubprocessError) as error:
             detail = detail or _reason(error)[:400]
             continue
         if detail:
-            say_once(f"{cc} compiles no SIMD lanes: models run several times slower, with the same answers: {detail}")
+            warn_once(f"{cc} compiles no SIMD lanes: models run several times slower, with the same answers: {detail}")
         return library
-    say_once(f"compiling with {cc} failed, the CasADi VM runs instead, with the same answers: {detail}")
+    warn_once(f"compiling with {cc} failed, the CasADi VM runs instead, with the same answers: {detail}")
     return None
 
 
-def compiler() -> str | None:
+def find_compiler() -> str | None:
     """Path of the C compiler that is used: ``$PNEUOPT_CC``, ``$CC``, gcc, clang, cc; None if none is found."""
     chosen = os.environ.get("PNEUOPT_CC", os.environ.get("CC"))
     if chosen is not None:
@@ -69,7 +69,7 @@ def cache_directory() -> Path:
 
 @functools.cache
 def _temporary_folder(reason: str) -> Path:
-    log.warning("the cache of compiled models cannot be written (%s): compiling anew in each run", reason)
+    logger.warning("the cache of compiled models cannot be written (%s): compiling anew in each run", reason)
     return Path(tempfile.mkdtemp(prefix="pneuopt-"))
 
 
@@ -83,15 +83,15 @@ def _reason(error: OSError | subprocess.SubprocessError) -> str:
     return str(getattr(error, "stderr", None) or error)
 
 
-def _loaded(cc: str, flags: tuple[str, ...], source: str) -> ctypes.CDLL:
-    identity = [source, *flags, _compiler_version(cc), platform.processor(), _cpu()]
+def _load_library(cc: str, flags: tuple[str, ...], source: str) -> ctypes.CDLL:
+    identity = [source, *flags, _compiler_version(cc), platform.processor(), _cpu_identity()]
     name = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:32]
     binary = cache_directory() / f"{name}.so"
     if binary.exists():
         try:
             return ctypes.CDLL(str(binary))
         except OSError:  # damaged on the disk; it is built anew
-            log.debug("%s cannot be loaded, compiling it anew", binary)
+            logger.debug("%s cannot be loaded, compiling it anew", binary)
     _compile(cc, flags, source, binary)
     return ctypes.CDLL(str(binary))
 
@@ -102,15 +102,15 @@ def _compile(cc: str, flags: tuple[str, ...], source: str, binary: Path) -> None
         text, product = Path(folder) / "model.c", Path(folder) / binary.name
         text.write_text(source, encoding="utf-8")
         command = [cc, *flags, str(text), "-o", str(product), "-lm"]
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=COMPILE_SECONDS)
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=COMPILE_TIMEOUT)
         with contextlib.suppress(PermissionError):  # Windows: another process has just loaded its own
             product.replace(binary)
 
 
 @functools.cache
-def say_once(message: str) -> None:
+def warn_once(message: str) -> None:
     """Warn, but not again in the same words."""
-    log.warning("%s", message)
+    logger.warning("%s", message)
 
 
 @functools.cache
@@ -120,7 +120,7 @@ def _compiler_version(cc: str) -> str:
 
 
 @functools.cache
-def _cpu() -> str:
+def _cpu_identity() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

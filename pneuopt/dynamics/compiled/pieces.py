@@ -6,17 +6,17 @@ from pathlib import Path
 
 import casadi as ca
 
-from pneuopt.dynamics.compiled.c_writer import Kernel, emit
-from pneuopt.dynamics.compiled.compiler import say_once
+from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
+from pneuopt.dynamics.compiled.compiler import warn_once
 from pneuopt.dynamics.runge_kutta import rk4
 
-HERE = Path(__file__).parent
-SAMPLED = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often the inputs of a piece change: see `emission.RATES`
-RESULTS = {"step": ("x_next", "S_next"), "output": ("y", "dy"), "update": ("x_next", "S_next")}
-STEPPED = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
+C_SOURCE_FOLDER = Path(__file__).parent
+INPUT_RATES = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often the inputs of a piece change: see `emission.RATES`
+PIECE_OUTPUTS = {"step": ("x_next", "S_next"), "output": ("y", "dy"), "update": ("x_next", "S_next")}
+STEP_INPUT_RATES = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
 
 
-def prepare(
+def prepare_rollout(
     step: ca.Function, update: ca.Function | None, ode: ca.Function | None, wrt: Sequence[int], start: bool
 ) -> tuple[dict[str, ca.Function], str]:
     """The pieces of a sampled system (see `codegen.Pieces`) with their sensitivities, and the C of a run of them.
@@ -37,27 +37,27 @@ def prepare(
     source : str
         Empty where an operation has no form in C, which is said once.
     """
-    return prepared(str(step.serialize()), _content(update), _content(ode), tuple(wrt), start)
+    return prepare_by_content(str(step.serialize()), _serialize(update), _serialize(ode), tuple(wrt), start)
 
 
 @functools.lru_cache(maxsize=64)
-def prepared(
+def prepare_by_content(
     step: str, update: str | None, ode: str | None, wrt: tuple[int, ...], start: bool
 ) -> tuple[dict[str, ca.Function], str]:
     """The same by content, for the same system is run again and again."""
-    functions = _with_sensitivities(ca.Function.deserialize(step), _function(update), _function(ode), wrt, start)
+    functions = _with_sensitivities(ca.Function.deserialize(step), _deserialize(update), _deserialize(ode), wrt, start)
     try:
-        return functions, _source(functions, len(wrt), start)
+        return functions, _rollout_source(functions, len(wrt), start)
     except NotImplementedError as missing:
-        say_once(f"no C for {missing}: this model runs in the CasADi VM, about ten times slower")
+        warn_once(f"no C for {missing}: this model runs in the CasADi VM, about ten times slower")
         return functions, ""
 
 
-def _content(function: ca.Function | None) -> str | None:
+def _serialize(function: ca.Function | None) -> str | None:
     return None if function is None else str(function.serialize())
 
 
-def _function(content: str | None) -> ca.Function | None:
+def _deserialize(content: str | None) -> ca.Function | None:
     return None if content is None else ca.Function.deserialize(content)
 
 
@@ -68,45 +68,50 @@ def _with_sensitivities(
     t, h, x, u, p = (ca.SX.sym(k, step.size1_in(i)) for i, k in enumerate(("t", "h", "x", "u", "p")))
     S = ca.SX.sym("S", x.numel(), len(wrt) + (x.numel() if start else 0))
 
-    def moved(value: ca.SX) -> ca.SX:
+    def value_sensitivity(value: ca.SX) -> ca.SX:
         """The value's sensitivity: its Jacobian first, which is cheaper than each column through every operation."""
         fixed = ca.SX(value.numel(), S.size2() - len(wrt))
         return ca.mtimes(ca.jacobian(value, x), S) + ca.horzcat(fixed, ca.jacobian(value, p)[:, list(wrt)])
 
-    def carried(name: str, arguments: list[ca.SX], value: ca.SX, sensitivity: ca.SX) -> ca.Function:
+    def piece_function(name: str, arguments: list[ca.SX], value: ca.SX, sensitivity: ca.SX) -> ca.Function:
         # a bare "step" would be bound to the C library's own
         outputs = [ca.densify(value), ca.densify(sensitivity)]
         return ca.Function(f"system_{name}", [*arguments, x, u, p, S], outputs, {"cse": True})
 
     x_next, y = step(t, h, x, u, p)
-    S_next = moved(x_next)
+    S_next = value_sensitivity(x_next)
     if ode is not None:
-        rate = ca.Function("rate", [t, x, u, p, S], [ca.horzcat(*(f(ode(t, x, u, p)[0]) for f in (ca.densify, moved)))])
+        rate = ca.Function(
+            "rate", [t, x, u, p, S], [ca.horzcat(*(f(ode(t, x, u, p)[0]) for f in (ca.densify, value_sensitivity)))]
+        )
         both = rk4(lambda at, z: rate(at, z[:, 0], u, p, z[:, 1:]), t, h, ca.horzcat(x, S))
         x_next, S_next = both[:, 0], both[:, 1:]
-    functions = {"step": carried("step", [t, h], x_next, S_next), "output": carried("output", [t], y, moved(y))}
+    functions = {
+        "step": piece_function("step", [t, h], x_next, S_next),
+        "output": piece_function("output", [t], y, value_sensitivity(y)),
+    }
     if update is not None:
         after = update(t, x, u, p)
-        functions["update"] = carried("update", [t], after, moved(after))
+        functions["update"] = piece_function("update", [t], after, value_sensitivity(after))
     return functions
 
 
-def _source(functions: dict[str, ca.Function], chosen: int, start: bool) -> str:
+def _rollout_source(functions: dict[str, ca.Function], chosen: int, start: bool) -> str:
     """The run in C: sizes, lanes, and the driver around the pieces."""
     nx, nu, np_ = (functions["step"].size1_in(i) for i in (2, 3, 4))
     starts = nx if start else 0
     sizes = {"NX": nx, "NU": nu, "NP": np_, "NY": functions["output"].size1_out(0)}
     sizes |= {"STARTS": starts, "NS": starts + chosen, "HAS_UPDATE": int("update" in functions)}
     pieces = []
-    for name, results in RESULTS.items():
+    for name, results in PIECE_OUTPUTS.items():
         text, kept = "", 0
         if name in functions:
             arguments = ("t", "h", "x", "u", "p", "S") if name == "step" else ("t", "x", "u", "p", "S")
-            rates = STEPPED if name == "step" else SAMPLED
-            text, kept = emit(Kernel(name, functions[name], arguments, results), rates)
+            rates = STEP_INPUT_RATES if name == "step" else INPUT_RATES
+            text, kept = write_c(CFunction(name, functions[name], arguments, results), rates)
         pieces.append(text)
         sizes |= {f"{name.upper()}_KEPT": kept}
     defines = (f"#define {k} {v}" for k, v in sizes.items())
-    lanes, driver = ((HERE / name).read_text(encoding="utf-8") for name in ("lanes.h", "rollout.c"))
+    lanes, driver = ((C_SOURCE_FOLDER / name).read_text(encoding="utf-8") for name in ("lanes.h", "rollout.c"))
     before, after = driver.split("#include PIECES", 1)
     return "\n".join([*defines, lanes, before, *pieces, after])

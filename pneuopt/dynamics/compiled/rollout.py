@@ -1,8 +1,8 @@
 """CasADi Functions as cached machine code; the CasADi VM where there is no compiler. Both give the same answers.
 
-`compiled` makes one Function callable; `Rollout` runs a sampled system over many segments at once, each in a SIMD
-lane, with forward sensitivities. Binaries are cached by content (source, flags, compiler, CPU); logs, values and step
-sizes are arguments, so one binary serves every log and every continuation step.
+`compile_function` makes one Function callable; `Rollout` runs a sampled system over many segments at once, each in a
+SIMD lane, with forward sensitivities. Binaries are cached by content (source, flags, compiler, CPU); logs, values and
+step sizes are arguments, so one binary serves every log and every continuation step.
 """
 
 import ctypes
@@ -15,14 +15,14 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pneuopt.dynamics.compiled.compiler import build
-from pneuopt.dynamics.compiled.pieces import prepare
+from pneuopt.dynamics.compiled.compiler import compile_library
+from pneuopt.dynamics.compiled.pieces import prepare_rollout
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 
-Array = NDArray[np.float64]
-BATCH = 1000  # segments that the CasADi VM sums up at a time
+VM_BATCH = 1000  # segments that the CasADi VM sums up at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Pieces:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class RolloutResult:
     """What `Rollout` returns for m segments of n samples.
 
     Attributes
@@ -69,7 +69,7 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The residuals of m segments as `Rollout.gram` sums them up; s sensitivity columns, as for `Run`.
+    """The residuals of m segments as `Rollout.gram` sums them up; s sensitivity columns, as for `RolloutResult`.
 
     Attributes
     ----------
@@ -119,19 +119,19 @@ class Rollout:
         threads: int | None = None,
         lanes: int | None = None,
     ) -> None:
-        self._functions, source = prepare(pieces.step, pieces.update, pieces.ode, wrt, start)
+        self._functions, source = prepare_rollout(pieces.step, pieces.update, pieces.ode, wrt, start)
         step = self._functions["step"]
         self.n_states, self.n_inputs, self.n_parameters = (step.size1_in(i) for i in (2, 3, 4))
         self.n_outputs = self._functions["output"].size1_out(0)
         self.n_columns = len(tuple(wrt)) + (self.n_states if start else 0)
         self._starts = self.n_states if start else 0
-        self._threads = threads or _processors()
+        self._threads = threads or _processor_count()
         choices = ("SIMD", "LANES=1") if lanes is None else (f"LANES={lanes}",)
-        self._library = build(source, *choices) if source and lanes != 0 else None
+        self._library = compile_library(source, *choices) if source and lanes != 0 else None
         self.lanes = 0 if self._library is None else ctypes.c_int.in_dll(self._library, "rollout_lanes").value
 
     @property
-    def is_compiled(self) -> bool:
+    def uses_machine_code(self) -> bool:
         """Whether machine code runs; otherwise the CasADi VM does."""
         return self._library is not None
 
@@ -145,7 +145,7 @@ class Rollout:
         *,
         substeps: int = 1,
         states: bool = False,
-    ) -> Run:
+    ) -> RolloutResult:
         """Integrate m segments of n samples each.
 
         Parameters
@@ -165,7 +165,7 @@ class Rollout:
         -------
         Run
         """
-        return self._run(*self._checked(x0, u, p, t, h, substeps), substeps, states)
+        return self._run(*self._check_arrays(x0, u, p, t, h, substeps), substeps, states)
 
     def gram(
         self,
@@ -194,14 +194,14 @@ class Rollout:
         -------
         Gram
         """
-        given = self._checked(x0, u, p, t, h, substeps)
+        given = self._check_arrays(x0, u, p, t, h, substeps)
         y, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (measured, weight))
         shape = (*given[3].shape, self.n_outputs)
         for name, array in (("measured", y), ("weight", w)):
             require(array.shape == shape, f"{name}: {array.shape}, expected {shape}", ModelError)
-        return (self._gram_compiled if self._library is not None else self._gram_vm)(given, y, w, substeps)
+        return (self._gram_native if self._library is not None else self._gram_vm)(given, y, w, substeps)
 
-    def _checked(
+    def _check_arrays(
         self, x0: ArrayLike, u: ArrayLike, p: ArrayLike, t: ArrayLike, h: ArrayLike, substeps: int
     ) -> tuple[Array, Array, Array, Array, Array]:
         t, h, x0, u, p = (np.ascontiguousarray(a, dtype=np.float64) for a in (t, h, x0, u, p))
@@ -215,27 +215,27 @@ class Rollout:
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}", ModelError)
         return x0, u, p, t, h
 
-    def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
+    def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> RolloutResult:
         if self._library is None:
             return self._run_vm(x0, u, p, t, h, substeps, states)
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         x = np.empty((m, n, nx)) if states else None
-        self._call((x0, u, p, t, h), substeps, (None, None, y, dy, x, x_end, dx_end, None, None))
-        return Run(y, x_end, x, _swapped(dy), _swapped(dx_end))
+        self._call_library((x0, u, p, t, h), substeps, (None, None, y, dy, x, x_end, dx_end, None, None))
+        return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
-    def _gram_compiled(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
+    def _gram_native(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         m, nx, ns = len(given[0]), self.n_states, self.n_columns
         grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
         y, x_end, dx_end = np.empty(measured.shape), np.empty((m, nx)), np.empty((m, ns, nx))
-        self._call(given, substeps, (measured, weight, y, None, None, x_end, dx_end, grams, squares))
+        self._call_library(given, substeps, (measured, weight, y, None, None, x_end, dx_end, grams, squares))
         return Gram(grams, squares, y, x_end, np.swapaxes(dx_end, 1, 2))
 
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
-        for i in range(0, len(measured), BATCH):
-            x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + BATCH] for a in (*given, measured, weight))
+        for i in range(0, len(measured), VM_BATCH):
+            x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + VM_BATCH] for a in (*given, measured, weight))
             run = self._run_vm(x0, u, p, t, h, substeps, states=False)
             dy = np.empty((*y.shape, 0)) if run.dy is None else run.dy
             dx_end = np.empty((*run.x_end.shape, 0)) if run.dx_end is None else run.dx_end
@@ -245,7 +245,7 @@ class Rollout:
             parts.append((np.swapaxes(flat, 1, 2) @ flat, np.sum(e[..., -1] ** 2, axis=1), run.y, run.x_end, dx_end))
         return Gram(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
-    def _call(self, given: tuple[Array, ...], substeps: int, others: tuple[Array | None, ...]) -> None:
+    def _call_library(self, given: tuple[Array, ...], substeps: int, others: tuple[Array | None, ...]) -> None:
         """Run the machine code, the segments shared out to the threads."""
         assert self._library is not None
         p, (m, n) = given[2], given[3].shape
@@ -262,11 +262,11 @@ class Rollout:
         if len(calls) == 1:
             function(*calls[0])
         else:
-            running = [_pool(self._threads).submit(_called, function, call, arrays) for call in calls]
+            running = [_pool(self._threads).submit(_call_part, function, call, arrays) for call in calls]
             for each in running:
                 each.result()
 
-    def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> Run:
+    def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> RolloutResult:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         update, step, output = (f and f.map(m) for f in map(self._functions.get, ("update", "step", "output")))
         assert step is not None
@@ -288,17 +288,17 @@ class Rollout:
         run_x = np.stack([np.array(a).T for a in xs], axis=1) if states else None
         x_end = np.array(x).T.copy()
         if not ns:
-            return Run(run_y, x_end, run_x)
-        run_dy = np.stack([_unstacked(a, ny, m, ns) for a in dys], axis=1)
-        return Run(run_y, x_end, run_x, run_dy, _unstacked(S, nx, m, ns))
+            return RolloutResult(run_y, x_end, run_x)
+        run_dy = np.stack([_unstack(a, ny, m, ns) for a in dys], axis=1)
+        return RolloutResult(run_y, x_end, run_x, run_dy, _unstack(S, nx, m, ns))
 
 
-def _called(function: Callable[..., None], call: tuple[object, ...], arrays: tuple[Array | None, ...]) -> None:  # noqa: ARG001
+def _call_part(function: Callable[..., None], call: tuple[object, ...], arrays: tuple[Array | None, ...]) -> None:  # noqa: ARG001
     """Run a thread's part; it holds the arrays, so that Ctrl-C in the main thread cannot free them meanwhile."""
     function(*call)
 
 
-def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
+def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     """Make an SX Function callable on arrays, as machine code where a compiler is found.
 
     Parameters
@@ -311,11 +311,11 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     callable
         ``f(*inputs) -> tuple of ndarray``: vectors flat, matrices of shape (rows, columns). Not thread-safe.
     """
-    function = _dense(function, "system_function")
+    function = _with_dense_outputs(function, "system_function")
     shapes = [function.size_out(i) for i in range(function.n_out())]
-    library = build(_casadi_source(function))
+    library = compile_library(_casadi_source(function))
     if library is None:
-        return lambda *inputs: tuple(map(_shaped, map(np.array, function.call(list(inputs))), shapes))
+        return lambda *inputs: tuple(map(_reshape, map(np.array, function.call(list(inputs))), shapes))
     buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
     results = [_buffer(shape) for shape in shapes]
     work = np.zeros(max(1, function.sz_w()))
@@ -326,7 +326,7 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     call.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int]
     pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
 
-    def evaluate(*inputs: ArrayLike) -> tuple[Array, ...]:
+    def call_machine_code(*inputs: ArrayLike) -> tuple[Array, ...]:
         for i, (buffer, value) in enumerate(zip(buffers, inputs, strict=True)):
             size = value.size if isinstance(value, np.ndarray) else np.size(value)
             if size != buffer.size:
@@ -335,8 +335,8 @@ def compiled(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
         call(*pointers)
         return tuple([result.copy() for result in results])
 
-    evaluate.keep_alive = (library, arg, res, work)  # type: ignore[attr-defined]
-    return evaluate
+    call_machine_code.keep_alive = (library, arg, res, work)  # type: ignore[attr-defined]
+    return call_machine_code
 
 
 def _casadi_source(function: ca.Function) -> str:
@@ -345,7 +345,7 @@ def _casadi_source(function: ca.Function) -> str:
     return str(generator.dump())
 
 
-def _processors() -> int:
+def _processor_count() -> int:
     """Those that this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)  # Linux only
     return len(allowed(0)) if allowed else os.cpu_count() or 1
@@ -356,18 +356,18 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="pneuopt")
 
 
-def _dense(function: ca.Function, name: str) -> ca.Function:
+def _with_dense_outputs(function: ca.Function, name: str) -> ca.Function:
     inputs = [ca.SX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
     outputs = function.call(inputs)
     return ca.Function(name, inputs, [ca.densify(o) for o in outputs], {"cse": True})
 
 
-def _unstacked(block: ca.DM, rows: int, m: int, columns: int) -> Array:
+def _unstack(block: ca.DM, rows: int, m: int, columns: int) -> Array:
     """(rows, m * columns) as CasADi's map stacks it -> (m, rows, columns)."""
     return np.ascontiguousarray(np.array(block).reshape(rows, m, columns).transpose(1, 0, 2))
 
 
-def _swapped(array: Array | None) -> Array | None:
+def _swap_last_axes(array: Array | None) -> Array | None:
     return None if array is None else np.swapaxes(array, -1, -2)
 
 
@@ -376,6 +376,6 @@ def _buffer(shape: tuple[int, int]) -> Array:
     return np.zeros(shape[0] * shape[1]) if 1 in shape else np.zeros(shape, order="F")
 
 
-def _shaped(array: Array, shape: tuple[int, int]) -> Array:
+def _reshape(array: Array, shape: tuple[int, int]) -> Array:
     rows, columns = shape
     return array.ravel(order="F") if 1 in (rows, columns) else array.reshape(rows, columns, order="F")

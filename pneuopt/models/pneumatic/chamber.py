@@ -1,18 +1,18 @@
 """The air in a cylinder's chamber: pressure, and where wanted temperature, from flows and motion."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import casadi as ca
 
-from pneuopt.models.pneumatic.gas import ISENTROPIC
+from pneuopt.dynamics.system import Symbols
+from pneuopt.models.pneumatic.gas import ISENTROPIC_EXPONENT
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-Symbols = Mapping[str, ca.SX]
-TURNING_FLOW = 1e-5  # [kg/s] over which a flow's exponent or temperature changes from outflow's to inflow's
-VACUUM = 1e3  # [Pa] below it nothing here is meant to hold
-PRESSURE = Quantity("pressure", "Pa(a)", nominal=5e5, lower=VACUUM)
+FLOW_REVERSAL_WIDTH = 1e-5  # [kg/s] over which a flow's exponent or temperature changes from outflow's to inflow's
+MIN_CHAMBER_PRESSURE = 1e3  # [Pa] below it nothing here is meant to hold
+PRESSURE = Quantity("pressure", "Pa(a)", nominal=5e5, lower=MIN_CHAMBER_PRESSURE)
 
 
 class Inflow(NamedTuple):
@@ -26,7 +26,7 @@ class Surroundings(NamedTuple):
     """What a chamber does not determine: volume [m^3], its rate [m^3/s], temperature of supply and wall [K], R."""
 
     volume: ca.SX
-    swept: ca.SX
+    volume_rate: ca.SX
     temperature: ca.SX
     gas_constant: ca.SX
 
@@ -97,7 +97,7 @@ class Polytropic:
             p[f"{n}_exponent" if self.mixed else "exponent"] for n in ("inflow", "outflow", "volume")
         )
         fed = blend(w, inward, outward) * around.gas_constant * around.temperature * w
-        return {"pressure": (fed - swept * z["pressure"] * around.swept) / around.volume}
+        return {"pressure": (fed - swept * z["pressure"] * around.volume_rate) / around.volume}
 
 
 @dataclass(frozen=True)
@@ -127,15 +127,15 @@ class Thermal:
 
     def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
         """See the class."""
-        pressure, temperature, k = z["pressure"], z["temperature"], ISENTROPIC
+        pressure, temperature, k = z["pressure"], z["temperature"], ISENTROPIC_EXPONENT
         enthalpy = sum((w * blend(w, source, temperature) for w, source in flows), start=ca.SX(0))
         heat = p["wall_conductance"] * (around.temperature - temperature)
-        rate = (k * around.gas_constant * enthalpy - k * pressure * around.swept + (k - 1) * heat) / around.volume
+        rate = (k * around.gas_constant * enthalpy - k * pressure * around.volume_rate + (k - 1) * heat) / around.volume
         mass = pressure * around.volume / (around.gas_constant * temperature)
         growth = sum((flow.rate for flow in flows), start=ca.SX(0)) / mass
         return {
             "pressure": rate,
-            "temperature": temperature * (rate / pressure + around.swept / around.volume - growth),
+            "temperature": temperature * (rate / pressure + around.volume_rate / around.volume - growth),
         }
 
 
@@ -158,4 +158,4 @@ def blend(flow: ca.SX, inward: ca.SX, outward: ca.SX) -> ca.SX:
     >>> round(float(blend(1e-2, 1.4, 1.0)), 6), round(float(blend(0.0, 1.4, 1.0)), 6)
     (1.4, 1.2)
     """
-    return outward + (inward - outward) * (1 + flow / ca.sqrt(flow**2 + TURNING_FLOW**2)) / 2
+    return outward + (inward - outward) * (1 + flow / ca.sqrt(flow**2 + FLOW_REVERSAL_WIDTH**2)) / 2

@@ -3,16 +3,15 @@
 Position counts from the end at which chamber a is smallest; the rod is on side b.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 
 import casadi as ca
 
+from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import REFERENCE_PRESSURE
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
-Symbols = Mapping[str, ca.SX]
 STOP_ROUNDING = 1e-4  # [m] of the end stops' onset; 10 mm away a stop of 1e6 N/m still pushes with 0.25 N
 
 
@@ -54,7 +53,7 @@ class Cylinder:
         """
         if not self.stops:
             return ca.SX(0)
-        front, rear = (_onset(d) for d in (y - p["stroke"], -y))
+        front, rear = (_smooth_positive_part(d) for d in (y - p["stroke"], -y))
         return p["stop_stiffness"] * (rear * (1 - p["stop_damping"] * v) - front * (1 + p["stop_damping"] * v))
 
 
@@ -128,5 +127,5 @@ def piston_leak(pressure_a: ca.SX, pressure_b: ca.SX, leak: ca.SX) -> ca.SX:
     return leak * (pressure_b - pressure_a) * (pressure_a + pressure_b) / (2 * REFERENCE_PRESSURE)
 
 
-def _onset(d: ca.SX) -> ca.SX:
+def _smooth_positive_part(d: ca.SX) -> ca.SX:
     return (d + ca.sqrt(d**2 + STOP_ROUNDING**2)) / 2

@@ -7,30 +7,28 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from pneuopt.dynamics.hooks import Doubter, Log, Rest
-from pneuopt.dynamics.system import System, define, names, stacked, symbols, vector
-from pneuopt.models.drive import AMBIENT, POSITION, SPEED, gauge, part, renamed
+from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest
+from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
+from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, gauge_pressures, rename_quantity, without_prefix
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.pneumatic.gas import GAS_CONSTANT
-from pneuopt.models.pneumatic.limits import check_hardware, check_start, guards, stray
-from pneuopt.models.pneumatic.rest import BALANCED, Glide, steady
+from pneuopt.models.pneumatic.limits import check_hardware, check_start, cylinder_guards, position_warning
+from pneuopt.models.pneumatic.rest import BALANCE_RATES, MotionBalance, solve_steady_motion
 from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve
 from pneuopt.models.starts.pneumatic import PneumaticStarts
-from pneuopt.models.starts.pressure_zero import PressureZeros
+from pneuopt.models.starts.pressure_zero import PressureZeroCheck
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-Symbols = Mapping[str, ca.SX]
 SIDES = ("a", "b")
-PRESSURES = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
+CHAMBER_PRESSURES = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
 
 
 @dataclass(frozen=True)
@@ -73,15 +71,15 @@ class PneumaticDrive:
         }
         joined = ParameterSet()
         for name, own in parts.items():
-            joined |= own.prefixed(name)
-        return joined | AMBIENT | _AIR
+            joined |= own.with_prefix(name)
+        return joined | AMBIENT_PARAMETERS | _AIR_PARAMETERS
 
     @property
     def states(self) -> tuple[Quantity, ...]:
         """The load's, the chambers', the valve's, the friction's."""
-        air = tuple(renamed(q, f"{q.name}_{side}") for q in self.chamber.states for side in SIDES)
-        spool = tuple(renamed(q, f"valve.{q.name}") for q in self.valve.states)
-        return POSITION, SPEED, *air, *spool, *(renamed(q, f"friction.{q.name}") for q in self.friction.states)
+        air = tuple(rename_quantity(q, f"{q.name}_{side}") for q in self.chamber.states for side in SIDES)
+        spool = tuple(rename_quantity(q, f"valve.{q.name}") for q in self.valve.states)
+        return POSITION, SPEED, *air, *spool, *(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
 
     def system(self) -> System:
         """Wire the parts."""
@@ -149,10 +147,12 @@ class PneumaticDrive:
         stroke = used.value("cylinder.stroke")
         y = used.value("cylinder.start") * stroke if position is None else position
         require(0 <= y <= stroke, f"a start at position = {y:g} m lies outside the stroke, 0 to {stroke:g} m")
-        states, voltage = steady(Glide(self._glide, vector(self.parameters, used), y, speed), used, pressure_b)
+        states, voltage = solve_steady_motion(
+            MotionBalance(self._balance_function, parameter_vector(self.parameters, used), y, speed), used, pressure_b
+        )
         return Rest(dict(zip(names(self.states), states, strict=True)), {VALVE_VOLTAGE.name: voltage})
 
-    def push(self, measured: Trajectory, parameters: ParameterSet) -> Array:
+    def air_force(self, measured: Trajectory, parameters: ParameterSet) -> Array:
         """Force of the air on the piston, from both logged pressures: the input "force" of a `ForceDrive`.
 
         Parameters
@@ -170,70 +170,81 @@ class PneumaticDrive:
         self.check(parameters)
         used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
         numbers = {n: q.value for n, q in used.items()}
-        return np.asarray(_push(numbers, *(measured[q.name] for q in PRESSURES)))
+        return np.asarray(_air_force(numbers, *(measured[q.name] for q in CHAMBER_PRESSURES)))
 
     @cached_property
     def _system(self) -> System:
-        outputs = (POSITION, SPEED, *PRESSURES)
-        starts = PneumaticStarts(self.system, _push)
-        system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._rest_for_loop)
-        doubts = partial(_doubts, PressureZeros(starts.runs))
-        known = replace(system, checker=self.check, guards=guards(self.cylinder.stops), doubter=doubts)
-        return replace(known, meter=self._meter())
+        outputs = (POSITION, SPEED, *CHAMBER_PRESSURES)
+        starts = PneumaticStarts(self.system, _air_force)
+        system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._find_rest)
+        doubts = partial(_log_warnings, PressureZeroCheck(starts.prepare_logs))
+        known = replace(
+            system,
+            hardware_check_hook=self.check,
+            validity_limits=cylinder_guards(self.cylinder.stops),
+            log_warning_hook=doubts,
+        )
+        return replace(known, meter=self._meter_function())
 
     def _rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG002 - no time in it
         y, v, a, b = (x[n] for n in ("position", "speed", "pressure_a", "pressure_b"))
-        friction = self.friction.force(v, part(x, "friction"), gauge(self.friction, x, p), part(p, "friction"))
-        stop = self.cylinder.stop_force(y, v, part(p, "cylinder"))
-        acceleration = self.load.acceleration(_push(p, a, b) - friction.value + stop, y, part(p, "load"))
-        spool = self.valve.rates(u["valve_voltage"], part(x, "valve"), part(p, "valve"))
-        rates = {"position": v, "speed": acceleration, **self._air(x, u, p)}
+        friction = self.friction.force(
+            v, without_prefix(x, "friction"), gauge_pressures(self.friction, x, p), without_prefix(p, "friction")
+        )
+        stop = self.cylinder.stop_force(y, v, without_prefix(p, "cylinder"))
+        acceleration = self.load.acceleration(_air_force(p, a, b) - friction.value + stop, y, without_prefix(p, "load"))
+        spool = self.valve.rates(u["valve_voltage"], without_prefix(x, "valve"), without_prefix(p, "valve"))
+        rates = {"position": v, "speed": acceleration, **self._chamber_rates(x, u, p)}
         rates |= {f"valve.{n}": rate for n, rate in spool.items()}
         rates |= {f"friction.{n}": rate for n, rate in friction.rates.items()}
-        return rates, {q.name: x[q.name] for q in (POSITION, SPEED, *PRESSURES)}
+        return rates, {q.name: x[q.name] for q in (POSITION, SPEED, *CHAMBER_PRESSURES)}
 
-    def _air(self, x: Symbols, u: Symbols, p: Symbols) -> dict[str, ca.SX]:
+    def _chamber_rates(self, x: Symbols, u: Symbols, p: Symbols) -> dict[str, ca.SX]:
         """Rates of the chambers' states."""
         outside, R = p["ambient.temperature"], p["gas.constant"]
-        inside, ports = self._inside(x, p)
-        through = self._through(x, u, p)
+        inside, ports = self._chambers_and_ports(x, p)
+        through = self._edge_flows(x, u, p)
         leak = piston_leak(x["pressure_a"], x["pressure_b"], p["cylinder.leak"])
         flows = {
             "a": [(through.supply_a, outside), (-through.a_exhaust, outside), (leak, ports["b"].temperature)],
             "b": [(through.supply_b, outside), (-through.b_exhaust, outside), (-leak, ports["a"].temperature)],
         }
-        swept = dict(zip(SIDES, (_areas(p)[0] * x["speed"], -_areas(p)[1] * x["speed"]), strict=True))
+        swept = dict(zip(SIDES, (_piston_areas(p)[0] * x["speed"], -_piston_areas(p)[1] * x["speed"]), strict=True))
         rates: dict[str, ca.SX] = {}
-        for side, volume in zip(SIDES, volumes(x["position"], part(p, "cylinder")), strict=True):
+        for side, volume in zip(SIDES, volumes(x["position"], without_prefix(p, "cylinder")), strict=True):
             around = Surroundings(volume, swept[side], outside, R)
-            own = self.chamber.rates(inside[side], [Inflow(*flow) for flow in flows[side]], around, part(p, "chamber"))
+            own = self.chamber.rates(
+                inside[side], [Inflow(*flow) for flow in flows[side]], around, without_prefix(p, "chamber")
+            )
             rates |= {f"{name}_{side}": rate for name, rate in own.items()}
         return rates
 
-    def _inside(self, x: Symbols, p: Symbols) -> tuple[dict[str, dict[str, ca.SX]], dict[str, Port]]:
+    def _chambers_and_ports(self, x: Symbols, p: Symbols) -> tuple[dict[str, dict[str, ca.SX]], dict[str, Port]]:
         """The chambers' states, and how the valve sees them, by side."""
         inside = {side: {q.name: x[f"{q.name}_{side}"] for q in self.chamber.states} for side in SIDES}
         outside = p["ambient.temperature"]
         return inside, {side: Port(z["pressure"], self.chamber.temperature(z, outside)) for side, z in inside.items()}
 
-    def _through(self, x: Symbols, u: Symbols, p: Symbols) -> Flows:
+    def _edge_flows(self, x: Symbols, u: Symbols, p: Symbols) -> Flows:
         """Mass flows through the valve's edges."""
-        outside, ports = p["ambient.temperature"], self._inside(x, p)[1]
+        outside, ports = p["ambient.temperature"], self._chambers_and_ports(x, p)[1]
         supply, exhaust = Port(p["supply.pressure"], outside), Port(p["ambient.pressure"], outside)
-        return self.valve.flows(self._spool(x, u, p), supply, exhaust, ports["a"], ports["b"], part(p, "valve"))
+        return self.valve.flows(
+            self._spool_position(x, u, p), supply, exhaust, ports["a"], ports["b"], without_prefix(p, "valve")
+        )
 
-    def _spool(self, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
-        return self.valve.position(u["valve_voltage"], part(x, "valve"), part(p, "valve"))
+    def _spool_position(self, x: Symbols, u: Symbols, p: Symbols) -> ca.SX:
+        return self.valve.position(u["valve_voltage"], without_prefix(x, "valve"), without_prefix(p, "valve"))
 
-    def _meter(self) -> ca.Function:
+    def _meter_function(self) -> ca.Function:
         """``(t, x, u, p)`` to the air that both edges draw from the supply [kg/s], and the spool's position."""
         x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
-        through = self._through(x, u, p)
-        drawn = [through.supply_a + through.supply_b, self._spool(x, u, p)]
-        return ca.Function("meter", [ca.SX.sym("t"), *map(stacked, (x, u, p))], drawn)
+        through = self._edge_flows(x, u, p)
+        drawn = [through.supply_a + through.supply_b, self._spool_position(x, u, p)]
+        return ca.Function("meter", [ca.SX.sym("t"), *map(stack, (x, u, p))], drawn)
 
     @cached_property
-    def _glide(self) -> ca.Function:
+    def _balance_function(self) -> ca.Function:
         """``(y, v, spool, a, b, p) -> (rates of pressure_a, pressure_b and speed; states)``, the friction's own steady.
 
         Bristles' rates are linear in their deflections: one Newton step from zero finds where they stay.
@@ -245,19 +256,19 @@ class PneumaticDrive:
         known = {**given, **warm, **inner}
         x = {n: known.get(n, ca.SX(0)) for n in names(self.states)}
         rates, _ = self._rhs(ca.SX(0), x, {VALVE_VOLTAGE.name: given["valve.spool"] * p["valve.span"]}, p)
-        z, zdot = stacked(inner), stacked({n: rates[n] for n in inner})
+        z, zdot = stack(inner), stack({n: rates[n] for n in inner})
         steady = ca.substitute(-ca.solve(ca.jacobian(zdot, z), zdot), z, 0) if inner else z
-        found = [ca.vertcat(*(rates[n] for n in BALANCED)), stacked(x)]
-        arguments = [*given.values(), stacked(p)]
+        found = [ca.vertcat(*(rates[n] for n in BALANCE_RATES)), stack(x)]
+        arguments = [*given.values(), stack(p)]
         return ca.Function("glide", arguments, ca.substitute(found, [z], [steady]) if inner else found)
 
-    def _rest_for_loop(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
+    def _find_rest(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
         others = ", ".join(sorted(outputs.keys() - {"position", "speed", "pressure_b"}))
         require(not others, f"a cylinder's start is told by position, speed and pressure_b, not by {others}")
         return self.rest(parameters, **outputs)
 
 
-_AIR = ParameterSet(
+_AIR_PARAMETERS = ParameterSet(
     {
         "ambient.temperature": Parameter(293.15, "K", 200.0, 400.0, source="ISO 8778 standard atmosphere (ANR)"),
         "gas.constant": Parameter(GAS_CONSTANT, "J/(kg*K)", 250.0, 320.0, source="dry air"),
@@ -265,19 +276,19 @@ _AIR = ParameterSet(
 )
 
 
-def _doubts(zeros: Doubter, logs: Mapping[str, Log]) -> Sequence[str]:
+def _log_warnings(zeros: LogWarningHook, logs: Mapping[str, Log]) -> Sequence[str]:
     """Positions that cannot be, and pressures; these say nothing where the chambers' volumes are wrong."""
     moved = {name: log for name, log in logs.items() if "position" in log.measured}
-    found = {name: stray(log.parameters, log.measured["position"]) for name, log in moved.items()}
+    found = {name: position_warning(log.parameters, log.measured["position"]) for name, log in moved.items()}
     outside = [f"{name}: {sentence}" for name, sentence in found.items() if sentence]
     return outside or zeros(logs)
 
 
-def _push(p: Mapping[str, Any], a: Any, b: Any) -> Any:
+def _air_force(p: Mapping[str, Any], a: Any, b: Any) -> Any:
     """Force of the air on the piston [N], from symbols or numbers."""
     area_a, area_b = areas(p["cylinder.bore"], p["cylinder.rod"])
     return area_a * (a - p["ambient.pressure"]) - area_b * (b - p["ambient.pressure"])
 
 
-def _areas(p: Symbols) -> tuple[ca.SX, ca.SX]:
+def _piston_areas(p: Symbols) -> tuple[ca.SX, ca.SX]:
     return areas(p["cylinder.bore"], p["cylinder.rod"])

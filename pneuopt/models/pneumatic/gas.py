@@ -6,23 +6,24 @@ smoothing, as a fraction of the choked flow, for zero = 1e-3: 5e-5 where choked,
 1.1 % at worst (above 0.9998); for zero = 1e-2: 1.6 % below 0.99.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 from typing import Protocol
 
 import casadi as ca
 
+from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
-Symbols = Mapping[str, ca.SX]
 GAS_CONSTANT = 287.05  # [J/(kg K)] dry air
-ISENTROPIC = 1.4  # [-] ratio of specific heats of air
+ISENTROPIC_EXPONENT = 1.4  # [-] ratio of specific heats of air
 REFERENCE_DENSITY = 1.185  # [kg/m^3] ANR, ISO 8778: 100 kPa, 20 degC, 65 % humidity
 REFERENCE_TEMPERATURE = 293.15  # [K] ANR
 REFERENCE_PRESSURE = 1e5  # [Pa] ANR
-CRITICAL_RATIO = (2 / (ISENTROPIC + 1)) ** (ISENTROPIC / (ISENTROPIC - 1))  # 0.528282, of the isentropic nozzle
-_POWER = (ISENTROPIC - 1) / ISENTROPIC
+CRITICAL_RATIO = (2 / (ISENTROPIC_EXPONENT + 1)) ** (
+    ISENTROPIC_EXPONENT / (ISENTROPIC_EXPONENT - 1)
+)  # 0.528282, of the isentropic nozzle
+_TEMPERATURE_EXPONENT = (ISENTROPIC_EXPONENT - 1) / ISENTROPIC_EXPONENT
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Iso6358:
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
         """See `FlowLaw`."""
-        high, z, s = clipped_ratio(upstream, downstream, p["critical_ratio"], smoothing)
+        high, z, s = clip_pressure_ratio(upstream, downstream, p["critical_ratio"], smoothing)
         flow: ca.SX = high * z / s * (s * (2 - s)) ** self.exponent
         return flow
 
@@ -95,15 +96,15 @@ class IsentropicNozzle:
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
         """See `FlowLaw`."""
-        high, z, s = clipped_ratio(upstream, downstream, CRITICAL_RATIO, smoothing)
+        high, z, s = clip_pressure_ratio(upstream, downstream, CRITICAL_RATIO, smoothing)
         # r^(2/k) - r^((k+1)/k) with one power: k = 1.4 makes 2/(k-1) the whole number 5
-        chill = (1 - (1 - CRITICAL_RATIO) * s) ** _POWER
-        least = CRITICAL_RATIO**_POWER
+        chill = (1 - (1 - CRITICAL_RATIO) * s) ** _TEMPERATURE_EXPONENT
+        least = CRITICAL_RATIO**_TEMPERATURE_EXPONENT
         flow: ca.SX = high * z / s * ca.sqrt(chill**5 * (1 - chill) / (least**5 * (1 - least)))
         return flow
 
 
-def clipped_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoothing) -> tuple[ca.SX, ca.SX, ca.SX]:
+def clip_pressure_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoothing) -> tuple[ca.SX, ca.SX, ca.SX]:
     """The higher pressure, the clipped ratio z in (-1, 1) and its rounded size s, as every flow law needs them.
 
     Parameters
@@ -153,7 +154,7 @@ def conductance_of_area(area: float) -> float:
     >>> round(conductance_of_area(5.02e-6) * 1e8, 3)
     1.0
     """
-    k = ISENTROPIC
+    k = ISENTROPIC_EXPONENT
     choked = sqrt(k / (GAS_CONSTANT * REFERENCE_TEMPERATURE)) * (2 / (k + 1)) ** ((k + 1) / (2 * (k - 1)))
     return float(area * choked / REFERENCE_DENSITY)
 

@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.dynamics.guards import Guard
-from pneuopt.models.pneumatic.chamber import VACUUM
+from pneuopt.dynamics.guards import ValidityLimit
+from pneuopt.models.pneumatic.chamber import MIN_CHAMBER_PRESSURE
 from pneuopt.models.pneumatic.cylinder import STOP_ROUNDING
 from pneuopt.quantities.errors import HardwareError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 
-EMPTY = 0.5  # of the ambient pressure: lip seals let air in long before
-STRAY = 0.01  # of the stroke, by which a piston that presses into a stop may stand outside
-MISPLACED = 0.05  # of the stroke, by which a position sensor's zero may be off
-_SIDES = {"a": "rear", "b": "front"}
+EMPTY_CHAMBER_RATIO = 0.5  # of the ambient pressure: lip seals let air in long before
+MAX_STOP_TRAVEL = 0.01  # of the stroke, by which a piston that presses into a stop may stand outside
+MAX_POSITION_ZERO_ERROR = 0.05  # of the stroke, by which a position sensor's zero may be off
+_END_NAMES = {"a": "rear", "b": "front"}
 
 
 def check_hardware(p: ParameterSet) -> None:
@@ -34,7 +34,7 @@ def check_hardware(p: ParameterSet) -> None:
     HardwareError
         Naming parameter, value, source and what would be possible.
     """
-    for name, limit in _limits(p).items():
+    for name, limit in _hardware_limits(p).items():
         if name in p and not limit.allows(p.value(name)):
             source = f" (source: {p[name].source})" if p[name].source else ""
             shown = write_value(p.value(name), p[name].unit)
@@ -54,12 +54,12 @@ def check_start(p: ParameterSet, start: Mapping[str, float]) -> None:
     InputError
     """
     stroke, y = p.value("cylinder.stroke"), start.get("position", 0.0)
-    inside = -STRAY * stroke <= y <= (1 + STRAY) * stroke
+    inside = -MAX_STOP_TRAVEL * stroke <= y <= (1 + MAX_STOP_TRAVEL) * stroke
     shown = write_value(y, "m"), write_value(stroke, "m")
     require(inside, f"a start at position = {shown[0]} lies outside the stroke, 0 to {shown[1]}")
 
 
-def stray(p: ParameterSet, position: NDArray[np.float64]) -> str:
+def position_warning(p: ParameterSet, position: NDArray[np.float64]) -> str:
     """What speaks against a logged position: that it lies outside the stroke by more than a sensor's zero is off.
 
     Parameters
@@ -75,14 +75,14 @@ def stray(p: ParameterSet, position: NDArray[np.float64]) -> str:
     """
     stroke = p.value("cylinder.stroke")
     low, high = (float(np.nanpercentile(position, q)) for q in (1, 99))
-    if -MISPLACED * stroke <= low and high <= (1 + MISPLACED) * stroke:
+    if -MAX_POSITION_ZERO_ERROR * stroke <= low and high <= (1 + MAX_POSITION_ZERO_ERROR) * stroke:
         return ""
     where = f"position runs from {write_value(low, 'm')} to {write_value(high, 'm')}"
     remedy = "check its sign, unit and zero, and cylinder.stroke"
     return f"{where}, outside the stroke, 0 to {write_value(stroke, 'm')}: {remedy}"
 
 
-def guards(stops: bool) -> tuple[Guard, ...]:
+def cylinder_guards(stops: bool) -> tuple[ValidityLimit, ...]:
     """What a simulation of a cylinder watches.
 
     Parameters
@@ -95,31 +95,31 @@ def guards(stops: bool) -> tuple[Guard, ...]:
     tuple of Guard
         Both ends of the stroke, and both chambers at half the ambient pressure.
     """
-    return (*(_end(side, stops) for side in _SIDES), *(_empty(side) for side in _SIDES))
+    return (*(_end_guard(side, stops) for side in _END_NAMES), *(_empty_chamber_guard(side) for side in _END_NAMES))
 
 
-def _end(side: str, stops: bool) -> Guard:
-    what = f"reached the {_SIDES[side]} end stop" if stops else f"left the stroke at the {_SIDES[side]}"
+def _end_guard(side: str, stops: bool) -> ValidityLimit:
+    what = f"reached the {_END_NAMES[side]} end stop" if stops else f"left the stroke at the {_END_NAMES[side]}"
     meaning = "the response is the stop's" if stops else "the model, which has no stops, means nothing"
-    limit, margin = (_front if side == "b" else _rear), (STOP_ROUNDING if stops else 0.0)
-    return Guard("position", partial(limit, margin), 1 if side == "b" else -1, f"the piston {what}", meaning)
+    limit, margin = (_front_limit if side == "b" else _rear_limit), (STOP_ROUNDING if stops else 0.0)
+    return ValidityLimit("position", partial(limit, margin), 1 if side == "b" else -1, f"the piston {what}", meaning)
 
 
-def _empty(side: str) -> Guard:
+def _empty_chamber_guard(side: str) -> ValidityLimit:
     meaning = "real seals let air in, the model does not"
-    return Guard(f"pressure_{side}", _half_ambient, -1, f"chamber {side} was emptied", meaning)
+    return ValidityLimit(f"pressure_{side}", _empty_chamber_pressure, -1, f"chamber {side} was emptied", meaning)
 
 
-def _front(margin: float, p: ParameterSet) -> float:
+def _front_limit(margin: float, p: ParameterSet) -> float:
     return p.value("cylinder.stroke") - margin
 
 
-def _rear(margin: float, p: ParameterSet) -> float:  # noqa: ARG001 - as `_front`
+def _rear_limit(margin: float, p: ParameterSet) -> float:  # noqa: ARG001 - as `_front_limit`
     return margin
 
 
-def _half_ambient(p: ParameterSet) -> float:
-    return EMPTY * p.value("ambient.pressure")
+def _empty_chamber_pressure(p: ParameterSet) -> float:
+    return EMPTY_CHAMBER_RATIO * p.value("ambient.pressure")
 
 
 class _Limit(NamedTuple):
@@ -128,13 +128,13 @@ class _Limit(NamedTuple):
     remedy: str
     lower: float = -inf
     upper: float = inf
-    open: bool = True
+    exclusive: bool = True
 
     def allows(self, value: float) -> bool:
-        return self.lower < value < self.upper or (not self.open and value in (self.lower, self.upper))
+        return self.lower < value < self.upper or (not self.exclusive and value in (self.lower, self.upper))
 
 
-_POSITIVE = {
+_POSITIVE_REMEDIES = {
     "cylinder.bore": "a bore is positive",
     "cylinder.stroke": "a stroke is positive",
     "cylinder.dead_volume_a": "ports and hoses always hold some air: a few percent of the swept volume are usual",
@@ -148,7 +148,7 @@ _POSITIVE = {
     "gas.constant": "air has 287.05 J/(kg*K)",
     "load.mass": "the piston alone weighs something",
 }
-_NOT_NEGATIVE = {
+_NON_NEGATIVE_REMEDIES = {
     "cylinder.leak": "no leakage is 0",
     "cylinder.stop_stiffness": "no stop is 0, or Cylinder(stops=False)",
     "cylinder.stop_damping": "no damping is 0",
@@ -157,23 +157,23 @@ _NOT_NEGATIVE = {
 }
 
 
-def _limits(p: ParameterSet) -> dict[str, _Limit]:
+def _hardware_limits(p: ParameterSet) -> dict[str, _Limit]:
     bore, ambient = (write_value(p.value(n), p[n].unit) for n in ("cylinder.bore", "ambient.pressure"))
     exponents = {
         n: _Limit("1 is isothermal, 1.4 adiabatic", 0.0) for n in p if n.startswith("chamber.") and "exponent" in n
     }
     return {
-        **{n: _Limit(remedy, 0.0) for n, remedy in _POSITIVE.items()},
-        **{n: _Limit(remedy, 0.0, open=False) for n, remedy in _NOT_NEGATIVE.items()},
+        **{n: _Limit(remedy, 0.0) for n, remedy in _POSITIVE_REMEDIES.items()},
+        **{n: _Limit(remedy, 0.0, exclusive=False) for n, remedy in _NON_NEGATIVE_REMEDIES.items()},
         **exponents,
         "cylinder.rod": _Limit(
             f"a rod is thinner than the bore, {bore}; rodless is 0", -1e-300, p.value("cylinder.bore")
         ),
-        "cylinder.start": _Limit("a start lies within the stroke, 0 to 1", 0.0, 1.0, open=False),
+        "cylinder.start": _Limit("a start lies within the stroke, 0 to 1", 0.0, 1.0, exclusive=False),
         "valve.critical_ratio": _Limit(
             "a critical pressure ratio lies between 0 and 1, 0.2 to 0.5 for most valves", -1e-300, 1.0
         ),
-        "ambient.pressure": _Limit("an absolute pressure is positive; sea level is 101325 Pa(a)", VACUUM),
+        "ambient.pressure": _Limit("an absolute pressure is positive; sea level is 101325 Pa(a)", MIN_CHAMBER_PRESSURE),
         "supply.pressure": _Limit(
             f"the supply lies above the ambient pressure, {ambient}", p.value("ambient.pressure")
         ),

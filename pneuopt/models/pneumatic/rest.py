@@ -4,20 +4,18 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from pneuopt.models.pneumatic.chamber import VACUUM
+from pneuopt.models.pneumatic.chamber import MIN_CHAMBER_PRESSURE
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
-Array = NDArray[np.float64]
-BALANCED = ("pressure_a", "pressure_b", "speed")
-CROWDED = 20.0  # times the supply's pressure: the most that a moving piston may compress a chamber to
+BALANCE_RATES = ("pressure_a", "pressure_b", "speed")
+MAX_COMPRESSION_RATIO = 20.0  # times the supply's pressure: the most that a moving piston may compress a chamber to
 
 
-class Glide(NamedTuple):
+class MotionBalance(NamedTuple):
     """A drive at a position [m] and a speed [m/s], over its spool's position and both pressures.
 
     Attributes
@@ -44,7 +42,7 @@ class Glide(NamedTuple):
         return found
 
 
-def steady(glide: Glide, p: ParameterSet, pressure_b: float | None) -> tuple[list[float], float]:
+def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float | None) -> tuple[list[float], float]:
     """The states, and the valve's voltage, at which no rate but that of the position is left.
 
     Parameters
@@ -63,9 +61,9 @@ def steady(glide: Glide, p: ParameterSet, pressure_b: float | None) -> tuple[lis
     if glide.speed:
         _check_motion(p, glide.speed, pressure_b)
     if pressure_b is None:
-        spool, a, b = _balanced(glide, p)
+        spool, a, b = _solve_balance(glide, p)
     else:
-        spool, a, b = 0.0, _balancing(glide, p, pressure_b), pressure_b
+        spool, a, b = 0.0, _balance_pressure_a(glide, p, pressure_b), pressure_b
     return glide.states(spool, a, b), spool * p.value("valve.span")
 
 
@@ -76,29 +74,29 @@ def _check_motion(p: ParameterSet, speed: float, pressure_b: float | None) -> No
     require(spring == 0, words + f"load.stiffness = {spring:g} N/m pulls more the farther it goes; start at rest")
 
 
-def _balanced(glide: Glide, p: ParameterSet) -> tuple[float, float, float]:
+def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float, float]:
     """Spool and pressures at which nothing changes: nested bisections, each on a function with one zero.
 
     In motion a chamber may hold more than the supply's pressure: the piston pumps, the spool throttles.
     """
     low, high, rates = p.value("ambient.pressure"), p.value("supply.pressure"), glide.rates
     if glide.speed:
-        low, high = VACUUM, CROWDED * high
+        low, high = MIN_CHAMBER_PRESSURE, MAX_COMPRESSION_RATIO * high
 
     def pressures(spool: float) -> tuple[float, float]:
-        def b(a: float) -> float:
-            return _fall(lambda b: rates(spool, a, b)[1], low, high)
+        def pressure_b_at(a: float) -> float:
+            return _zero_crossing_or_end(lambda pressure_b_at: rates(spool, a, pressure_b_at)[1], low, high)
 
         if p.value("cylinder.leak") == 0:
-            return _fall(lambda a: rates(spool, a, low)[0], low, high), b(low)
-        a = _fall(lambda a: rates(spool, a, b(a))[0], low, high)
-        return a, b(a)
+            return _zero_crossing_or_end(lambda a: rates(spool, a, low)[0], low, high), pressure_b_at(low)
+        a = _zero_crossing_or_end(lambda a: rates(spool, a, pressure_b_at(a))[0], low, high)
+        return a, pressure_b_at(a)
 
-    def push(spool: float) -> float:
+    def acceleration_at(spool: float) -> float:
         return rates(spool, *pressures(spool))[2]
 
     mass = p.value("load.mass")
-    ends = [push(end) * mass for end in (-1.0, 1.0)]
+    ends = [acceleration_at(end) * mass for end in (-1.0, 1.0)]
     what = f"no steady motion at speed = {glide.speed:g} m/s" if glide.speed else "no equilibrium exists"
     require(
         ends[0] <= 0 <= ends[1],
@@ -106,29 +104,38 @@ def _balanced(glide: Glide, p: ParameterSet) -> tuple[float, float, float]:
         f"{ends[1]:.4g} N at supply.pressure = {p.value('supply.pressure'):g} Pa(a), never with 0; "
         f"lower the {'speed or the ' if glide.speed else ''}load, raise the supply or the bore",
     )
-    spool = 0.0 if abs(push(0.0)) * mass < 1e-9 else _root(push, -1.0, 1.0)
-    a, b = pressures(spool)
-    inside = not glide.speed or (low < min(a, b) and max(a, b) < high)
-    require(inside, f"{what}: a chamber would need {a if low < b < high else b:g} Pa(a); lower the speed")
-    return spool, a, b
+    spool = 0.0 if abs(acceleration_at(0.0)) * mass < 1e-9 else _brent_root(acceleration_at, -1.0, 1.0)
+    a, pressure_b_at = pressures(spool)
+    inside = not glide.speed or (low < min(a, pressure_b_at) and max(a, pressure_b_at) < high)
+    require(
+        inside,
+        f"{what}: a chamber would need {a if low < pressure_b_at < high else pressure_b_at:g} Pa(a); lower the speed",
+    )
+    return spool, a, pressure_b_at
 
 
-def _balancing(glide: Glide, p: ParameterSet, b: float) -> float:
+def _balance_pressure_a(glide: MotionBalance, p: ParameterSet, b: float) -> float:
     """The pressure in chamber a that balances pressure b; the force is linear in it."""
-    require(b > VACUUM, f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {VACUUM:g} Pa")
+    require(
+        b > MIN_CHAMBER_PRESSURE,
+        f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {MIN_CHAMBER_PRESSURE:g} Pa",
+    )
     low, high = p.value("ambient.pressure"), p.value("supply.pressure")
     at_low, at_high = (glide.rates(0.0, a, b)[2] for a in (low, high))
     a = low - at_low * (high - low) / (at_high - at_low)
-    require(a > VACUUM, f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more")
+    require(
+        a > MIN_CHAMBER_PRESSURE,
+        f"no equilibrium exists: beside pressure_b = {b:g} Pa chamber a would need {a:g} Pa; give more",
+    )
     return a
 
 
-def _fall(rate: Callable[[float], float], low: float, high: float) -> float:
+def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: float) -> float:
     """Where a pressure's rate falls through zero; an end where it does not."""
     if rate(high) >= 0:
         return high
-    return low if rate(low) <= 0 else _root(rate, low, high)
+    return low if rate(low) <= 0 else _brent_root(rate, low, high)
 
 
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
+def _brent_root(function: Callable[[float], float], low: float, high: float) -> float:
     return float(brentq(function, low, high, xtol=1e-14 * (high - low), rtol=1e-15))

@@ -1,6 +1,5 @@
 """A 5/3 proportional directional valve: spool, four metering edges, leak."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from math import pi
@@ -8,10 +7,9 @@ from typing import NamedTuple
 
 import casadi as ca
 
+from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-
-Symbols = Mapping[str, ca.SX]
 
 
 class Spool(Enum):
@@ -85,14 +83,14 @@ class ProportionalValve:
 
     def position(self, voltage: ca.SX, z: Symbols, p: Symbols) -> ca.SX:
         """The spool's position [1] at a command [V] and the states z."""
-        return _command(voltage, p) if self.spool is Spool.RIGID else z["spool"]
+        return _spool_command(voltage, p) if self.spool is Spool.RIGID else z["spool"]
 
     def rates(self, voltage: ca.SX, z: Symbols, p: Symbols) -> dict[str, ca.SX]:
         """Rates of the spool's states: a lag of first or second order, corner frequency `bandwidth`."""
         if self.spool is Spool.RIGID:
             return {}
         w = 2 * pi * p["bandwidth"]
-        error = _command(voltage, p) - z["spool"]
+        error = _spool_command(voltage, p) - z["spool"]
         if self.spool is Spool.FIRST_ORDER:
             return {"spool": w * error}
         return {"spool": z["spool_rate"], "spool_rate": w**2 * error - 2 * p["damping"] * w * z["spool_rate"]}
@@ -100,14 +98,19 @@ class ProportionalValve:
     def flows(self, spool: ca.SX, supply: Port, exhaust: Port, a: Port, b: Port, p: Symbols) -> Flows:
         """Mass flows [kg/s] at a spool position [1]."""
 
-        def edge(upstream: Port, downstream: Port, x: ca.SX) -> ca.SX:
+        def edge_flow(upstream: Port, downstream: Port, x: ca.SX) -> ca.SX:
             scale = p["conductance"] * REFERENCE_DENSITY * opening(x, p)
-            cooling = ca.sqrt(REFERENCE_TEMPERATURE / self._temperature(upstream, downstream))
+            cooling = ca.sqrt(REFERENCE_TEMPERATURE / self._upstream_temperature(upstream, downstream))
             return scale * cooling * self.law.flow(upstream.pressure, downstream.pressure, p, self.smoothing)
 
-        return Flows(edge(supply, a, spool), edge(a, exhaust, -spool), edge(supply, b, -spool), edge(b, exhaust, spool))
+        return Flows(
+            edge_flow(supply, a, spool),
+            edge_flow(a, exhaust, -spool),
+            edge_flow(supply, b, -spool),
+            edge_flow(b, exhaust, spool),
+        )
 
-    def _temperature(self, one: Port, two: Port) -> ca.SX:
+    def _upstream_temperature(self, one: Port, two: Port) -> ca.SX:
         """The temperature of the port with the higher pressure, smooth between."""
         fall = one.pressure - two.pressure
         share = (1 + fall / ca.sqrt(fall**2 + self.smoothing.pressure**2)) / 2
@@ -138,5 +141,5 @@ def opening(x: ca.SX, p: Symbols) -> ca.SX:
     return (beyond + ca.sqrt(beyond**2 + p["rounding"] ** 2)) / 2 + p["leak"]
 
 
-def _command(voltage: ca.SX, p: Symbols) -> ca.SX:
+def _spool_command(voltage: ca.SX, p: Symbols) -> ca.SX:
     return ca.fmax(-1, ca.fmin(1, voltage / p["span"]))

@@ -9,20 +9,19 @@ from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
-from pneuopt.dynamics.system import Symbols, System, define, discretise, names, stacked, vector
+from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector, stack
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
-PRESSURES = ("pressure_a", "pressure_b")
-STEP = 5e-5  # [s] of integration; a chamber of a few cm^3 at the end of its stroke answers in 1e-4 s
+PRESSURE_NAMES = ("pressure_a", "pressure_b")
+MAX_INTEGRATION_STEP = 5e-5  # [s] of integration; a chamber of a few cm^3 at the end of its stroke answers in 1e-4 s
 
 
-class Follower:
-    """Compiled integration of a pneumatic drive whose states in `led` are given.
+class AirSimulator:
+    """Compiled integration of a pneumatic drive whose states in `given_states` are given.
 
     Friction's own states stay at zero, for no air feels them.
 
@@ -30,29 +29,29 @@ class Follower:
     ----------
     system : System
         A pneumatic drive's.
-    led : sequence of str
+    given_states : sequence of str
         Names of the states that are given; position and speed at least.
     """
 
-    def __init__(self, system: System, led: Sequence[str]) -> None:
-        self.led = tuple(led)
-        self.states = tuple(q for q in system.states if q.name not in led and not q.name.startswith("friction."))
-        inputs = (*system.inputs, *(q for q in system.states if q.name in led))
-        rates = tuple(Quantity(f"rate_of_{n}", "Pa/s", 1e6) for n in PRESSURES)
+    def __init__(self, system: System, given_states: Sequence[str]) -> None:
+        self.given_states = tuple(given_states)
+        self.states = tuple(
+            q for q in system.states if q.name not in given_states and not q.name.startswith("friction.")
+        )
+        inputs = (*system.inputs, *(q for q in system.states if q.name in given_states))
+        rates = tuple(Quantity(f"rate_of_{n}", "Pa/s", 1e6) for n in PRESSURE_NAMES)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
             every = ca.vertcat(*({**x, **u}.get(n, ca.SX(0)) for n in names(system.states)))
             given = ca.vertcat(*(u[n] for n in names(system.inputs)))
-            rate = dict(
-                zip(names(system.states), ca.vertsplit(system.ode(t, every, given, stacked(p))[0]), strict=True)
-            )
-            return {q.name: rate[q.name] for q in self.states}, {f"rate_of_{n}": rate[n] for n in PRESSURES}
+            rate = dict(zip(names(system.states), ca.vertsplit(system.ode(t, every, given, stack(p))[0]), strict=True))
+            return {q.name: rate[q.name] for q in self.states}, {f"rate_of_{n}": rate[n] for n in PRESSURE_NAMES}
 
         self._inputs, self._parameters = names(inputs), system.parameters
         inner = define(self.states, inputs, rates, system.parameters, rhs)
         self._rollout = Rollout(Pieces(discretise(inner).step))
 
-    def states_along(self, given: Trajectory, sets: Sequence[ParameterSet]) -> list[dict[str, Array]]:
+    def simulate_states(self, given: Trajectory, sets: Sequence[ParameterSet]) -> list[dict[str, Array]]:
         """The states that follow, for each of several parameter sets; pressures start at half the supply.
 
         Parameters
@@ -67,12 +66,12 @@ class Follower:
             By state, shape (n,).
         """
         u = given.matrix(self._inputs)
-        inner = [i for i, n in enumerate(self._inputs) if n in self.led]
+        inner = [i for i, n in enumerate(self._inputs) if n in self.given_states]
         u[:-1, inner] = (u[:-1, inner] + u[1:, inner]) / 2
         h = np.append(np.diff(given.t), 0.0)
-        x0 = np.array([[self._start(q.name, p) for q in self.states] for p in sets]).reshape(len(sets), -1)
-        substeps = max(1, math.ceil(float(h.max()) / STEP))
-        x = self._run(x0, u, sets, (given.t, h), substeps, states=True)
+        x0 = np.array([[self._initial_value(q.name, p) for q in self.states] for p in sets]).reshape(len(sets), -1)
+        substeps = max(1, math.ceil(float(h.max()) / MAX_INTEGRATION_STEP))
+        x = self._roll_out(x0, u, sets, (given.t, h), substeps, states=True)
         return [dict(zip(names(self.states), columns.T, strict=True)) for columns in x]
 
     def pressure_rates(self, given: Trajectory, sets: Sequence[ParameterSet]) -> Array:
@@ -83,9 +82,9 @@ class Follower:
         ndarray, shape (len(sets), n, 2)
         """
         still = (given.t, np.zeros_like(given.t))
-        return self._run(np.empty((len(sets), 0)), given.matrix(self._inputs), sets, still, 1, states=False)
+        return self._roll_out(np.empty((len(sets), 0)), given.matrix(self._inputs), sets, still, 1, states=False)
 
-    def _run(
+    def _roll_out(
         self,
         x0: Array,
         u: Array,
@@ -96,13 +95,13 @@ class Follower:
         states: bool,
     ) -> Array:
         m = len(sets)
-        p = np.array([vector(self._parameters, one) for one in sets])
+        p = np.array([parameter_vector(self._parameters, one) for one in sets])
         inputs, (t, h) = np.tile(u, (m, 1, 1)), (np.tile(a, (m, 1)) for a in grid)
         with np.errstate(all="ignore"):  # an absurd set may overflow; whoever judges it sees no finite number then
             run = self._rollout.run(x0, inputs, p, t, h, substeps=substeps, states=states)
         return run.y if run.x is None else run.x
 
-    def _start(self, name: str, p: ParameterSet) -> float:
-        if name in PRESSURES:
+    def _initial_value(self, name: str, p: ParameterSet) -> float:
+        if name in PRESSURE_NAMES:
             return (p.value("supply.pressure") + p.value("ambient.pressure")) / 2
         return p.value("ambient.temperature") if name.startswith("temperature") else 0.0

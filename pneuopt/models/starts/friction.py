@@ -9,27 +9,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.models.load import GRAVITY
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the order that succeeded most often
 FILTER_TIME = 0.031  # [s] window of the Savitzky-Golay filter, order 3
 SLIDING_SPEED = 4e-3  # [m/s] slower samples say nothing of sliding friction
-STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recipe
-RIDGE = 1e-2  # on columns of unit length: sliding one way only, Coulomb friction and a constant force are one
-LEAST_EXCESS = 0.03  # of static friction over Coulomb's, as a fraction of it (step 2)
-JUDGED = 2000  # samples of a log, about, by which a valve is judged
-PRESLIDING = 3.0  # bristle deflections since the last reversal, within which bristles still bend
+BRISTLE_STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recipe
+RIDGE_WEIGHT = 1e-2  # on columns of unit length: sliding one way only, Coulomb friction and a constant force are one
+MIN_STATIC_EXCESS = 0.03  # of static friction over Coulomb's, as a fraction of it (step 2)
+MAX_VALVE_SAMPLES = 2000  # samples of a log, about, by which a valve is judged
+PRESLIDING_DEFLECTIONS = 3.0  # bristle deflections since the last reversal, within which bristles still bend
 SLOW_SPEED = 1e-2  # [m/s] below it friction comes near its static level, and bristles still bend
-STATIC_LEVEL = 0.995  # quantile of the force in slow samples that counts as static friction (step 2)
+STATIC_QUANTILE = 0.995  # quantile of the force in slow samples that counts as static friction (step 2)
 STATIC_WEIGHT = 0.003  # squared weight of that, in sliding samples (step 2)
 
 
@@ -43,10 +42,10 @@ def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
     """
     rows = {}
     for name, (measured, parameters) in logs.items():
-        position, speed, acceleration = motion(measured)
+        position, speed, acceleration = filter_motion(measured)
         columns, states = load_columns(parameters, position, acceleration), {"position": position, "speed": speed}
-        rows[name] = Rows(measured, parameters, speed, measured["force"], columns, states)
-    return candidates(rows)
+        rows[name] = RegressionRows(measured, parameters, speed, measured["force"], columns, states)
+    return friction_candidates(rows)
 
 
 def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
@@ -58,8 +57,8 @@ def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
             push = parameters.value("rig.area") * (measured["pressure_a"] - parameters.value("ambient.pressure"))
             force = force - push
             rig["rig.area_bias"] = push
-        rows[name] = Rows(measured, parameters, measured["speed"], force, rig, {})
-    return candidates(rows)
+        rows[name] = RegressionRows(measured, parameters, measured["speed"], force, rig, {})
+    return friction_candidates(rows)
 
 
 def load_columns(parameters: ParameterSet, position: Array, acceleration: Array) -> dict[str, Array]:
@@ -71,7 +70,7 @@ def load_columns(parameters: ParameterSet, position: Array, acceleration: Array)
     return columns
 
 
-def motion(measured: Trajectory) -> tuple[Array, Array, Array]:
+def filter_motion(measured: Trajectory) -> tuple[Array, Array, Array]:
     """Filtered position [m], speed [m/s] and acceleration [m/s^2], from whichever of position and speed is logged."""
     require(
         "position" in measured or "speed" in measured,
@@ -79,23 +78,23 @@ def motion(measured: Trajectory) -> tuple[Array, Array, Array]:
         LogError,
     )
     if "position" in measured:
-        speed = filtered(measured, "speed", 0) if "speed" in measured else filtered(measured, "position", 1)
-        return filtered(measured, "position", 0), speed, filtered(measured, "position", 2)
-    speed, acceleration = filtered(measured, "speed", 0), filtered(measured, "speed", 1)
+        speed = filter_channel(measured, "speed", 0) if "speed" in measured else filter_channel(measured, "position", 1)
+        return filter_channel(measured, "position", 0), speed, filter_channel(measured, "position", 2)
+    speed, acceleration = filter_channel(measured, "speed", 0), filter_channel(measured, "speed", 1)
     return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(measured.t))]), speed, acceleration
 
 
-def filtered(measured: Trajectory, name: str, derivative: int) -> Array:
+def filter_channel(measured: Trajectory, name: str, derivative: int) -> Array:
     """A channel, or its derivative by time, by Savitzky and Golay's filter; missing samples interpolated."""
     step = float(np.median(np.diff(measured.t)))
     window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
     window = min(window, (len(measured) - 1) // 2 * 2 + 1)
-    column = _filled(measured, name)
+    column = _interpolate_gaps(measured, name)
     return np.asarray(savgol_filter(column, window, min(3, window - 1), deriv=derivative, delta=step))
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class RegressionRows:
     """One log's part of the regression: ``force = sum(columns * parameters) + friction``."""
 
     measured: Trajectory
@@ -106,7 +105,7 @@ class Rows:
     states: Mapping[str, Array]
 
 
-def candidates(logs: Mapping[str, Rows]) -> Sequence[Start]:
+def friction_candidates(logs: Mapping[str, RegressionRows]) -> Sequence[Start]:
     """One start for each Stribeck velocity tried, from the rows of all logs."""
     parameters = next(iter(logs.values())).parameters
     searched = "friction.stribeck_velocity" in parameters.free_names
@@ -118,25 +117,25 @@ def candidates(logs: Mapping[str, Rows]) -> Sequence[Start]:
     for velocity in dict.fromkeys(tried) if searched else (given,):
         values, _ = _regress(logs, parameters, velocity)
         own = {n: rows.parameters for n, rows in logs.items()}
-        guess = named("friction.stribeck_velocity", velocity, own) if searched else {}
+        guess = per_log_values("friction.stribeck_velocity", velocity, own) if searched else {}
         values |= guess
         label = f"stribeck velocity {velocity:g} m/s" if searched else "equation error"
-        bristles = _bristles(logs, values)
+        bristles = _bristle_deflections(logs, values)
         states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
         starts.append(Start(states, values, label, tuple(guess)))
     return starts
 
 
-def misfit(logs: Mapping[str, Rows]) -> float:
+def force_misfit(logs: Mapping[str, RegressionRows]) -> float:
     """Mean size of the force that no friction explains, of all that the sliding samples show [N]."""
-    thinned = {name: _thinned(rows) for name, rows in logs.items()}
+    thinned = {name: _thin_rows(rows) for name, rows in logs.items()}
     parameters = next(iter(logs.values())).parameters
     if not all(np.isfinite(rows.force).all() for rows in thinned.values()):
         return math.inf
     return float(np.mean(np.abs(_regress(thinned, parameters, STRIBECK_VELOCITIES[0])[1])))
 
 
-def named(name: str, value: float, logs: Mapping[str, ParameterSet]) -> dict[str, float]:
+def per_log_values(name: str, value: float, logs: Mapping[str, ParameterSet]) -> dict[str, float]:
     """A start value, for each log where the parameter is each log's own."""
     per_log = any(parameters[name].per_log for parameters in logs.values())
     return (
@@ -146,9 +145,9 @@ def named(name: str, value: float, logs: Mapping[str, ParameterSet]) -> dict[str
     )
 
 
-def _thinned(rows: Rows) -> Rows:
-    """At most about `JUDGED` of the samples."""
-    every = slice(None, None, max(1, len(rows.measured) // JUDGED))
+def _thin_rows(rows: RegressionRows) -> RegressionRows:
+    """At most about `MAX_VALVE_SAMPLES` of the samples."""
+    every = slice(None, None, max(1, len(rows.measured) // MAX_VALVE_SAMPLES))
     measured = Trajectory(rows.measured.t[every], {n: rows.measured[n][every] for n in rows.measured})
     columns, states = ({n: c[every] for n, c in part.items()} for part in (rows.columns, rows.states))
     return replace(
@@ -156,7 +155,9 @@ def _thinned(rows: Rows) -> Rows:
     )
 
 
-def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float) -> tuple[dict[str, float], Array]:
+def _regress(
+    logs: Mapping[str, RegressionRows], parameters: ParameterSet, velocity: float
+) -> tuple[dict[str, float], Array]:
     """Bounded linear least squares over all logs' sliding samples, with four Cauchy reweights; and what is left [N]."""
     parts = [_log_columns(name, rows, velocity) for name, rows in logs.items()]
     free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
@@ -168,32 +169,35 @@ def _regress(logs: Mapping[str, Rows], parameters: ParameterSet, velocity: float
     speed = np.abs(np.concatenate([rows.speed for rows in logs.values()]))
     sliding = known & (speed > SLIDING_SPEED)
     if "friction.bristle_stiffness" in parameters and sliding.any():
-        level, travelled = float(np.median(np.abs(y[sliding]))), [_travelled(part) for part in logs.values()]
+        level, travelled = (
+            float(np.median(np.abs(y[sliding]))),
+            [_distance_since_reversal(part) for part in logs.values()],
+        )
         pull = {name: force for name, (_, force) in zip(logs, parts, strict=True)}
-        stiffness = np.clip(_presliding_slope(logs, pull, 0.6 * level), *STIFFNESS_RANGE)
-        sliding &= np.concatenate(travelled) > PRESLIDING * level / stiffness
+        stiffness = np.clip(_presliding_slope(logs, pull, 0.6 * level), *BRISTLE_STIFFNESS_RANGE)
+        sliding &= np.concatenate(travelled) > PRESLIDING_DEFLECTIONS * level / stiffness
     rows = sliding if np.count_nonzero(sliding) > 10 * len(free) else known
     if not free:
         return {}, y[rows]
     bases = {n: parameters[n.split("[")[0]] for n in free}
-    lower, upper = _bounds(bases, float(np.median(np.abs(y[rows]))))
+    lower, upper = _regression_bounds(bases, float(np.median(np.abs(y[rows]))))
     weight = math.sqrt(STATIC_WEIGHT * np.count_nonzero(rows))
-    stuck = [(_vector(columns, free), level) for columns, level in _static_levels(logs, velocity)]
+    stuck = [(_coefficient_row(columns, free), level) for columns, level in _static_levels(logs, velocity)]
     given = np.array([row for row, _ in stuck]).reshape(-1, len(free)), np.array([level for _, level in stuck])
-    x = _robust(A[rows], y[rows], lower, upper, (weight * given[0], weight * given[1]))
+    x = _robust_least_squares(A[rows], y[rows], lower, upper, (weight * given[0], weight * given[1]))
     values = dict(zip(free, x.tolist(), strict=True))
     for name in [n for n in free if n.startswith("friction.static")]:
         own = name.replace("static", "coulomb")
         coulomb = values.get(own, values.get("friction.coulomb", parameters.value("friction.coulomb")))
-        values[name] = coulomb + max(values[name], LEAST_EXCESS * coulomb)
+        values[name] = coulomb + max(values[name], MIN_STATIC_EXCESS * coulomb)
     return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}, y[rows] - A[rows] @ x
 
 
-def _vector(columns: Mapping[str, float], free: Sequence[str]) -> Array:
+def _coefficient_row(columns: Mapping[str, float], free: Sequence[str]) -> Array:
     return np.array([columns.get(n, 0.0) for n in free])
 
 
-def _static_levels(logs: Mapping[str, Rows], velocity: float) -> list[tuple[dict[str, float], float]]:
+def _static_levels(logs: Mapping[str, RegressionRows], velocity: float) -> list[tuple[dict[str, float], float]]:
     """For each log a slow sample in which friction is about to give way: it is static there, whatever the speed."""
     out = []
     for name, rows in logs.items():
@@ -201,12 +205,14 @@ def _static_levels(logs: Mapping[str, Rows], velocity: float) -> list[tuple[dict
         slow = np.flatnonzero((np.abs(rows.speed) < SLOW_SPEED) & np.isfinite(pull))
         columns, level = _log_columns(name, rows, velocity, np.sign(pull))
         if slow.size and any(n.startswith("friction.static") for n in columns):
-            at = slow[np.argsort(np.abs(level[slow]))[math.ceil(STATIC_LEVEL * (slow.size - 1))]]
+            at = slow[np.argsort(np.abs(level[slow]))[math.ceil(STATIC_QUANTILE * (slow.size - 1))]]
             out.append(({n: float(c[at]) for n, c in columns.items()}, float(level[at])))
     return out
 
 
-def _log_columns(name: str, rows: Rows, velocity: float, stuck: Array | None = None) -> tuple[dict[str, Array], Array]:
+def _log_columns(
+    name: str, rows: RegressionRows, velocity: float, stuck: Array | None = None
+) -> tuple[dict[str, Array], Array]:
     """A log's free columns ("name[log]" if its own), and its force less what is known; `stuck`: see below."""
     p = rows.parameters
     columns = {n: c for n, c in {**rows.columns, **_friction_columns(rows, velocity, stuck)}.items() if n in p}
@@ -223,7 +229,7 @@ def _log_columns(name: str, rows: Rows, velocity: float, stuck: Array | None = N
     return {f"{n}[{name}]" if p[n].per_log else n: c for n, c in columns.items() if p[n].free}, target
 
 
-def _friction_columns(rows: Rows, velocity: float, stuck: Array | None = None) -> dict[str, Array]:
+def _friction_columns(rows: RegressionRows, velocity: float, stuck: Array | None = None) -> dict[str, Array]:
     """What multiplies each friction parameter in the force; static friction counts as the part above Coulomb's.
 
     If stuck (1 or -1: the side to which a sample is pulled) friction has its static level, whatever the filtered speed.
@@ -241,14 +247,16 @@ def _friction_columns(rows: Rows, velocity: float, stuck: Array | None = None) -
     return columns
 
 
-def _robust(A: Array, y: Array, lower: Array, upper: Array, given: tuple[Array, Array] | None = None) -> Array:
-    """Bounded least squares, reweighted but for the given rows; what no row tells apart (`RIDGE`) shares the effect."""
+def _robust_least_squares(
+    A: Array, y: Array, lower: Array, upper: Array, given: tuple[Array, Array] | None = None
+) -> Array:
+    """Bounded least squares, reweighted but for the given rows; `RIDGE_WEIGHT` splits what no row tells apart."""
     k = A.shape[1]
     given_A, given_y = (np.empty((0, k)), np.empty(0)) if given is None else given
     scale = np.linalg.norm(A, axis=0) + 1e-300
     weight, x = np.ones(len(A)), np.zeros(k)
     for _ in range(5):
-        weighted = np.concatenate([A / scale * weight[:, None], given_A / scale, RIDGE * np.eye(k)])
+        weighted = np.concatenate([A / scale * weight[:, None], given_A / scale, RIDGE_WEIGHT * np.eye(k)])
         right = np.concatenate([y * weight, given_y, np.zeros(k)])
         fit = lsq_linear(weighted, right, (lower * scale, upper * scale))
         x = np.clip(np.asarray(fit.x) / scale, lower, upper)
@@ -258,7 +266,7 @@ def _robust(A: Array, y: Array, lower: Array, upper: Array, given: tuple[Array, 
     return x
 
 
-def _bounds(bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]:
+def _regression_bounds(bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]:
     """Of the regression: the parameters' own, and floors that keep friction positive (NUMERICS section 3, step 2)."""
     floors = {"friction.coulomb": 0.05 * level, "friction.viscous": 0.0}
     own = {n: n.split("[")[0] for n in bases}
@@ -268,30 +276,30 @@ def _bounds(bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]
     return lower, upper
 
 
-def _bristles(logs: Mapping[str, Rows], values: dict[str, float]) -> dict[str, dict[str, Array]]:
+def _bristle_deflections(logs: Mapping[str, RegressionRows], values: dict[str, float]) -> dict[str, dict[str, Array]]:
     """The bristle deflection along each log, and their stiffness from presliding motion (changes `values`)."""
     parameters = next(iter(logs.values())).parameters
     if "friction.bristle_stiffness" not in parameters:
         return {}
 
-    def number(name: str) -> float:
+    def value_of(name: str) -> float:
         return values.get(name, parameters.value(name))
 
     friction = {n: _friction_force(n, rows, values) for n, rows in logs.items()}
     stiffness = parameters["friction.bristle_stiffness"]
     if stiffness.free:
-        slope = _presliding_slope(logs, friction, 0.6 * number("friction.coulomb"))
-        low, high = max(STIFFNESS_RANGE[0], stiffness.lower), min(STIFFNESS_RANGE[1], stiffness.upper)
+        slope = _presliding_slope(logs, friction, 0.6 * value_of("friction.coulomb"))
+        low, high = max(BRISTLE_STIFFNESS_RANGE[0], stiffness.lower), min(BRISTLE_STIFFNESS_RANGE[1], stiffness.upper)
         found = float(np.clip(slope, low, high))
-        values |= named("friction.bristle_stiffness", found, {n: rows.parameters for n, rows in logs.items()})
+        values |= per_log_values("friction.bristle_stiffness", found, {n: rows.parameters for n, rows in logs.items()})
     else:
         found = stiffness.value
-    limit = number("friction.static") / found
-    deflections = {n: (friction[n] - number("friction.viscous") * rows.speed) / found for n, rows in logs.items()}
+    limit = value_of("friction.static") / found
+    deflections = {n: (friction[n] - value_of("friction.viscous") * rows.speed) / found for n, rows in logs.items()}
     return {n: {"friction.bristle": np.clip(z, -limit, limit)} for n, z in deflections.items()}
 
 
-def _presliding_slope(logs: Mapping[str, Rows], friction: Mapping[str, Array], level: float) -> float:
+def _presliding_slope(logs: Mapping[str, RegressionRows], friction: Mapping[str, Array], level: float) -> float:
     """Robust slope of dF/dt over v in slow samples below the sliding level [N/m]; zero where there are none."""
     rate, speed = [], []
     for n, rows in logs.items():
@@ -300,10 +308,14 @@ def _presliding_slope(logs: Mapping[str, Rows], friction: Mapping[str, Array], l
         speed.append(rows.speed[presliding])
     v = np.concatenate(speed)
     # a step of the force, or the log's edge, is no presliding: the robust weights take it out
-    return float(_robust(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0]) if v.size else 0.0
+    return (
+        float(_robust_least_squares(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0])
+        if v.size
+        else 0.0
+    )
 
 
-def _travelled(rows: Rows) -> Array:
+def _distance_since_reversal(rows: RegressionRows) -> Array:
     """Distance since the speed last changed its sign [m]."""
     v, step = rows.speed, np.diff(rows.measured.t)
     path = np.concatenate([[0.0], np.cumsum(np.abs(v[1:] + v[:-1]) / 2 * step)])
@@ -311,7 +323,7 @@ def _travelled(rows: Rows) -> Array:
     return np.asarray(path - np.maximum.accumulate(np.where(turns, path, 0.0)))
 
 
-def _friction_force(name: str, rows: Rows, values: Mapping[str, float]) -> Array:
+def _friction_force(name: str, rows: RegressionRows, values: Mapping[str, float]) -> Array:
     """The force less what inertia, load and offsets take [N]."""
     p = rows.parameters
     used = {n: c for n, c in rows.columns.items() if n in p}
@@ -319,7 +331,7 @@ def _friction_force(name: str, rows: Rows, values: Mapping[str, float]) -> Array
     return np.asarray(rows.force - sum(taken))
 
 
-def _filled(measured: Trajectory, name: str) -> Array:
+def _interpolate_gaps(measured: Trajectory, name: str) -> Array:
     """The column with missing samples interpolated, for filters only."""
     column = measured[name]
     known = np.isfinite(column)

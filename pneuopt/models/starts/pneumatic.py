@@ -14,25 +14,40 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import System
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
-from pneuopt.models.starts.following import PRESSURES, Follower
-from pneuopt.models.starts.friction import Rows, candidates, filtered, load_columns, misfit, motion, named
+from pneuopt.models.starts.following import PRESSURE_NAMES, AirSimulator
+from pneuopt.models.starts.friction import (
+    RegressionRows,
+    filter_channel,
+    filter_motion,
+    force_misfit,
+    friction_candidates,
+    load_columns,
+    per_log_values,
+)
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 
-Array = NDArray[np.float64]
-Values = Mapping[str, float]
-Push = Callable[[Mapping[str, Any], Any, Any], Any]
-CONDUCTANCE, LEAK = "valve.conductance", "valve.leak"
-SHAPES = {"valve.critical_ratio": (0.15, 0.3, 0.45), "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2)}  # tried, if free
-LEAKS = (0.003, 0.01, 0.03, 0.1)  # tried, where no pressure is logged
-CONDUCTANCES = 2.0 ** np.arange(-1, 5)  # likewise, times what the logged speed needs at half the supply pressure
-LEAST_LEAK = 1e-4  # at zero the search would begin on a bound
-ZOOM = {CONDUCTANCE: 1.4, LEAK: 1.8, "valve.critical_ratio": 0.08, "valve.dead_zone": 0.02}  # factors, then steps
-ZOOMS = 5  # each halves the step
+ValveValues = Mapping[str, float]
+AirForce = Callable[[Mapping[str, Any], Any, Any], Any]
+VALVE_CONDUCTANCE, VALVE_LEAK = "valve.conductance", "valve.leak"
+VALVE_SHAPE_GRID = {
+    "valve.critical_ratio": (0.15, 0.3, 0.45),
+    "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2),
+}  # tried, if free
+LEAK_GRID = (0.003, 0.01, 0.03, 0.1)  # tried, where no pressure is logged
+CONDUCTANCE_FACTORS = 2.0 ** np.arange(-1, 5)  # likewise, times what the logged speed needs at half the supply pressure
+MIN_LEAK = 1e-4  # at zero the search would begin on a bound
+REFINEMENT_STEPS = {
+    VALVE_CONDUCTANCE: 1.4,
+    VALVE_LEAK: 1.8,
+    "valve.critical_ratio": 0.08,
+    "valve.dead_zone": 0.02,
+}  # factors, then steps
+GRID_REFINEMENTS = 5  # each halves the step
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,64 +61,70 @@ class PneumaticStarts:
     ----------
     system : callable
         Returns the drive's System (not held: it holds this).
-    push : callable
+    air_force : callable
         From the parameters' mapping and both pressures [Pa] to the force of the air on the piston [N].
     """
 
     system: Callable[[], System]
-    push: Push
+    air_force: AirForce
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates: one valve, friction for each of the Stribeck velocities tried."""
-        runs = self.runs(logs)
-        valve = _valve(runs)
-        starts = candidates({name: run.balance(valve) for name, run in runs.items()})
+        runs = self.prepare_logs(logs)
+        valve = _estimate_valve(runs)
+        starts = friction_candidates({name: run.force_balance(valve) for name, run in runs.items()})
         own: dict[str, float] = {}
         for name, value in valve.items():
-            own |= named(name, value, {n: log.parameters for n, log in logs.items()})
+            own |= per_log_values(name, value, {n: log.parameters for n, log in logs.items()})
         return [replace(start, parameters={**start.parameters, **own}) for start in starts]
 
-    def runs(self, logs: Mapping[str, Log]) -> dict[str, "Run"]:
+    def prepare_logs(self, logs: Mapping[str, Log]) -> dict[str, "PneumaticLog"]:
         """The logs as this drive's motion and air."""
-        followers = functools.cache(functools.partial(Follower, self.system()))
-        return {name: Run(log, followers, self.push) for name, log in logs.items()}
+        followers = functools.cache(functools.partial(AirSimulator, self.system()))
+        return {name: PneumaticLog(log, followers, self.air_force) for name, log in logs.items()}
 
 
-class Run:
+class PneumaticLog:
     """One log: its filtered motion and pressures, and what follows from them with any valve."""
 
-    def __init__(self, log: Log, followers: Callable[[tuple[str, ...]], Follower], push: Push) -> None:
+    def __init__(self, log: Log, simulator_for: Callable[[tuple[str, ...]], AirSimulator], push: AirForce) -> None:
         self.measured, self.parameters = log
-        self._followers, self._push = followers, push
-        position, speed, self._acceleration = motion(self.measured)
+        self._simulator_for, self._air_force = simulator_for, push
+        position, speed, self._acceleration = filter_motion(self.measured)
         if "position" not in self.measured:
-            position = position + self._begin(position)
-        self.logged = tuple(n for n in PRESSURES if n in self.measured)
-        self.led = {"position": position, "speed": speed, **{n: filtered(self.measured, n, 0) for n in self.logged}}
-        self._given = self.measured.select(["valve_voltage"]).with_columns(self.led)
+            position = position + self._start_position(position)
+        self.logged_pressures = tuple(n for n in PRESSURE_NAMES if n in self.measured)
+        self.known_states = {
+            "position": position,
+            "speed": speed,
+            **{n: filter_channel(self.measured, n, 0) for n in self.logged_pressures},
+        }
+        self._known_signals = self.measured.select(["valve_voltage"]).with_columns(self.known_states)
 
-    def _begin(self, travel: Array) -> float:
+    def _start_position(self, travel: Array) -> float:
         """The position where a log without one begins [m]: cylinder.start, or the nearest that keeps to the stroke."""
         stroke = self.parameters.value("cylinder.stroke")
         lowest, highest = -float(travel.min()), stroke - float(travel.max())
         return min(max(self.parameters.value("cylinder.start") * stroke, lowest), max(lowest, highest))
 
-    def balance(self, valve: Values) -> Rows:
+    def force_balance(self, valve: ValveValues) -> RegressionRows:
         """The forces with this valve, for the regression of friction."""
-        return self.balances([valve])[0]
+        return self.force_balances([valve])[0]
 
-    def balances(self, valves: Sequence[Values]) -> list[Rows]:
+    def force_balances(self, valves: Sequence[ValveValues]) -> list[RegressionRows]:
         """The forces with each of several valves."""
-        columns = load_columns(self.parameters, self.led["position"], self._acceleration)
+        columns = load_columns(self.parameters, self.known_states["position"], self._acceleration)
         out = []
-        for follow in self._follow(valves):
-            states = {**self.led, **follow}
-            measured = self.measured.with_columns({n: states[n] for n in PRESSURES})
-            force = self._push({n: q.value for n, q in self.parameters.items()}, *(states[n] for n in PRESSURES))
-            out.append(Rows(measured, self.parameters, states["speed"], force, columns, states))
+        for follow in self._simulate_air(valves):
+            states = {**self.known_states, **follow}
+            measured = self.measured.with_columns({n: states[n] for n in PRESSURE_NAMES})
+            force = self._air_force(
+                {n: q.value for n, q in self.parameters.items()}, *(states[n] for n in PRESSURE_NAMES)
+            )
+            out.append(RegressionRows(measured, self.parameters, states["speed"], force, columns, states))
         return out
 
-    def valve_columns(self, shape: Values) -> tuple[Array, Array]:
+    def valve_columns(self, shape: ValveValues) -> tuple[Array, Array]:
         """The regression of the m logged pressures' rates on conductance, and conductance times leak.
 
         Returns
@@ -113,96 +134,110 @@ class Run:
             As logged, less what they are behind a closed valve [Pa/s].
         """
         unit, leak = 1e-8, 0.01  # the rates are linear in both: any two values tell the columns
-        probes = [{**shape, CONDUCTANCE: c, LEAK: x} for c, x in ((1e-12, 0.0), (unit, 0.0), (unit, leak))]
-        closed, edges, leaking = self._rates(probes)
+        probes = [{**shape, VALVE_CONDUCTANCE: c, VALVE_LEAK: x} for c, x in ((1e-12, 0.0), (unit, 0.0), (unit, leak))]
+        closed, edges, leaking = self._pressure_rates(probes)
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
-        return columns, np.column_stack([filtered(self.measured, n, 1) for n in self.logged]) - closed
+        return columns, np.column_stack([filter_channel(self.measured, n, 1) for n in self.logged_pressures]) - closed
 
-    def _rates(self, valves: Sequence[Values]) -> Array:
+    def _pressure_rates(self, valves: Sequence[ValveValues]) -> Array:
         """Rates of the logged pressures with each of several valves [Pa/s], shape (len(valves), n, m)."""
-        given = self._given.with_columns(self._as_given)
-        rates = self._followers((*self.led, *self._as_given)).pressure_rates(given, self._with(valves))
-        return rates[:, :, [PRESSURES.index(n) for n in self.logged]]
+        given = self._known_signals.with_columns(self._default_air_states)
+        rates = self._simulator_for((*self.known_states, *self._default_air_states)).pressure_rates(
+            given, self._with_valves(valves)
+        )
+        return rates[:, :, [PRESSURE_NAMES.index(n) for n in self.logged_pressures]]
 
-    def conductance_needed(self) -> float:
+    def min_conductance(self) -> float:
         """Of an open edge, choked, to feed the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
-        fastest = float(np.quantile(np.abs(self.led["speed"]), 0.99))
+        fastest = float(np.quantile(np.abs(self.known_states["speed"]), 0.99))
         gas = self.parameters.value("gas.constant") * self.parameters.value("ambient.temperature")
         area = math.pi / 4 * self.parameters.value("cylinder.bore") ** 2
         return max(area * fastest * 0.5 / (REFERENCE_DENSITY * gas), 1e-10)
 
     @functools.cached_property
-    def _as_given(self) -> dict[str, Array]:
+    def _default_air_states(self) -> dict[str, Array]:
         """What follows with the valve's given values."""
-        return self._follow([{}])[0]
+        return self._simulate_air([{}])[0]
 
-    def _follow(self, valves: Sequence[Values]) -> list[dict[str, Array]]:
-        return self._followers(tuple(self.led)).states_along(self._given, self._with(valves))
+    def _simulate_air(self, valves: Sequence[ValveValues]) -> list[dict[str, Array]]:
+        return self._simulator_for(tuple(self.known_states)).simulate_states(
+            self._known_signals, self._with_valves(valves)
+        )
 
-    def _with(self, valves: Iterable[Values]) -> list[ParameterSet]:
+    def _with_valves(self, valves: Iterable[ValveValues]) -> list[ParameterSet]:
         """The log's parameters with other valves, and no bounds on those."""
         return [
             self.parameters.with_bounds(dict.fromkeys(valve, (-np.inf, np.inf))).with_values(valve) for valve in valves
         ]
 
 
-def _valve(runs: Mapping[str, Run]) -> dict[str, float]:
+def _estimate_valve(runs: Mapping[str, PneumaticLog]) -> dict[str, float]:
     """What is free of conductance, leak, critical ratio and dead zone."""
     parameters = next(iter(runs.values())).parameters
-    free = [n for n in (CONDUCTANCE, LEAK, *SHAPES) if any(n in run.parameters.free_names for run in runs.values())]
+    free = [
+        n
+        for n in (VALVE_CONDUCTANCE, VALVE_LEAK, *VALVE_SHAPE_GRID)
+        if any(n in run.parameters.free_names for run in runs.values())
+    ]
     if not free:
         return {}
-    if any(run.logged for run in runs.values()):
-        shapes = {n: tried for n, tried in SHAPES.items() if n in free}
-        best = _searched(shapes, parameters, lambda values: [_by_pressure(runs, free, v)[1] for v in values])
-        return best | _by_pressure(runs, free, best)[0]
-    needed = max(run.conductance_needed() for run in runs.values())
-    tried = {CONDUCTANCE: tuple(needed * CONDUCTANCES), LEAK: LEAKS}
+    if any(run.logged_pressures for run in runs.values()):
+        shapes = {n: tried for n, tried in VALVE_SHAPE_GRID.items() if n in free}
+        best = _search_values(
+            shapes, parameters, lambda values: [_fit_valve_to_pressures(runs, free, v)[1] for v in values]
+        )
+        return best | _fit_valve_to_pressures(runs, free, best)[0]
+    needed = max(run.min_conductance() for run in runs.values())
+    tried = {VALVE_CONDUCTANCE: tuple(needed * CONDUCTANCE_FACTORS), VALVE_LEAK: LEAK_GRID}
     tried = {n: tried.get(n, (parameters.value(n),)) for n in free}
-    return _searched(tried, parameters, lambda values: _by_force(runs, values))
+    return _search_values(tried, parameters, lambda values: _force_misfits(runs, values))
 
 
-def _searched(
+def _search_values(
     tried: Mapping[str, Sequence[float]],
     parameters: ParameterSet,
-    misfits: Callable[[Sequence[Values]], Sequence[float]],
+    misfits: Callable[[Sequence[ValveValues]], Sequence[float]],
 ) -> dict[str, float]:
     """The values of least misfit: the best of a grid, then of ever closer ones around the best."""
     if not tried:
         return {}
     names = list(tried)
-    logarithmic = np.array([n in (CONDUCTANCE, LEAK) for n in names])
+    logarithmic = np.array([n in (VALVE_CONDUCTANCE, VALVE_LEAK) for n in names])
     lower, upper = (np.array([getattr(parameters[n], b) for n in names]) for b in ("lower", "upper"))
 
-    def best(grid: Array) -> Array:
+    def best_of(grid: Array) -> Array:
         grid = np.clip(grid, lower, upper)
         found = misfits([dict(zip(names, point, strict=True)) for point in grid.tolist()])
         return np.asarray(grid[np.argmin(np.nan_to_num(found, nan=np.inf))])
 
-    point = best(np.array(list(itertools.product(*tried.values()))))
-    step = np.array([ZOOM[n] for n in names])
+    point = best_of(np.array(list(itertools.product(*tried.values()))))
+    step = np.array([REFINEMENT_STEPS[n] for n in names])
     moves = np.array([m for m in itertools.product((0, -1, 1), repeat=len(names)) if np.count_nonzero(m) <= 2])
-    for k in range(ZOOMS):
+    for k in range(GRID_REFINEMENTS):
         near = moves * 0.5**k
-        point = best(np.where(logarithmic, point * step**near, point + step * near))
+        point = best_of(np.where(logarithmic, point * step**near, point + step * near))
     return dict(zip(names, point.tolist(), strict=True))
 
 
-def _by_pressure(runs: Mapping[str, Run], free: Sequence[str], shape: Values) -> tuple[dict[str, float], float]:
+def _fit_valve_to_pressures(
+    runs: Mapping[str, PneumaticLog], free: Sequence[str], shape: ValveValues
+) -> tuple[dict[str, float], float]:
     """Conductance and leak, as far as free, by linear regression; and the squares that are left [Pa^2/s^2]."""
     parameters = next(iter(runs.values())).parameters
-    parts = [run.valve_columns(shape) for run in runs.values() if run.logged]
+    parts = [run.valve_columns(shape) for run in runs.values() if run.logged_pressures]
     A = np.concatenate([columns.reshape(-1, 2) for columns, _ in parts])
     y = np.concatenate([rates.ravel() for _, rates in parts])
-    known, basis = _affine(parameters.value(CONDUCTANCE), parameters.value(LEAK), CONDUCTANCE in free, LEAK in free)
+    known, basis = _affine_basis(
+        parameters.value(VALVE_CONDUCTANCE), parameters.value(VALVE_LEAK), VALVE_CONDUCTANCE in free, VALVE_LEAK in free
+    )
     known = known + basis @ np.linalg.lstsq(A @ basis, y - A @ known, rcond=None)[0]
     leak = float(known[1] / known[0]) if known[0] > 0 else 0.0
-    found = {CONDUCTANCE: float(known[0]), LEAK: max(leak, LEAST_LEAK)}
+    found = {VALVE_CONDUCTANCE: float(known[0]), VALVE_LEAK: max(leak, MIN_LEAK)}
     values = {n: float(np.clip(v, parameters[n].lower, parameters[n].upper)) for n, v in found.items() if n in free}
     return values, float(np.sum((y - A @ known) ** 2))
 
 
-def _affine(conductance: float, leak: float, conductance_free: bool, leak_free: bool) -> tuple[Array, Array]:
+def _affine_basis(conductance: float, leak: float, conductance_free: bool, leak_free: bool) -> tuple[Array, Array]:
     """(C, C * leak) as a known part and a basis of what is free."""
     if conductance_free:
         return np.zeros(2), np.eye(2) if leak_free else np.array([[1.0], [leak]])
@@ -211,7 +246,7 @@ def _affine(conductance: float, leak: float, conductance_free: bool, leak_free: 
     return np.array([conductance, conductance * leak]), np.empty((2, 0))
 
 
-def _by_force(runs: Mapping[str, Run], valves: Sequence[Values]) -> list[float]:
+def _force_misfits(runs: Mapping[str, PneumaticLog], valves: Sequence[ValveValues]) -> list[float]:
     """How badly the forces balance with each of several valves [N]."""
-    balances = {name: run.balances(valves) for name, run in runs.items()}
-    return [misfit({name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]
+    balances = {name: run.force_balances(valves) for name, run in runs.items()}
+    return [force_misfit({name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]

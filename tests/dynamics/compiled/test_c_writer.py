@@ -5,15 +5,14 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.compiled import c_writer as emission
 from pneuopt.dynamics.compiled import compiler
-from pneuopt.dynamics.compiled.c_writer import Kernel, emit
+from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.quantities.arrays import Array
 
-Array = NDArray[np.float64]
-needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
 EDGES = np.array([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, 5e-324, 1e-310, 720.0, -720.0, -744.0, -760.0, 1e308])
 
 
@@ -98,7 +97,7 @@ def statements(text: str, name: str) -> list[str]:
 def test_what_changes_rarely_is_computed_rarely() -> None:
     x, u, p = (ca.SX.sym(n, 2) for n in "xup")
     f = ca.Function("f", [x, u, p], [x / ca.sqrt(p[0]) + ca.sin(u[0] * p[1])])
-    text, kept = emit(Kernel("rate", f, ("x", "u", "p"), ("y",)), {"p": 0, "u": 1, "x": 2})
+    text, kept = write_c(CFunction("rate", f, ("x", "u", "p"), ("y",)), {"p": 0, "u": 1, "x": 2})
     once, sampled, always = (" ".join(statements(text, f"rate_{n}")) for n in ("segment", "sample", "call"))
     assert "v_sqrt" in once
     assert "v_sin" in sampled
@@ -111,7 +110,7 @@ def test_what_changes_rarely_is_computed_rarely() -> None:
 def test_a_shared_divisor_divides_once() -> None:
     x = ca.SX.sym("x", 4)
     f = ca.Function("f", [x], [ca.vertcat(x[0] / x[3], x[1] / x[3], x[2] / x[1])])
-    text, _ = emit(Kernel("f", f, ("x",), ("y",)), {"x": 2})
+    text, _ = write_c(CFunction("f", f, ("x",), ("y",)), {"x": 2})
     assert text.count(" / ") == 2
 
 
@@ -120,7 +119,7 @@ def test_an_operation_without_c_is_left_to_the_vm(
 ) -> None:
     expected = computed(ca.sin, EDGES[:4])
     forget()
-    monkeypatch.delitem(emission.FUNCTIONS, ca.OP_SIN)
+    monkeypatch.delitem(emission.C_FUNCTIONS, ca.OP_SIN)
     assert_allclose(computed(ca.sin, EDGES[:4]), expected, rtol=1e-15)
     messages: list[Any] = [r.getMessage() for r in caplog.records]
     assert len(messages) == 1

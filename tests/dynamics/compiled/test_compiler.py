@@ -15,10 +15,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pneuopt.dynamics.compiled import compiler
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compiled
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compile_function
 
 Forget = Callable[[], None]
-needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
 needs_shell = pytest.mark.skipif(os.name == "nt", reason="the compilers here are shell scripts")
 
 
@@ -43,8 +43,8 @@ def test_without_a_compiler_one_line_says_so(
 ) -> None:
     monkeypatch.setenv("PNEUOPT_CC", "")
     for drag in (0.1, 0.2):
-        assert not fall(drag).is_compiled
-    compiled(ca.Function("f", [ca.SX.sym("a")], [1]))
+        assert not fall(drag).uses_machine_code
+    compile_function(ca.Function("f", [ca.SX.sym("a")], [1]))
     assert len(warnings_in(caplog)) == 1
     assert "no C compiler found" in warnings_in(caplog)[0]
 
@@ -84,8 +84,8 @@ def test_a_broken_compiler_is_a_warning_not_a_crash(
     monkeypatch.setenv("PNEUOPT_CC", script(tmp_path, text))
     monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path / "cache"))
     slow, again = fall(), fall()
-    assert not slow.is_compiled
-    assert not again.is_compiled
+    assert not slow.uses_machine_code
+    assert not again.uses_machine_code
     assert_allclose(fallen(slow), fast, rtol=1e-14)
     (warning,) = warnings_in(caplog)
     assert "failed, the CasADi VM runs instead" in warning
@@ -94,7 +94,7 @@ def test_a_broken_compiler_is_a_warning_not_a_crash(
 
 def test_a_compiler_that_is_not_there_counts_as_none(monkeypatch: pytest.MonkeyPatch, forget: Forget) -> None:
     monkeypatch.setenv("PNEUOPT_CC", "no-such-compiler")
-    assert compiler.compiler() is None
+    assert compiler.find_compiler() is None
 
 
 @needs_compiler
@@ -104,8 +104,8 @@ def test_an_unwritable_cache_is_a_warning(
     blocked = tmp_path / "file"
     blocked.write_text("")
     monkeypatch.setenv("PNEUOPT_CACHE", str(blocked / "cache"))
-    assert fall(0.1).is_compiled
-    assert fall(0.2).is_compiled
+    assert fall(0.1).uses_machine_code
+    assert fall(0.2).uses_machine_code
     assert len(warnings_in(caplog)) == 1
     assert "cannot be written" in warnings_in(caplog)[0]
     shutil.rmtree(compiler.cache_directory())
@@ -116,11 +116,11 @@ def test_a_cached_binary_is_loaded_and_a_damaged_one_built_anew(
     monkeypatch: pytest.MonkeyPatch, forget: Forget, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path))
-    assert fall().is_compiled
+    assert fall().uses_machine_code
     (binary,) = tmp_path.iterdir()
     built = binary.stat().st_mtime_ns
     forget()
-    assert fall().is_compiled
+    assert fall().uses_machine_code
     assert binary.stat().st_mtime_ns == built
     forget()
     damaged = tmp_path / "damaged"
@@ -128,7 +128,7 @@ def test_a_cached_binary_is_loaded_and_a_damaged_one_built_anew(
     shutil.copy(binary, damaged / binary.name)  # the loaded one must not be touched
     (damaged / binary.name).write_bytes(b"junk")
     monkeypatch.setenv("PNEUOPT_CACHE", str(damaged))
-    assert fall().is_compiled
+    assert fall().uses_machine_code
     assert (damaged / binary.name).stat().st_size > 1000
 
 
@@ -137,13 +137,13 @@ def test_a_cached_binary_is_loaded_and_a_damaged_one_built_anew(
 def test_a_compiler_without_vectors_gives_one_lane(
     monkeypatch: pytest.MonkeyPatch, forget: Forget, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    usual, cc = fallen(fall()), compiler.compiler()
+    usual, cc = fallen(fall()), compiler.find_compiler()
     forget()
     text = f'#!/bin/sh\ncase "$*" in *SIMD*) echo "no vectors" >&2; exit 1;; esac\nexec {cc} "$@"\n'
     monkeypatch.setenv("PNEUOPT_CC", script(tmp_path, text))
     monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path / "cache"))
     for drag in (0.1, 0.2):
-        assert fall(drag).is_compiled
+        assert fall(drag).uses_machine_code
         assert fall(drag).lanes == 1
     assert_allclose(fallen(fall()), usual, rtol=1e-14)
     (warning,) = warnings_in(caplog)
@@ -169,7 +169,7 @@ def test_an_interrupted_compilation_leaves_nothing_behind(
         with pytest.raises(KeyboardInterrupt):
             fall()
     assert list(tmp_path.iterdir()) == []
-    assert fall().is_compiled
+    assert fall().uses_machine_code
 
 
 @needs_compiler

@@ -10,15 +10,15 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.compiled import compiler
 from pneuopt.dynamics.compiled import rollout as codegen
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compiled
-from pneuopt.dynamics.system import DiscreteSystem, discretise, vector
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compile_function
+from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
-from pneuopt.quantities.trajectories import Array
 
 Forget = Callable[[], None]
-needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
 
 
 def loop() -> DiscreteSystem:
@@ -44,11 +44,11 @@ class Case:
         self.x0 = 0.2 * nominal * rng.standard_normal((m, len(nominal)))
         self.u = 0.3 * rng.standard_normal((m, n, len(self.system.inputs)))
         self.u *= np.array([q.nominal for q in self.system.inputs])
-        p = vector(self.system.parameters, self.system.parameters)
+        p = parameter_vector(self.system.parameters, self.system.parameters)
         if name == "sampled loop":
             set_to = {"pid.Kp": 50.0, "pid.Ki": 100.0, "pid.Kd": 0.5, "pid.Tf": 0.01, "dither.amplitude": 5.0}
             set_to |= {"pid.lower": -400.0, "pid.upper": 400.0, "pid.Tt": 0.5}
-            p = vector(self.system.parameters, self.system.parameters.with_values(set_to))
+            p = parameter_vector(self.system.parameters, self.system.parameters.with_values(set_to))
         self.p = p * (1 + 0.1 * rng.random((m, len(p))))
         self.h = np.full((m, n), 2e-3)
         self.h[1, 4:] = 0  # a short segment, padded
@@ -57,7 +57,7 @@ class Case:
     def rollout(self, wrt: tuple[int, ...] = (), start: bool = False, threads: int | None = 1) -> Rollout:
         return Rollout(self.system.pieces, wrt, start, threads)
 
-    def run(self, rollout: Rollout, **changed: Array) -> codegen.Run:
+    def run(self, rollout: Rollout, **changed: Array) -> codegen.RolloutResult:
         given = {"x0": self.x0, "u": self.u, "p": self.p, "t": self.t, "h": self.h, **changed}
         return rollout.run(**given, substeps=self.system.substeps, states=True)
 
@@ -118,7 +118,7 @@ def test_sensitivities_are_the_central_differences(name: str) -> None:
             assert_allclose(found, exact, rtol=2e-4, atol=2e-4 * size + 1e-7, err_msg=f"{which}[{index}]")
 
 
-def assert_alike(a: codegen.Run, b: codegen.Run) -> None:
+def assert_alike(a: codegen.RolloutResult, b: codegen.RolloutResult) -> None:
     for field in ("y", "x_end", "x", "dy", "dx_end"):
         left, right = getattr(a, field), getattr(b, field)
         assert left.shape == right.shape, field
@@ -131,9 +131,9 @@ def test_machine_code_and_the_casadi_vm_agree_to_rounding(name: str) -> None:
     case = Case(name)
     wrt = (0, 2, case.p.shape[1] - 1)
     fast = case.rollout(wrt, start=True)
-    assert fast.is_compiled
+    assert fast.uses_machine_code
     slow = Rollout(case.system.pieces, wrt, start=True, lanes=0)
-    assert not slow.is_compiled
+    assert not slow.uses_machine_code
     assert_alike(case.run(fast), case.run(slow))
 
 
@@ -151,7 +151,7 @@ def test_the_number_of_lanes_changes_nothing(lanes: int, name: str) -> None:
 
 @needs_compiler
 def test_lanes_are_as_many_as_pay_on_the_cpu() -> None:
-    flags = compiler._cpu().split()
+    flags = compiler._cpu_identity().split()
     expected = 4 if "avx" in flags else 2  # eight, under AVX-512, took longer than four
     assert Case("stribeck").rollout().lanes == expected
 
@@ -252,7 +252,7 @@ def test_compiled_takes_scalars_vectors_and_matrices(
     if cc is not None:
         monkeypatch.setenv("PNEUOPT_CC", cc)
     B, c = np.arange(6.0).reshape(2, 3), np.array([1.0, -1.0, 2.0])
-    product, turned, sparse, nothing = compiled(mixed())(2.0, B, c)
+    product, turned, sparse, nothing = compile_function(mixed())(2.0, B, c)
     assert_allclose(product, 2 * B @ c)
     assert_allclose(turned, 2 * B.T)
     assert_allclose(sparse, [[0, 2], [0, 0]])
@@ -260,7 +260,7 @@ def test_compiled_takes_scalars_vectors_and_matrices(
 
 
 def test_results_are_the_callers_own() -> None:
-    f = compiled(mixed())
+    f = compile_function(mixed())
     first = f(1.0, np.ones((2, 3)), np.ones(3))[0]
     f(5.0, np.ones((2, 3)), np.ones(3))
     assert_array_equal(first, [3.0, 3.0])
@@ -269,7 +269,7 @@ def test_results_are_the_callers_own() -> None:
 @needs_compiler
 def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers() -> None:
     with pytest.raises(ModelError, match="argument 2 has 2 numbers, expected 3"):
-        compiled(mixed())(1.0, np.ones((2, 3)), np.ones(2))
+        compile_function(mixed())(1.0, np.ones((2, 3)), np.ones(2))
 
 
 @pytest.mark.parametrize("lanes", [pytest.param(None, marks=needs_compiler), 0])

@@ -8,7 +8,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define, names
-from pneuopt.models.drive import part
+from pneuopt.models.drive import without_prefix
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.chamber import Polytropic, Thermal, blend
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak
@@ -35,7 +35,7 @@ def books(drive: PneumaticDrive) -> System:
         outside = p["ambient.temperature"]
         ports = [Port(x[f"pressure_{s}"], x[f"temperature_{s}"] if thermal else outside) for s in "ab"]
         borders = [Port(p[n], outside) for n in ("supply.pressure", "ambient.pressure")]
-        w = drive.valve.flows(x["valve.spool"], borders[0], borders[1], ports[0], ports[1], part(p, "valve"))
+        w = drive.valve.flows(x["valve.spool"], borders[0], borders[1], ports[0], ports[1], without_prefix(p, "valve"))
         leak = piston_leak(ports[0].pressure, ports[1].pressure, p["cylinder.leak"])
         crossing = {"a": (w.supply_a, -w.a_exhaust), "b": (w.supply_b, -w.b_exhaust)}
         fed = {"fed_a": sum(crossing["a"]) + leak, "fed_b": sum(crossing["b"]) - leak}
@@ -47,13 +47,13 @@ def books(drive: PneumaticDrive) -> System:
         if thermal:
             power += sum((p["chamber.wall_conductance"] * (outside - q.temperature) for q in ports), start=ca.SX(0))
         a, b = areas(p["cylinder.bore"], p["cylinder.rod"])
-        friction = drive.friction.force(x["speed"], {}, {}, part(p, "friction")).value
+        friction = drive.friction.force(x["speed"], {}, {}, without_prefix(p, "friction")).value
         power -= ((a - b) * p["ambient.pressure"] + friction + p["load.force"]) * x["speed"]
         rates_ = {n: xdot[k] for k, n in enumerate(names(own.states))} | fed | {"energy": power}
         return rates_, {n: y[k] for k, n in enumerate(names(own.outputs))}
 
     states = (*own.states, *ledger)
-    return define(states, own.inputs, own.outputs, own.parameters, rhs, rest_finder=own.rest_finder)
+    return define(states, own.inputs, own.outputs, own.parameters, rhs, rest_hook=own.rest_hook)
 
 
 @pytest.mark.parametrize("chamber", [Polytropic(), Thermal()], ids=["isothermal", "thermal"])

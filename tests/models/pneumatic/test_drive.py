@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import System, names, vector
+from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.load import GRAVITY, Load
@@ -20,11 +19,11 @@ from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 DRIVES = {
     "plain": PneumaticDrive(),
     "lugre": PneumaticDrive(friction=PressureDependent(LuGre()), load=Load(spring=True, inclined=True)),
@@ -68,7 +67,7 @@ def with_values(drive: PneumaticDrive, **values: float) -> ParameterSet:
 
 
 def rates(drive: PneumaticDrive, x: Array, u: float, p: ParameterSet) -> Array:
-    return np.asarray(drive.system().ode(0, x, [u], vector(drive.parameters, p))[0]).ravel()
+    return np.asarray(drive.system().ode(0, x, [u], parameter_vector(drive.parameters, p))[0]).ravel()
 
 
 @pytest.mark.parametrize("name", DRIVES)
@@ -76,7 +75,7 @@ def rates(drive: PneumaticDrive, x: Array, u: float, p: ParameterSet) -> Array:
 @given(st.data())
 def test_no_nan_in_value_gradient_or_hessian(name: str, data: st.DataObject) -> None:
     drive = DRIVES[name]
-    p, weights = vector(drive.parameters, drive.parameters), np.ones(len(drive.states))
+    p, weights = parameter_vector(drive.parameters, drive.parameters), np.ones(len(drive.states))
     x, u = data.draw(points(drive))
     equal = np.where(np.array(names(drive.states)) == "pressure_b", x[2], x)
     for state in (x, equal):
@@ -87,7 +86,7 @@ def test_no_nan_in_value_gradient_or_hessian(name: str, data: st.DataObject) -> 
 @pytest.mark.parametrize("name", DRIVES)
 def test_derivatives_are_the_central_differences(name: str) -> None:
     drive, rng = DRIVES[name], np.random.default_rng(2)
-    system, p = drive.system(), vector(drive.parameters, drive.parameters)
+    system, p = drive.system(), parameter_vector(drive.parameters, drive.parameters)
     nominal = np.array([q.nominal for q in (*system.states, *system.inputs)])
     middle = np.array([np.mean(RANGE[q.name]) for q in (*system.states, *system.inputs)])
     n, m = len(system.states), len(system.inputs)
@@ -192,7 +191,7 @@ def test_a_loop_finds_its_rest() -> None:
         x = loop.initial(p.with_values({"pid.Ki": Ki}))
         system = loop.system()
         scale = np.array([q.nominal for q in system.states])
-        assert np.abs(np.array(system.ode(0, x, [0.0], loop.numbers(p))[0]).ravel() / scale).max() < 1e-6
+        assert np.abs(np.array(system.ode(0, x, [0.0], loop.parameter_vector(p))[0]).ravel() / scale).max() < 1e-6
         assert x[0] == pytest.approx(0.04)
     position = ClosedLoop(drive.system(), PID(), measured="position")
     assert position.initial(position.parameters, reference=0.13)[0] == 0.13
@@ -327,8 +326,8 @@ def test_a_position_that_no_stroke_holds_is_doubted() -> None:
     drive = DRIVES["plain"]
     t = np.linspace(0, 1, 200)
     log = Trajectory(t, {"valve_voltage": np.cos(t), "position": 0.1 + 0.095 * np.sin(6 * t)})
-    assert drive.system().doubts({"run": Log(log, drive.parameters)}) == []
+    assert drive.system().log_warnings({"run": Log(log, drive.parameters)}) == []
     for column in (-log["position"], 1e3 * log["position"], log["position"] + 0.05):
-        (told,) = drive.system().doubts({"run": Log(log.with_columns({"position": column}), drive.parameters)})
+        (told,) = drive.system().log_warnings({"run": Log(log.with_columns({"position": column}), drive.parameters)})
         assert told.startswith("run: position runs from ")
         assert told.endswith("outside the stroke, 0 to 200 mm: check its sign, unit and zero, and cylinder.stroke")

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pneuopt.models.pneumatic.gas import (
     CRITICAL_RATIO,
@@ -19,8 +18,8 @@ from pneuopt.models.pneumatic.gas import (
     conductance_of_area,
     conductance_of_nominal_flow,
 )
+from pneuopt.quantities.arrays import Array
 
-Array = NDArray[np.float64]
 LAWS: dict[str, FlowLaw] = {"iso": Iso6358(), "iso 0.6": Iso6358(0.6), "nozzle": IsentropicNozzle()}
 RATIOS = np.concatenate([np.linspace(0.02, 0.999, 4000), 1 - np.geomspace(1e-3, 1e-9, 400)])
 pressure = st.floats(0.0, 1.2e6)

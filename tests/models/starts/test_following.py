@@ -8,7 +8,7 @@ import pytest
 import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.models.pneumatic.chamber import Thermal
-from pneuopt.models.starts.following import Follower
+from pneuopt.models.starts.following import AirSimulator
 
 Truth = tuple[po.System, po.ParameterSet, po.Trajectory]
 
@@ -30,8 +30,8 @@ def run(thermal: bool) -> Truth:
 @pytest.mark.parametrize("logged", [(), ("pressure_a",), ("pressure_b",), ("pressure_a", "pressure_b")])
 def test_what_is_not_logged_follows_the_motion(thermal: bool, logged: tuple[str, ...]) -> None:
     system, parameters, truth = run(thermal)
-    follower = Follower(system, ("position", "speed", *logged))
-    (found,) = follower.states_along(truth, [parameters])
+    follower = AirSimulator(system, ("position", "speed", *logged))
+    (found,) = follower.simulate_states(truth, [parameters])
     air = {"pressure_a", "pressure_b"} | ({"temperature_a", "temperature_b"} if thermal else set())
     assert set(found) == (air | {"valve.spool"}) - set(logged)
     late = truth.t > 0.5  # the start is a guess, until valve and leak have changed the air; its heat stays longer
@@ -42,7 +42,7 @@ def test_what_is_not_logged_follows_the_motion(thermal: bool, logged: tuple[str,
 
 def test_rates_of_the_pressures_are_the_odes() -> None:
     system, parameters, truth = run(False)
-    rates = Follower(system, [q.name for q in system.states]).pressure_rates(truth, [parameters] * 2)
+    rates = AirSimulator(system, [q.name for q in system.states]).pressure_rates(truth, [parameters] * 2)
     assert rates.shape == (2, len(truth), 2)
     k = 140
     x = [truth[q.name][k] for q in system.states]
@@ -55,7 +55,7 @@ def test_rates_of_the_pressures_are_the_odes() -> None:
 def test_sets_run_side_by_side_and_an_absurd_one_spoils_no_other() -> None:
     system, parameters, truth = run(False)
     absurd = parameters.with_values({"valve.conductance": 1e-5})
-    follower = Follower(system, ("position", "speed"))
-    both, alone = follower.states_along(truth, [parameters, absurd]), follower.states_along(truth, [parameters])
+    follower = AirSimulator(system, ("position", "speed"))
+    both, alone = follower.simulate_states(truth, [parameters, absurd]), follower.simulate_states(truth, [parameters])
     for name in alone[0]:
         assert both[0][name] == pytest.approx(alone[0][name], rel=1e-9)

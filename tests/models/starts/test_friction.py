@@ -5,14 +5,15 @@ import pytest
 
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.dynamics.system import DiscreteSystem, discretise, names, vector
+from pneuopt.dynamics.system import DiscreteSystem, discretise, names, parameter_vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.models.load import Load
-from pneuopt.models.starts.friction import Rows, load_columns, misfit, motion
+from pneuopt.models.starts.friction import RegressionRows, filter_motion, force_misfit, load_columns
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.trajectories import Array, Trajectory
+from pneuopt.quantities.trajectories import Trajectory
 
 TRUTH = {
     "load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0, "friction.static": 42.0,
@@ -37,7 +38,7 @@ def logged(drive: ForceDrive, truth: ParameterSet, *channels: str, seed: int = 0
     rng, t = np.random.default_rng(seed), np.linspace(0, 2, 2000, endpoint=False)
     force = 50 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t + seed)
     system = drive.system()
-    run = compute(discretise(system), force[:, None], vector(system.parameters, truth), t)
+    run = compute(discretise(system), force[:, None], parameter_vector(system.parameters, truth), t)
     noise = {"position": 1e-5, "speed": 1e-3}
     return Trajectory(t, {"force": force, **{c: run[c] + noise[c] * rng.standard_normal(len(t)) for c in channels}})
 
@@ -142,7 +143,9 @@ def test_a_rigs_levels_are_linear_in_pressure() -> None:
     for name, pressure in {"low": 2e5, "high": 6e5}.items():
         inputs = {"speed": 0.01 * np.sign(np.sin(t)), "pressure_a": np.full_like(t, pressure)}
         u, system = np.column_stack(list(inputs.values())), discretise(rig.system())
-        force = compute(system, u, vector(system.parameters, p), t)["force"] + 0.2 * rng.standard_normal(len(t))
+        force = compute(system, u, parameter_vector(system.parameters, p), t)["force"] + 0.2 * rng.standard_normal(
+            len(t)
+        )
         logs[name] = Trajectory(t, {**inputs, "force": np.where(rng.random(len(t)) < 0.05, np.nan, force)})
     free = p.freed("friction.coulomb", "friction.coulomb_pressure_a", "rig.force_offset").per_log("rig.force_offset")
     (start,) = starts(rig, logs, free)
@@ -155,7 +158,7 @@ def test_motion_is_filtered_from_position_or_speed() -> None:
     t = np.arange(500) * 1e-3
     y, v, a = np.sin(10 * t), 10 * np.cos(10 * t), -100 * np.sin(10 * t)
     for channels in ({"position": y}, {"position": y, "speed": v}, {"speed": v}):
-        position, speed, acceleration = motion(Trajectory(t, channels))
+        position, speed, acceleration = filter_motion(Trajectory(t, channels))
         assert position == pytest.approx(y, abs=2e-3)
         assert speed == pytest.approx(v, abs=2e-2)
         assert acceleration[20:-20] == pytest.approx(a[20:-20], abs=1)
@@ -163,13 +166,13 @@ def test_motion_is_filtered_from_position_or_speed() -> None:
 
 def test_without_motion_it_is_refused() -> None:
     with pytest.raises(LogError, match="neither 'position' nor 'speed'"):
-        motion(Trajectory([0.0, 1.0], {"force": [0.0, 0.0]}))
+        filter_motion(Trajectory([0.0, 1.0], {"force": [0.0, 0.0]}))
     with pytest.raises(LogError, match="channel 'position' has no samples"):
-        motion(Trajectory(np.arange(20.0), {"position": np.full(20, np.nan)}))
+        filter_motion(Trajectory(np.arange(20.0), {"position": np.full(20, np.nan)}))
 
 
 def test_a_short_log_takes_a_shorter_filter() -> None:
-    position, speed, _ = motion(Trajectory(np.arange(6) * 1e-3, {"position": np.arange(6) * 1e-3}))
+    position, speed, _ = filter_motion(Trajectory(np.arange(6) * 1e-3, {"position": np.arange(6) * 1e-3}))
     assert speed == pytest.approx(np.ones(6))
     assert position == pytest.approx(np.arange(6) * 1e-3)
 
@@ -187,10 +190,10 @@ def test_the_misfit_is_what_no_friction_explains() -> None:
     given = drive.parameters.freed("friction.coulomb", "friction.viscous")
     columns = load_columns(given, np.zeros(4000), 0.7 * np.cos(7 * t))
     right = 33 * np.tanh(speed / 1e-3) + 50 * speed + given.value("load.mass") * columns["load.mass"]
-    rows = Rows(Trajectory(t, {"speed": speed}), given, speed, right, columns, {})
-    assert misfit({"run": rows}) < 1.0
-    assert misfit({"run": replace(rows, force=right + wrong)}) == pytest.approx(np.mean(np.abs(wrong)), rel=0.1)
-    assert misfit({"run": replace(rows, force=np.full(4000, np.nan))}) == np.inf
+    rows = RegressionRows(Trajectory(t, {"speed": speed}), given, speed, right, columns, {})
+    assert force_misfit({"run": rows}) < 1.0
+    assert force_misfit({"run": replace(rows, force=right + wrong)}) == pytest.approx(np.mean(np.abs(wrong)), rel=0.1)
+    assert force_misfit({"run": replace(rows, force=np.full(4000, np.nan))}) == np.inf
 
 
 def test_static_friction_shows_where_the_drive_gives_way() -> None:
@@ -199,7 +202,7 @@ def test_static_friction_shows_where_the_drive_gives_way() -> None:
     truth = true_values(drive.parameters, friction__static=60.0, friction__stribeck_velocity=0.005, load__force=0.0)
     force = 70 * np.sin(2 * np.pi * t)
     system = drive.system()
-    run = compute(discretise(system), force[:, None], vector(system.parameters, truth), t)
+    run = compute(discretise(system), force[:, None], parameter_vector(system.parameters, truth), t)
     free = truth.freed("friction.coulomb", "friction.static", "friction.viscous", "friction.stribeck_velocity")
     log = Trajectory(t, {"force": force, "position": run["position"]})
     found = {s.parameters["friction.stribeck_velocity"]: s.parameters for s in starts(drive, {"run": log}, free)}
@@ -212,7 +215,7 @@ def test_bending_bristles_do_not_pass_for_sliding() -> None:
     truth = true_values(drive.parameters, load__force=0.0)
     force = np.where(t > 3, 55.0, 28.0) * np.sin(2 * np.pi * 2 * t)  # mostly presliding, and not slowly
     system = drive.system()
-    run = compute(discretise(system), force[:, None], vector(system.parameters, truth), t)
+    run = compute(discretise(system), force[:, None], parameter_vector(system.parameters, truth), t)
     log = Trajectory(t, {"force": force, "position": run["position"]})
     free = truth.freed(
         "friction.coulomb", "friction.static", "friction.stribeck_velocity", "friction.bristle_stiffness"

@@ -1,16 +1,14 @@
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.trajectories import Trajectory
-
-Array = NDArray[np.float64]
 
 
 def steps(t: Array, levels: tuple[float, ...]) -> Array:

@@ -64,7 +64,7 @@ def scaled(truth: po.ParameterSet, factors: Mapping[str, float]) -> po.Parameter
 @pytest.mark.parametrize("wrong", WRONG)
 def test_true_zeros_are_not_doubted(swing: tuple[po.System, po.ParameterSet, Trajectory], wrong: str) -> None:
     system, truth, log = swing
-    assert system.doubts({"run": Log(log, scaled(truth, WRONG[wrong]))}) == []
+    assert system.log_warnings({"run": Log(log, scaled(truth, WRONG[wrong]))}) == []
 
 
 @pytest.mark.parametrize("wrong", WRONG)
@@ -73,7 +73,7 @@ def test_wrong_zeros_are_told_even_with_wrong_hardware(
     swing: tuple[po.System, po.ParameterSet, Trajectory], wrong: str, shift: int, remedy: str
 ) -> None:
     system, truth, log = swing
-    told = system.doubts({"run": Log(moved(log, shift * ATMOSPHERE), scaled(truth, WRONG[wrong]))})
+    told = system.log_warnings({"run": Log(moved(log, shift * ATMOSPHERE), scaled(truth, WRONG[wrong]))})
     assert told
     assert all(remedy in sentence or "supply.pressure" in sentence for sentence in told)
     if wrong == "nothing":
@@ -84,7 +84,7 @@ def test_wrong_zeros_are_told_even_with_wrong_hardware(
 def test_a_supply_in_gauge_is_told_from_sensors_in_gauge(swing: tuple[po.System, po.ParameterSet, Trajectory]) -> None:
     system, truth, log = swing
     gauge = truth.with_values({"supply.pressure": truth.value("supply.pressure") - ATMOSPHERE})
-    told = system.doubts({"run": Log(log, gauge)})
+    told = system.log_warnings({"run": Log(log, gauge)})
     assert told
     assert all("1.013 bar added to supply.pressure: is that too low, or a gauge" in sentence for sentence in told)
 
@@ -92,19 +92,19 @@ def test_a_supply_in_gauge_is_told_from_sensors_in_gauge(swing: tuple[po.System,
 def test_the_sensor_and_the_log_are_named(swing: tuple[po.System, po.ParameterSet, Trajectory]) -> None:
     system, truth, log = swing
     gauge = moved(log, -ATMOSPHERE, ("pressure_b",))
-    (sentence,) = system.doubts({"good": Log(log, truth), "bad": Log(gauge, truth)})
+    (sentence,) = system.log_warnings({"good": Log(log, truth), "bad": Log(gauge, truth)})
     assert sentence.startswith("pressure_b of bad: its chamber's mass balance leaves ")
     alone = gauge.select(["valve_voltage", "position", "pressure_b"])
-    assert len(system.doubts({"alone": Log(alone, truth)})) == 1
+    assert len(system.log_warnings({"alone": Log(alone, truth)})) == 1
     for channels in (["position"], ["pressure_a", "pressure_b"]):
-        assert system.doubts({"silent": Log(gauge.select(["valve_voltage", *channels]), truth)}) == []
+        assert system.log_warnings({"silent": Log(gauge.select(["valve_voltage", *channels]), truth)}) == []
 
 
 def test_a_valve_of_unknown_shape_is_no_excuse(swing: tuple[po.System, po.ParameterSet, Trajectory]) -> None:
     system, truth, log = swing
     unknown = truth.freed("valve.dead_zone", "valve.critical_ratio", "valve.conductance")
-    assert system.doubts({"run": Log(log, unknown)}) == []
-    assert len(system.doubts({"run": Log(moved(log, -ATMOSPHERE), unknown)})) >= 1
+    assert system.log_warnings({"run": Log(log, unknown)}) == []
+    assert len(system.log_warnings({"run": Log(moved(log, -ATMOSPHERE), unknown)})) >= 1
 
 
 @pytest.mark.parametrize("name", ["run_01", "run_02"])
@@ -112,12 +112,12 @@ def test_the_rigs_logs_are_told_from_themselves_in_gauge(name: str) -> None:
     drive, parameters = po.read_drive(DATA / "pneumatic_rig" / "drive.toml")
     log = po.read_log(DATA / "pneumatic_rig" / f"{name}.csv").trajectory
     system = drive.system()
-    assert system.doubts({name: Log(log, parameters)}) == []
+    assert system.log_warnings({name: Log(log, parameters)}) == []
     if "pressure_a" in log:
-        assert system.doubts({name: Log(moved(log, -ATMOSPHERE), parameters)}) != []
+        assert system.log_warnings({name: Log(moved(log, -ATMOSPHERE), parameters)}) != []
 
 
 def test_a_supply_to_be_identified_is_no_measure(swing: tuple[po.System, po.ParameterSet, Trajectory]) -> None:
     system, truth, log = swing
     guessed = truth.with_values({"supply.pressure": 5e5}).freed("supply.pressure")
-    assert system.doubts({"run": Log(log, guessed)}) == []
+    assert system.log_warnings({"run": Log(log, guessed)}) == []
