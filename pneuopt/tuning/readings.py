@@ -128,7 +128,7 @@ def read_metrics(
         )
     settings: Any = {
         "start": reference.at,
-        "about": BandCentre.REFERENCE,
+        "band_centre": BandCentre.REFERENCE,
         "dither_period": period,
         "averaged": averaged,
     }

@@ -200,7 +200,7 @@ class Simulator:
         p, starts = np.empty_like(base), np.empty((len(rows), self._rollout.n_states))
         for k in np.unique(case).tolist():
             own = case == k
-            p[own] = self.cases[k].rows(base[own], order)
+            p[own] = self.cases[k].case_vectors(base[own], order)
             starts[own] = self.starts(k, points[rows[own]])
         return p, starts
 
@@ -228,7 +228,7 @@ class Simulator:
         """Inputs, instants and steps of lanes, shapes (m, n, n_inputs), (m, n), (m, n); substeps."""
         own = self._grid_of[case]
         n = max(len(self.grids[g].t) for g in np.unique(own))
-        full = {g: self.grids[g].padded(n) for g in np.unique(own).tolist()}
+        full = {g: self.grids[g].pad(n) for g in np.unique(own).tolist()}
         u, t, h = (np.array([full[g][k] for g in own.tolist()]) for k in range(3))
         return u, t, h, max(self.substeps[g] for g in np.unique(own))
 
