@@ -62,7 +62,7 @@ def average_dither(
     -------
     System
         States and outputs are means. Of a plant it has "dither.amplitude" and "dither.offset", too:
-        ``ClosedLoop(averaged(plant, p), pid)`` takes the parameters of the dithered loop.
+        ``ClosedLoop(average_dither(plant, p), pid)`` takes the parameters of the dithered loop.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def average_dither(
     >>> edge = {"dead_zone": 0.2, "rounding": 0.02, "leak": 0.0}
     >>> flow = lambda t, x, u, p: ({"level": opening(u["spool"], edge) - opening(-u["spool"], edge)}, dict(x))
     >>> given = ParameterSet({"dither.amplitude": Parameter(0.4, "1"), "dither.frequency": Parameter(100.0, "Hz")})
-    >>> mean = averaged(define([x], [u], [x], ParameterSet(), flow), given)
+    >>> mean = average_dither(define([x], [u], [x], ParameterSet(), flow), given)
     >>> round(float(mean.linearise(np.zeros(1), {}, given).B[0, 0]), 2)
     0.67
     """
@@ -111,7 +111,7 @@ def ripple(
     """
     dithered = _add_dither(model, parameters, actuated, waveform)
     given = dithered.parameters | parameters.select(n for n in parameters if n in dithered.parameters)
-    swing = _first_harmonic(dithered, given, _operating_point(model, dithered, given, at, reference), nodes)
+    swing = _first_harmonic(dithered, given, _operating_point(dithered, given, at, reference), nodes)
     return dict(zip(names(dithered.system.states), swing.tolist(), strict=True))
 
 
@@ -142,13 +142,17 @@ def mean_start(swing: Mapping[str, complex], x: Sequence[float] | Array) -> Arra
 
 @dataclass(frozen=True, eq=False)
 class _DitheredSystem:
-    """A system and where the wave enters: an input, or, of a loop, the dither's offset."""
+    """A system and where the wave enters: an input, or, of a loop, the dither's offset.
+
+    `steady_motion` gives states and inputs from the parameters and the reference.
+    """
 
     system: System
     parameters: ParameterSet
     frequency: float
     dithered_input: str | None
     waveform: Waveform
+    steady_motion: Callable[[ParameterSet, float], tuple[Array, Array]]
 
     def rates(self, t: ca.SX, x: ca.SX, u: Symbols, p: Symbols, wave: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Rates and outputs while the wave has this value."""
@@ -205,42 +209,53 @@ def _add_dither(
         require(positive, f"averaging needs a dither: parameters with {name} > 0")
     frequency = parameters.value(DITHER_FREQUENCY)
     if isinstance(model, ClosedLoop):
-        sampled = "the controller is sampled; average the plant, ClosedLoop(averaged(plant, parameters), pid)"
-        require(model.dither is not None, "averaging needs a loop with dither: ClosedLoop(plant, pid, Dither())")
-        require(model.pid.sample_time is None, sampled)
-        own = model.dither.waveform if model.dither else Waveform.SINE
-        require(waveform in (None, own), f"the loop's dither is a {own.value}; leave waveform= out")
-        return _DitheredSystem(model.system(), model.parameters, frequency, None, own)
-    inputs = {q.name: q for q in model.inputs}
+        return _dithered_loop(model, frequency, waveform)
+    return _dithered_plant(model, frequency, actuated, waveform)
+
+
+def _dithered_loop(loop: ClosedLoop, frequency: float, waveform: Waveform | None) -> _DitheredSystem:
+    sampled = "the controller is sampled; average the plant, ClosedLoop(average_dither(plant, parameters), pid)"
+    require(loop.dither is not None, "averaging needs a loop with dither: ClosedLoop(plant, pid, Dither())")
+    require(loop.pid.sample_time is None, sampled)
+    own = loop.dither.waveform if loop.dither else Waveform.SINE
+    require(waveform in (None, own), f"the loop's dither is a {own.value}; leave waveform= out")
+
+    def steady_motion(parameters: ParameterSet, reference: float) -> tuple[Array, Array]:
+        inputs = np.array([reference if n == "reference" else 0.0 for n in names(loop.inputs)])
+        return loop.initial(parameters, reference=reference), inputs
+
+    return _DitheredSystem(loop.system(), loop.parameters, frequency, None, own, steady_motion)
+
+
+def _dithered_plant(
+    plant: System, frequency: float, actuated: str | None, waveform: Waveform | None
+) -> _DitheredSystem:
+    inputs = {q.name: q for q in plant.inputs}
     name = actuated or next(iter(inputs), "")
     require(actuated is not None or len(inputs) == 1, f"the plant has the inputs {', '.join(inputs)}; choose actuated=")
-    check_names("input", [name], inputs, "averaged: actuated")
+    check_names("input", [name], inputs, "average_dither: actuated")
     added = ParameterSet({n: Parameter(0.0, inputs[name].unit) for n in (DITHER_AMPLITUDE, DITHER_OFFSET)})
-    return _DitheredSystem(model, model.parameters | added, frequency, name, waveform or Waveform.SINE)
+
+    def steady_motion(parameters: ParameterSet, reference: float) -> tuple[Array, Array]:
+        if plant.rest_hook is None:
+            return np.zeros(len(plant.states)), np.zeros(len(inputs))
+        rest = plant.rest_hook(parameters, {"speed": reference})
+        states = np.array([rest.states.get(n, 0.0) for n in names(plant.states)])
+        return states, np.array([rest.inputs.get(n, 0.0) for n in inputs])
+
+    own = waveform or Waveform.SINE
+    return _DitheredSystem(plant, plant.parameters | added, frequency, name, own, steady_motion)
 
 
 def _operating_point(
-    model: System | ClosedLoop,
-    dithered: _DitheredSystem,
-    parameters: ParameterSet,
-    at: Mapping[str, float] | None,
-    reference: float,
+    dithered: _DitheredSystem, parameters: ParameterSet, at: Mapping[str, float] | None, reference: float
 ) -> tuple[Array, Array]:
     """The operating point: states and inputs."""
+    if at is None:
+        return dithered.steady_motion(parameters, reference)
     states, inputs = names(dithered.system.states), names(dithered.system.inputs)
-    if at is not None:
-        check_names("state or input", at, [*states, *inputs], "averaged: at")
-        return np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
-    if isinstance(model, ClosedLoop):
-        x = model.initial(parameters, reference=reference)
-        return x, np.array([reference if n == "reference" else 0.0 for n in inputs])
-    if model.rest_hook is None:
-        return np.zeros(len(states)), np.zeros(len(inputs))
-    rest = model.rest_hook(parameters, {"speed": reference})
-    return (
-        np.array([rest.states.get(n, 0.0) for n in states]),
-        np.array([rest.inputs.get(n, 0.0) for n in inputs]),
-    )
+    check_names("state or input", at, [*states, *inputs], "average_dither: at")
+    return np.array([at.get(n, 0.0) for n in states]), np.array([at.get(n, 0.0) for n in inputs])
 
 
 def _first_harmonic(

@@ -25,6 +25,7 @@ from pneuopt.control.wiring import Signals, check_algebraic_loop, check_initial_
 from pneuopt.dynamics.system import (
     DiscreteSystem,
     Linearisation,
+    Motion,
     Symbols,
     System,
     define,
@@ -192,6 +193,21 @@ class ClosedLoop:
         if self.pid.sample_time is None:
             return discretise(self.system(), substeps)
         return replace(discretise(self.hold_system(), substeps), update=self.update, sample_time=self.pid.sample_time)
+
+    def motion(self) -> Motion:
+        """See `Runnable`."""
+        if self.pid.sample_time is None:
+            return Motion(self.system())
+        return Motion(self.hold_system(), self.update, self.pid.sample_time)
+
+    def rest_state(self, parameters: ParameterSet, outputs: Mapping[str, float] | None = None) -> Array:
+        """See `Runnable`: `initial` without outputs; with them, zeros where the plant has no `rest_hook`."""
+        if outputs is None:
+            return self.initial(parameters)
+        if self.plant.rest_hook is None:
+            return np.zeros(len(self.states))
+        command = self.plant.rest_hook(parameters, outputs).inputs.get(self.command.name, 0.0)
+        return self.initial(parameters, self.plant.rest_state(parameters, outputs), command=command)
 
     def check(self, parameters: ParameterSet) -> None:
         """Refuse values that no loop can run with, whatever their bounds: `InputError` names the parameter."""

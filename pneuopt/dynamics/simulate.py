@@ -6,15 +6,15 @@ friction sticks and slips between events that are located (`stick_slip`).
 """
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.guards import Contact
+from pneuopt.dynamics.runnable import Runnable
 from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
@@ -23,7 +23,6 @@ from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, r
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-CompiledUpdate = Callable[..., tuple[Array, ...]]
 REST_COORDINATE = "position"  # where a plant can be asked to rest
 
 
@@ -44,7 +43,7 @@ class StickSlipResult:
 
 
 def simulate(
-    model: System | ClosedLoop,
+    model: Runnable,
     inputs: Trajectory,
     parameters: ParameterSet,
     *,
@@ -57,8 +56,9 @@ def simulate(
 
     Parameters
     ----------
-    model : System or ClosedLoop
-        A loop with a sampled PID takes its samples at ``inputs.t[0]`` plus whole sample times.
+    model : Runnable
+        A System, ClosedLoop or LoggedLoop. A loop with a sampled PID takes its samples at ``inputs.t[0]`` plus whole
+        sample times.
     inputs : Trajectory
         A column an input of the model, held from each of its instants to the next; others are not read.
     parameters : ParameterSet
@@ -105,7 +105,7 @@ def simulate(
 
 
 def simulate_stick_slip(
-    model: System | ClosedLoop,
+    model: Runnable,
     inputs: Trajectory,
     parameters: ParameterSet,
     *,
@@ -138,14 +138,14 @@ def simulate_stick_slip(
     return StickSlipResult(run.trajectory(), run.events)
 
 
-def contacts(trajectory: Trajectory, model: System | ClosedLoop, parameters: ParameterSet) -> tuple[Contact, ...]:
+def contacts(trajectory: Trajectory, model: Runnable, parameters: ParameterSet) -> tuple[Contact, ...]:
     """Where a response runs into an end stop or empties a chamber: what `simulate` warns of, seen at the instants.
 
     Parameters
     ----------
     trajectory : Trajectory
         With the plant's states.
-    model : System or ClosedLoop
+    model : Runnable
     parameters : ParameterSet
 
     Returns
@@ -162,7 +162,7 @@ def contacts(trajectory: Trajectory, model: System | ClosedLoop, parameters: Par
     >>> print(str(contacts(run, drive, drive.parameters)[0]).partition(";")[0])
     the piston reached the front end stop (position 199.9 mm) at t = 0.04975 s with 0.4 m/s
     """
-    plant = _plant_of(model)
+    plant = model.plant
     rows = trajectory.matrix(names(plant.states))
     watch = LimitMonitor(plant, parameters, trajectory.t[0], rows[0])
     for t, row in zip(trajectory.t, rows, strict=True):
@@ -184,21 +184,22 @@ def new_integration(system: System, p: Array, grid: Array, rtol: float, atol: fl
 
 
 def _integrate(
-    model: System | ClosedLoop,
+    model: Runnable,
     inputs: Trajectory,
     parameters: ParameterSet,
     initial: Mapping[str, float] | ArrayLike | None,
     t_out: ArrayLike | None,
     tolerances: tuple[float, float],
 ) -> tuple[Integration, tuple[Contact, ...]]:
-    system, update, sample_time = _ode_and_update(model)
+    motion = model.motion()
+    system, update = motion.system, compile_function(motion.update) if motion.update is not None else None
     u, grid = input_rows(system.inputs, inputs), _report_times(t_out, inputs.t)
     x, p = initial_state(model, parameters, initial), parameter_vector(system.parameters, parameters)
     slack = _time_tolerance(inputs.t)
-    breaks, is_sample = _restart_times(inputs.t, u, sample_time, slack)
+    breaks, is_sample = _restart_times(inputs.t, u, motion.sample_time, slack)
     rows = u[np.searchsorted(inputs.t, breaks + slack, side="right") - 1]
     run, done = new_integration(system, p, grid, *tolerances), 0
-    watch = LimitMonitor(_plant_of(model), parameters, inputs.t[0], x)
+    watch = LimitMonitor(model.plant, parameters, inputs.t[0], x)
     with watch.report_contacts():
         for at, end, row, acts in zip(breaks, [*breaks[1:], np.inf], rows, is_sample, strict=True):
             run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row)
@@ -210,15 +211,6 @@ def _integrate(
                 break
             x, done = watch.advance(run, end), until
     return run, watch.contacts
-
-
-def _ode_and_update(model: System | ClosedLoop) -> tuple[System, CompiledUpdate | None, float | None]:
-    """The ODE between two samples, the update at a sample, the sample time."""
-    if isinstance(model, System):
-        return model, None, None
-    if model.pid.sample_time is None:
-        return model.system(), None, None
-    return model.hold_system(), compile_function(model.update), model.pid.sample_time
 
 
 def input_rows(wanted: Sequence[Quantity], inputs: Trajectory) -> Array:
@@ -259,17 +251,15 @@ def _restart_times(t: Array, u: Array, sample_time: float | None, slack: float) 
     return np.concatenate([samples, between])[order], order < len(samples)
 
 
-def initial_state(
-    model: System | ClosedLoop, parameters: ParameterSet, initial: Mapping[str, float] | ArrayLike | None
-) -> Array:
+def initial_state(model: Runnable, parameters: ParameterSet, initial: Mapping[str, float] | ArrayLike | None) -> Array:
     """The state from which `simulate` starts; one where the plant cannot be is an error."""
-    states, plant = model.states, _plant_of(model)
+    states, plant = model.states, model.plant
     if initial is None:
-        x = _rest_state(model, parameters, {}) if isinstance(model, System) else model.initial(parameters)
+        x = model.rest_state(parameters)
     elif isinstance(initial, Mapping):
         check_names("state", initial, names(states), "initial")
         held = {n: float(v) for n, v in initial.items() if n == REST_COORDINATE}
-        base = _rest_state(model, parameters, held) if initial.keys() < set(names(states)) else np.zeros(len(states))
+        base = model.rest_state(parameters, held) if initial.keys() < set(names(states)) else np.zeros(len(states))
         x = np.array([initial.get(q.name, value) for q, value in zip(states, base, strict=True)], dtype=float)
     else:
         x = np.array(initial, dtype=float)
@@ -281,19 +271,3 @@ def initial_state(
         )
     plant.check(parameters, dict(zip(names(plant.states), x.tolist(), strict=False)))
     return x
-
-
-def _rest_state(model: System | ClosedLoop, parameters: ParameterSet, held: Mapping[str, float]) -> Array:
-    """The model at rest where the held outputs have these values; zeros where the plant knows no rest."""
-    plant = _plant_of(model)
-    if plant.rest_hook is None:
-        return np.zeros(len(model.states))
-    rest = plant.rest_hook(parameters, held)
-    x = np.array([rest.states.get(n, 0.0) for n in names(plant.states)])
-    if isinstance(model, System):
-        return x
-    return model.initial(parameters, x, command=rest.inputs.get(model.command.name, 0.0))
-
-
-def _plant_of(model: System | ClosedLoop) -> System:
-    return model.plant if isinstance(model, ClosedLoop) else model

@@ -116,6 +116,34 @@ class System:
         """What speaks against the logs, a sentence each; of a model without a doubter, nothing."""
         return self.log_warning_hook(logs) if self.log_warning_hook is not None else ()
 
+    @property
+    def plant(self) -> "System":
+        """The model itself, as it has no controller."""
+        return self
+
+    def motion(self) -> "Motion":
+        """See `Runnable`."""
+        return Motion(self)
+
+    def discrete(self, substeps: int = 1) -> "DiscreteSystem":
+        """See `discretise`."""
+        return discretise(self, substeps)
+
+    def rest_state(self, parameters: ParameterSet, outputs: Mapping[str, float] | None = None) -> Array:
+        """See `Runnable`; zeros without a `rest_hook`."""
+        rest = self.rest_hook(parameters, outputs or {}).states if self.rest_hook is not None else {}
+        return np.array([rest.get(n, 0.0) for n in names(self.states)])
+
+    def check_log(self, measured: Trajectory, name: str) -> None:
+        """See `Fittable`; a plant without a controller takes every log that holds its inputs."""
+
+    def input_matrix(self, measured: Trajectory, name: str) -> Array:  # noqa: ARG002 - as `Fittable`
+        """See `Fittable`."""
+        return measured.matrix(names(self.inputs))
+
+    def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> None:
+        """See `Fittable`; of a plant every initial state is to be found."""
+
     def _states_from_log(self, measured: Trajectory) -> Trajectory:
         columns = {s.name: _interpolate_missing(measured, s.name) for s in self.states}
         return Trajectory(measured.t, columns)
@@ -188,6 +216,24 @@ class System:
     def _input_vector(self, u: Mapping[str, float]) -> Array:
         check_names("input", u, names(self.inputs))
         return np.array([u.get(q.name, 0.0) for q in self.inputs], dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How a model moves: as `system` between two samples, after `update` at a sample.
+
+    Attributes
+    ----------
+    system : System
+    update : casadi.Function, optional
+        ``(t, x, u, p) -> x``: what a sampled controller does at a sample.
+    sample_time : float, optional
+        From one sample to the next [s].
+    """
+
+    system: System
+    update: ca.Function | None = None
+    sample_time: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

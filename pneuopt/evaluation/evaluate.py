@@ -102,10 +102,10 @@ def evaluate(
     import pandas as pd
 
     steps = [references] if isinstance(references, Step) else list(references)
-    loop = _with_disturbances(loop, steps)
-    full = _require_closed_loop(loop).parameters | parameters
+    inner, rig = _loop_and_rig(loop, steps)
+    full = inner.parameters | parameters
     every = cases(steps, scenarios, full)
-    return pd.DataFrame({case.label: _evaluate_case(loop, case, full, band, envelope) for case in every})
+    return pd.DataFrame({case.label: _evaluate_case(inner, rig, case, full, band, envelope) for case in every})
 
 
 def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
@@ -122,31 +122,31 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     Trajectory
         Of a loop states and outputs, simulated tightly, on a grid finer than the search's; of a rig the truth.
     """
-    loop = _with_disturbances(loop, [reference])
-    inner = _require_closed_loop(loop)
-    run = loop_inputs(inner, reference, sample_spacing(inner, reference, parameters))
-    start = inner.initial(parameters, reference=reference.initial, start=reference.start)
-    if isinstance(loop, Rig):
-        return record(loop, run, parameters, initial=start).truth
-    fine = np.linspace(
-        run.t[0], run.t[-1], POINTS_PER_READING * readings_a_sample(inner, reference) * (len(run) - 1) + 1
-    )
-    return simulate(inner, run, parameters, initial=start, t_out=fine)
+    return _respond(*_loop_and_rig(loop, [reference]), reference, parameters)
+
+
+def _respond(loop: ClosedLoop, rig: Rig | None, reference: Step, parameters: ParameterSet) -> Trajectory:
+    run = loop_inputs(loop, reference, sample_spacing(loop, reference, parameters))
+    start = loop.initial(parameters, reference=reference.initial, start=reference.start)
+    if rig is not None:
+        return record(rig, run, parameters, initial=start).truth
+    count = POINTS_PER_READING * readings_a_sample(loop, reference) * (len(run) - 1) + 1
+    return simulate(loop, run, parameters, initial=start, t_out=np.linspace(run.t[0], run.t[-1], count))
 
 
 def _evaluate_case(
-    loop: ClosedLoop | Rig, case: TuningCase, parameters: ParameterSet, band: float, envelope: Envelope
+    loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: ParameterSet, band: float, envelope: Envelope
 ) -> dict[str, float]:
-    inner, parameters = _require_closed_loop(loop), case.case_parameters(parameters)
-    response = respond(loop, case.reference, parameters)
-    metrics = measure(inner, parameters, case.reference, response, band, envelope)
-    metrics |= limit_cycle_metrics(inner, parameters, case.reference, response)
-    metrics |= response_air_consumption(inner, parameters, response, case.reference.at)
-    if isinstance(loop, Rig):
+    parameters = case.case_parameters(parameters)
+    response = _respond(loop, rig, case.reference, parameters)
+    metrics = measure(loop, parameters, case.reference, response, band, envelope)
+    metrics |= limit_cycle_metrics(loop, parameters, case.reference, response)
+    metrics |= response_air_consumption(loop, parameters, response, case.reference.at)
+    if rig is not None:
         return metrics
-    x, command = final_operating_point(inner, parameters, response)
-    metrics |= friction_slope(inner, parameters, x, command)
-    return metrics | _margin_metrics(inner, parameters, x, command, case.reference)
+    x, command = final_operating_point(loop, parameters, response)
+    metrics |= friction_slope(loop, parameters, x, command)
+    return metrics | _margin_metrics(loop, parameters, x, command, case.reference)
 
 
 def final_operating_point(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory) -> tuple[Array, float]:
@@ -213,13 +213,11 @@ def _margin_metrics(
     return found if robust.stable else {n: nan if n.endswith("Margin") else inf for n in found}
 
 
-def _with_disturbances(loop: ClosedLoop | Rig, references: Sequence[Step]) -> ClosedLoop | Rig:
-    inner = add_disturbances(_require_closed_loop(loop), references)
-    return replace(loop, model=inner) if isinstance(loop, Rig) else inner
-
-
-def _require_closed_loop(loop: ClosedLoop | Rig) -> ClosedLoop:
-    inner = loop.model if isinstance(loop, Rig) else loop
-    if not isinstance(inner, ClosedLoop):
+def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Step]) -> tuple[ClosedLoop, Rig | None]:
+    """The loop with the inputs of the references' disturbances, and the rig in which it runs, if any."""
+    rig = model if isinstance(model, Rig) else None
+    loop = rig.loop if rig is not None else model
+    if not isinstance(loop, ClosedLoop):
         raise ModelError("this rig is a plant alone, which follows no reference; give it a ClosedLoop")
-    return inner
+    loop = add_disturbances(loop, references)
+    return loop, replace(rig, model=loop) if rig is not None else None

@@ -63,21 +63,26 @@ class Rig:
     def __post_init__(self) -> None:
         check_names("output", self.sensors, names(self.plant.outputs), "Rig: sensors")
         _ = self.command
-        if isinstance(self.model, ClosedLoop):
-            _check_loop(self.model)
+        if self.loop is not None:
+            _check_loop(self.loop)
             message = f"the controller needs {self.feedback!r}, which is not measured; add it to sensors"
             require(self.feedback in self.sensors, message, ModelError)
 
     @property
+    def loop(self) -> ClosedLoop | None:
+        """The loop behind the sensors; None where the plant is alone."""
+        return self.model if isinstance(self.model, ClosedLoop) else None
+
+    @property
     def plant(self) -> System:
         """The plant without sensors and controller."""
-        return self.model.plant if isinstance(self.model, ClosedLoop) else self.model
+        return self.model.plant
 
     @cached_property
     def command(self) -> Quantity:
         """The plant's input behind the actuator."""
-        if isinstance(self.model, ClosedLoop):
-            return self.model.command
+        if self.loop is not None:
+            return self.loop.command
         inputs = {q.name: q for q in self.plant.inputs}
         name = self.actuated or (next(iter(inputs)) if len(inputs) == 1 else "")
         require(bool(name), f"the plant has the inputs {', '.join(inputs) or 'none'}; choose actuated=", ModelError)
@@ -87,9 +92,9 @@ class Rig:
     @property
     def feedback(self) -> str | None:
         """The channel that the controller reads, the encoder's where it derives a speed; None without a controller."""
-        if not isinstance(self.model, ClosedLoop):
+        if self.loop is None:
             return None
-        wanted = self.model.feedback.name
+        wanted = self.loop.feedback.name
         return self.encoder.position if wanted == "speed" and "speed" not in self.sensors else wanted
 
     @property
@@ -194,11 +199,11 @@ def record(
     >>> run.experiment.trajectory["position"].round(9).tolist(), [event.t for event in run.events]
     ([0.0, 0.0, 0.023, 0.066], [0.1])
     """
-    log_inputs = _resample_inputs(rig.model, inputs)
+    log_inputs = _resample_inputs(rig, inputs)
     x, p = initial_state(rig.model, parameters, initial), parameter_vector(rig.plant.parameters, parameters)
     source = (
-        _SampledController(rig, rig.model, parameters, log_inputs, x)
-        if isinstance(rig.model, ClosedLoop)
+        _SampledController(rig, rig.loop, parameters, log_inputs, x)
+        if rig.loop is not None
         else _CommandPlayer(rig, log_inputs)
     )
     run = new_integration(rig.sensor_system, p, log_inputs.t, rtol, 1e-2 * rtol)
@@ -325,15 +330,15 @@ def _plant_outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str
     return dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel().tolist(), strict=True))
 
 
-def _resample_inputs(model: System | ClosedLoop, inputs: Trajectory) -> Trajectory:
+def _resample_inputs(rig: Rig, inputs: Trajectory) -> Trajectory:
     """The inputs of the model at the instants of the log."""
-    rows, t, slack = input_rows(model.inputs, inputs), inputs.t, 1e-9
-    if isinstance(model, ClosedLoop):
-        h = model.pid.sample_time or 0.0
+    rows, t, slack = input_rows(rig.model.inputs, inputs), inputs.t, 1e-9
+    if rig.loop is not None:
+        h = rig.loop.pid.sample_time or 0.0
         slack = max(1e-6 * h, 4 * float(np.spacing(np.abs(t).max())))
         t = t[0] + h * np.arange(int((t[-1] - t[0] + slack) / h) + 1)
     rows = rows[np.searchsorted(inputs.t, t + slack, side="right") - 1]
-    return Trajectory(t, dict(zip(names(model.inputs), rows.T, strict=True)))
+    return Trajectory(t, dict(zip(names(rig.model.inputs), rows.T, strict=True)))
 
 
 def _zero_rates(x: Symbols) -> Symbols:

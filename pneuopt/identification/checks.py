@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.dynamics.hooks import Log
-from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
-from pneuopt.identification.logged_loop import LoggedLoop
+from pneuopt.dynamics.runnable import Fittable
+from pneuopt.dynamics.system import names
 from pneuopt.identification.statistics import noise_level
 from pneuopt.logs.doctor import Finding, examine
 from pneuopt.logs.experiments import Experiment
@@ -20,13 +20,10 @@ SETPOINT_CHANNELS = (
     "speed_reference",
     "position_reference",
 )  # a loop's set-points may stay in a log; no plant reads them
-EstimationModel = System | LoggedLoop
 MAX_PAUSE_STEPS = 50  # usual steps without a sample; the inputs in between are unknown
 
 
-def check_logs(
-    system: EstimationModel, experiments: Sequence[Experiment], parameters: ParameterSet
-) -> list[Experiment]:
+def check_logs(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
     """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
     require(len(experiments) > 0, "no experiments: give at least one log", LogError)
     check_names("parameter", parameters, system.parameters)
@@ -38,8 +35,7 @@ def check_logs(
         name = experiment.name or f"log {number}"
         name = name if name not in taken else f"{name} ({number})"
         taken.add(name)
-        if isinstance(system, LoggedLoop):
-            system.check_log(experiment.trajectory, name)
+        system.check_log(experiment.trajectory, name)
         _check_channels(system, experiment, name, known)
         _check_conditions(system, experiment, parameters, name)
         out.append(replace(experiment, name=name))
@@ -68,15 +64,11 @@ def check_content(experiments: Sequence[Experiment]) -> None:
         require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}", LogError)
 
 
-def emit_log_warnings(
-    system: EstimationModel, experiments: Sequence[Experiment], parameters: ParameterSet
-) -> tuple[str, ...]:
-    """What the model tells against logs that `check_logs` has passed, as a gauge pressure read as absolute.
+def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
+    """Warn of what the model finds wrong with logs that `check_logs` has passed, as a gauge pressure read as absolute.
 
-    Each sentence is warned of, too. A loop's logs hold no command, without which its plant tells nothing.
+    The sentences are returned, too.
     """
-    if isinstance(system, LoggedLoop):
-        return ()
     every = system.parameters | parameters
     known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
     found = system.log_warnings({e.name: Log(e.trajectory, known[e.name]) for e in experiments})
@@ -85,16 +77,7 @@ def emit_log_warnings(
     return tuple(found)
 
 
-def check_smooth(system: EstimationModel) -> None:
-    """Refuse Karnopp's friction where derivatives are taken: without its events a search sees no dry friction."""
-    message = (
-        "the plant has Karnopp's friction (friction.direction), which only a simulation switches; search on the smooth "
-        "model, Coulomb() or Stribeck(), and prove the result on this one with simulate, evaluate or record"
-    )
-    require(FRICTION_DIRECTION not in system.parameters, message, ModelError)
-
-
-def _check_conditions(system: EstimationModel, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
+def _check_conditions(system: Fittable, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
     """The hardware as it is in this log."""
     check_names("parameter", experiment.conditions, system.parameters, f"{name}: condition")
     try:
@@ -103,7 +86,7 @@ def _check_conditions(system: EstimationModel, experiment: Experiment, parameter
         raise InputError(f"{name}: condition {error}") from None
 
 
-def _check_channels(system: EstimationModel, experiment: Experiment, name: str, known: set[str]) -> None:
+def _check_channels(system: Fittable, experiment: Experiment, name: str, known: set[str]) -> None:
     trajectory = experiment.trajectory
     require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
     steps = np.diff(trajectory.t)
@@ -131,7 +114,7 @@ def _check_channels(system: EstimationModel, experiment: Experiment, name: str, 
         require(bool(np.isfinite(trajectory[channel]).any()), empty, LogError)
 
 
-def _fill_noise(system: EstimationModel, experiments: Sequence[Experiment]) -> list[Experiment]:
+def _fill_noise(system: Fittable, experiments: Sequence[Experiment]) -> list[Experiment]:
     """Where a log declares no noise: the median over all logs of what the channel shows, for sensors are shared."""
     found: dict[str, dict[str, float]] = {}
     for experiment in experiments:
@@ -153,7 +136,7 @@ def _fill_noise(system: EstimationModel, experiments: Sequence[Experiment]) -> l
     ]
 
 
-def outputs_in_log(system: EstimationModel, experiment: Experiment) -> tuple[str, ...]:
+def outputs_in_log(system: Fittable, experiment: Experiment) -> tuple[str, ...]:
     """The system's outputs that a log holds, unless they are its inputs, too."""
     inputs = names(system.inputs)
     return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)

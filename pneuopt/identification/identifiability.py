@@ -9,8 +9,9 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.dynamics.system import System
-from pneuopt.identification.checks import check_content, check_free, check_logs, check_smooth
+from pneuopt.identification.checks import check_content, check_free, check_logs
 from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.profiles import Profile

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.runnable import Fittable, check_smooth
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, names
 from pneuopt.identification.checks import (
     check_content,
     check_free,
     check_logs,
-    check_smooth,
     emit_log_warnings,
     outputs_in_log,
 )
@@ -25,11 +26,9 @@ from pneuopt.identification.identifiability import Verdict
 from pneuopt.identification.losses import Loss, Refit, fit_robustly, white_chi_square
 from pneuopt.identification.multistart import multistart
 from pneuopt.identification.problem import (
-    EstimationModel,
     EstimationProblem,
     apply_conditions,
     as_estimation_model,
-    free_run,
 )
 from pneuopt.identification.review import review_fit
 from pneuopt.identification.statistics import (
@@ -208,16 +207,16 @@ def predict(system: System | ClosedLoop, experiment: Experiment, parameters: Par
     return _predict_log(model, check_logs(model, [experiment], fixed)[0], fixed)
 
 
-def _predict_log(system: EstimationModel, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
+def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
     inputs, known = experiment.trajectory, apply_conditions(fixed, experiment)
     if not system.states:
-        return free_run(system, inputs, known, {})
+        return simulate(system, inputs, known, initial={})
     method = LeastSquares()  # over the whole log in one segment, stiction would trap the start in a local optimum
     problem = EstimationProblem(system, (experiment,), fixed, method)
     start = problem.candidates()[0]
     initial = solve_least_squares(problem.transcription(start), method).solution.trajectories[0]
     state = {s.name: float(initial[s.name][0]) for s in system.states}
-    return free_run(system, inputs, known, state)
+    return simulate(system, inputs, known, initial=state)
 
 
 def _result(found: Refit, label: str, loss: Loss | None) -> tuple[IdentificationResult, tuple[str, ...]]:
@@ -333,16 +332,14 @@ def _are_alike(best: Fit, second: Fit) -> bool:
     return converged and same and _fit_cost(second) <= 1.001 * _fit_cost(best)
 
 
-def _fit_table(
-    system: EstimationModel, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]
-) -> "pd.DataFrame":
+def _fit_table(system: Fittable, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
     import pandas as pd
 
     rows = [row for e in experiments for row in _agreement_rows(system, e, runs[e.name])]
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
 
-def _agreement_rows(system: EstimationModel, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
+def _agreement_rows(system: Fittable, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
     units = {q.name: q.unit for q in system.outputs}
     rows: list[dict[str, object]] = []
     for channel in outputs_in_log(system, experiment):
@@ -352,9 +349,7 @@ def _agreement_rows(system: EstimationModel, experiment: Experiment, run: Trajec
     return rows
 
 
-def _residual_diagnosis(
-    system: EstimationModel, experiment: Experiment, run: Trajectory, channel: str
-) -> dict[str, object]:
+def _residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajectory, channel: str) -> dict[str, object]:
     """What of the inputs, and of its own past, is left in a channel's residuals."""
     log = experiment.trajectory
     residuals = log[channel] - run[channel]
@@ -366,7 +361,7 @@ def _residual_diagnosis(
 
 
 def _residual_correlation_time(
-    system: EstimationModel, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]
+    system: Fittable, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]
 ) -> float:
     """By how much correlated residuals (model error, not noise) widen a variance: the mean over logs and channels."""
     times = [

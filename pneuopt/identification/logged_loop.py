@@ -18,7 +18,7 @@ from pneuopt.control.rest import unobservable_states
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, names
+from pneuopt.dynamics.system import DiscreteSystem, Motion, Symbols, System, define, names
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
@@ -78,6 +78,20 @@ class LoggedLoop:
         """The loop's."""
         return self.loop.parameters
 
+    @property
+    def plant(self) -> System:
+        """The loop's."""
+        return self.loop.plant
+
+    def motion(self) -> Motion:
+        """The loop's, its reference named as in a log."""
+        motion = self.loop.motion()
+        return replace(motion, system=replace(motion.system, inputs=self.inputs))
+
+    def rest_state(self, parameters: ParameterSet, outputs: Mapping[str, float] | None = None) -> Array:
+        """The loop's."""
+        return self.loop.rest_state(parameters, outputs)
+
     def check(self, parameters: ParameterSet) -> None:
         """As `ClosedLoop.check`."""
         self.loop.check(parameters)
@@ -90,9 +104,9 @@ class LoggedLoop:
         require(reference in measured, f"{name}: the loop needs the channel {reference!r} as input", LogError)
         _acting_samples(measured.t, self._sample_time, name)
 
-    def discrete(self) -> DiscreteSystem:
+    def discrete(self, substeps: int = 1) -> DiscreteSystem:
         """The loop's sampled step; its last input says at which samples the controller acts."""
-        return _add_acting_input(self.loop.discrete(), self.inputs)
+        return _add_acting_input(self.loop.discrete(substeps), self.inputs)
 
     def input_matrix(self, measured: Trajectory, name: str) -> Array:
         """The inputs of `discrete` along a log, shape (n, n_inputs)."""
@@ -113,10 +127,6 @@ class LoggedLoop:
         held |= set.intersection(*(set(unobservable_states(self.loop.plant, n)) for n in seen))
         return np.array([states[n][0] if n in held else np.nan for n in names(self.states)])
 
-    def with_reference(self, measured: Trajectory) -> Trajectory:
-        """The log with its reference named as `simulate` reads it."""
-        return measured.with_columns({"reference": measured[self.inputs[0].name]})
-
     def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """The plant's own candidates under the command that the controller must have given; the log began at rest.
 
@@ -131,6 +141,10 @@ class LoggedLoop:
                 states = {n: run.with_columns(_controller_states(replayed[n])) for n, run in start.states.items()}
                 out.append(Start(states, start.parameters, ", ".join(filter(None, (start.label, label)))))
         return out
+
+    def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:  # noqa: ARG002 - as `Fittable`
+        """None: the log lacks the command, without which the plant cannot examine it."""
+        return ()
 
     @property
     def _sample_time(self) -> float:

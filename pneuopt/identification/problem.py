@@ -8,8 +8,8 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
+from pneuopt.dynamics.runnable import Fittable
+from pneuopt.dynamics.system import System, names
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.logs.experiments import Experiment
@@ -20,8 +20,6 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
-EstimationModel = System | LoggedLoop
-
 
 @dataclass(frozen=True, eq=False)
 class EstimationProblem:
@@ -29,7 +27,7 @@ class EstimationProblem:
 
     Parameters
     ----------
-    system : System or LoggedLoop
+    system : Fittable
     experiments : tuple of Experiment
     parameters : ParameterSet
     method : LeastSquares
@@ -39,7 +37,7 @@ class EstimationProblem:
         Free parameters that the logs do not tell, and where they stay.
     """
 
-    system: EstimationModel
+    system: Fittable
     experiments: tuple[Experiment, ...]
     parameters: ParameterSet
     method: LeastSquares
@@ -72,20 +70,15 @@ class EstimationProblem:
         parameters = self.unknowns().with_values(candidate.parameters)
         held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.held.items()}
         parameters = parameters | ParameterSet(held)
-        return Transcription(self._discretise(), parameters, phases, residuals)
-
-    def _discretise(self) -> DiscreteSystem:
-        return self.system.discrete() if isinstance(self.system, LoggedLoop) else discretise(self.system)
+        return Transcription(self.system.discrete(), parameters, phases, residuals)
 
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
         nodes, guess = regular_nodes(len(t), self._samples_a_segment(h)), states.matrix(names(self.system.states))
-        if isinstance(self.system, LoggedLoop):
-            driven = self.system.input_matrix(experiment.trajectory, experiment.name)
-            start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
-            return Phase(experiment.name, t, h, driven, nodes, start, guess=guess)
-        return Phase(experiment.name, t, h, experiment.trajectory.matrix(names(self.system.inputs)), nodes, guess=guess)
+        driven = self.system.input_matrix(experiment.trajectory, experiment.name)
+        start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
+        return Phase(experiment.name, t, h, driven, nodes, start, guess=guess)
 
     def _samples_a_segment(self, h: Array) -> int:
         """Samples between two nodes; a static map has no gaps, so its cut is only for batching."""
@@ -102,18 +95,9 @@ class EstimationProblem:
         return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
 
 
-def as_estimation_model(model: System | ClosedLoop) -> EstimationModel:
+def as_estimation_model(model: System | ClosedLoop) -> Fittable:
     """The model as an identification reads it from a log."""
     return LoggedLoop(model) if isinstance(model, ClosedLoop) else model
-
-
-def free_run(
-    model: EstimationModel, inputs: Trajectory, parameters: ParameterSet, initial: Mapping[str, float]
-) -> Trajectory:
-    """Simulate the model along a log from a known state."""
-    if isinstance(model, LoggedLoop):
-        return simulate(model.loop, model.with_reference(inputs), parameters, initial=initial)
-    return simulate(model, inputs, parameters, initial=initial)
 
 
 def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:

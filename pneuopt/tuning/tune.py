@@ -13,11 +13,11 @@ import numpy as np
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.requirements import PeakControl, Requirement
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification, specify
-from pneuopt.identification.checks import check_smooth
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback

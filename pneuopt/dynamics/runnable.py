@@ -1,0 +1,93 @@
+"""`Runnable` and `Fittable`: what a model offers so that it can be simulated, and fitted to logs.
+
+`System`, `ClosedLoop` and `LoggedLoop` are runnable; a new kind of model becomes so by these members, and is then taken
+by `simulate` and, where it is fittable, by `identify`. Nobody asks a model for its type.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.system import FRICTION_DIRECTION, DiscreteSystem, Motion, System
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
+
+
+class Runnable(Protocol):
+    """A model that can be simulated; the plant's states come first among its own."""
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """Those of a state vector, in its order."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """What a simulation has to be given."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """What a simulation reports beside the states."""
+        ...
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Every parameter with its default."""
+        ...
+
+    @property
+    def plant(self) -> System:
+        """The plant without a controller."""
+        ...
+
+    def motion(self) -> Motion:
+        """The equations between two samples, and what happens at a sample."""
+        ...
+
+    def discrete(self, substeps: int = 1) -> DiscreteSystem:
+        """The sampled step, by `substeps` steps of RK4 a sample."""
+        ...
+
+    def rest_state(self, parameters: ParameterSet, outputs: Mapping[str, float] | None = None) -> Array:
+        """The state at rest, shape (n_states,), where the named outputs of the plant have these values."""
+        ...
+
+
+class Fittable(Runnable, Protocol):
+    """A model that can be fitted to logs; its inputs and outputs are named as a log's channels are."""
+
+    def check(self, parameters: ParameterSet) -> None:
+        """Raise `InputError` for values with which it cannot run."""
+        ...
+
+    def check_log(self, measured: Trajectory, name: str) -> None:
+        """Raise `LogError` for a log that does not fit this model, beyond its inputs and outputs."""
+        ...
+
+    def input_matrix(self, measured: Trajectory, name: str) -> Array:
+        """The inputs of `discrete` along a log, shape (n, n_inputs)."""
+        ...
+
+    def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array | None:
+        """The initial states that no output depends on, from a candidate; NaN, or None for all, where one is sought."""
+        ...
+
+    def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
+        """Candidates from which an identification can start, the most plausible first."""
+        ...
+
+    def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:
+        """What speaks against the logs, a sentence each."""
+        ...
+
+
+def check_smooth(model: Runnable) -> None:
+    """Refuse Karnopp's friction where derivatives are taken: without its events a search sees no dry friction."""
+    message = (
+        "the plant has Karnopp's friction (friction.direction), which only a simulation switches; search on the smooth "
+        "model, Coulomb() or Stribeck(), and prove the result on this one with simulate, evaluate or record"
+    )
+    require(FRICTION_DIRECTION not in model.parameters, message, ModelError)
