@@ -20,14 +20,14 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show_verdict
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.dynamics.system import System
-from pneuopt.files.drive import Drive, read_drive, write_fit
+from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.identification.identifiability import Verdict, identifiability
 from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiments import Experiment, read_log, split
-from pneuopt.models.drive import ForceDrive, MotionDrive
+from pneuopt.models.declaration import Drive
+from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.models.friction import friction_ladder
-from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,
@@ -36,7 +36,7 @@ from pneuopt.plotting import (
     plot_prediction,
     plot_residuals,
 )
-from pneuopt.quantities.errors import InputError, require
+from pneuopt.quantities.errors import require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import LeastSquares
@@ -147,9 +147,10 @@ def _read_free_drive(path: Path) -> tuple[Drive, ParameterSet]:
 
 def _friction_systems(path: Path, model: Drive) -> dict[str, System]:
     """The drive with each friction model in turn."""
-    if not isinstance(model, ForceDrive | MotionDrive | PneumaticDrive):
-        raise InputError(f"{path}: --select chooses a drive's friction model; this plant is not built from one")
-    return {name: replace(model, friction=friction).system() for name, friction in friction_ladder().items()}
+    message = f"{path}: --select chooses a drive's friction model; this plant is not built from one"
+    require(DRIVE_KINDS[model.kind].any_friction, message)
+    drive: Any = model
+    return {name: replace(drive, friction=friction).system() for name, friction in friction_ladder().items()}
 
 
 def _verdict_record(verdict: Verdict | None) -> dict[str, Any]:

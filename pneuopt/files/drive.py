@@ -1,9 +1,10 @@
 """Files that people edit: drive.toml, and fit.toml made from it; whole or not at all, comments kept.
 
 A value is "32 mm", or a table where it may be free: { value = "40 N", lower = "5 N", upper = "90 N", free = true }.
+Which kinds of drive there are, and which sections and keys each has, is declared beside the drives.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -11,26 +12,11 @@ import tomlkit
 
 from pneuopt.dynamics.system import System
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.logs.experiments import CHANNELS
-from pneuopt.models.drive import FORCE, POSITION, ForceDrive, MotionDrive
-from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.linear import SPEED, VALVE_VOLTAGE, FirstOrder, Integrator, SecondOrder
-from pneuopt.models.load import Load
-from pneuopt.models.pneumatic.chamber import ChamberModel, Polytropic, Thermal
-from pneuopt.models.pneumatic.cylinder import Cylinder
-from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.models.pneumatic.gas import (
-    CRITICAL_RATIO,
-    FlowLaw,
-    IsentropicNozzle,
-    Iso6358,
-    Smoothing,
-    conductance_of_nominal_flow,
-)
-from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
-from pneuopt.quantities.errors import HardwareError, InputError, UnitError, UnknownNameError, check_names, require
+from pneuopt.models.declaration import Alias, Drive, DriveKind, Sections, Structure, choice
+from pneuopt.models.drive_kinds import DRIVE_KINDS
+from pneuopt.quantities.errors import HardwareError, InputError, UnknownNameError, check_names, require
 from pneuopt.quantities.output import plain_value, write_text
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import read_value
 
@@ -39,53 +25,11 @@ if TYPE_CHECKING:
 
     from pneuopt.identification.identifiability import Verdict
 
-DriveSections = Mapping[str, Mapping[str, Any]]
-
-FRICTION_MODELS: Mapping[str, Callable[[], FrictionModel]] = {
-    "viscous": Viscous,
-    "coulomb": Coulomb,
-    "stribeck": Stribeck,
-    "lugre": LuGre,
-}
-FLOW_LAWS: Mapping[str, Callable[[], FlowLaw]] = {"iso6358": Iso6358, "isentropic": IsentropicNozzle}
-SPOOL_MODELS = {spool.name.lower(): spool for spool in Spool}
-LINEAR_PLANTS = ("first_order", "second_order", "integrator")
-CHAMBER_PRESSURES = ("pressure_a", "pressure_b")
-NOMINAL_FLOW_KEY, CONDUCTANCE_NAME, CRITICAL_RATIO_NAME = "nominal_flow", "valve.conductance", "valve.critical_ratio"
 FIT_SECTIONS = ("estimates", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
-# What a section says about the drive's structure; every other key of it is a parameter.
-_DRIVE_STRUCTURE: DriveSections = {
-    "drive": {"kind": "text"},
-    "cylinder": {"stops": "true or false"},
-    "valve": {"law": "text", "spool": "text", "smoothing": "a table", "nominal_flow": "text or a table"},
-    "supply": {},
-    "gas": {},
-    "chamber": {"model": "text", "mixed": "true or false"},
-    "ambient": {},
-    "load": {"spring": "true or false", "inclined": "true or false"},
-    "friction": {"model": "text", "asymmetric": "true or false", "pressure_dependent": "true, false or a list"},
-    "plant": {"model": "text", "input": "text", "output": "text", "pade_order": "a whole number"},
-    "rig": {"chamber": "true or false"},
-}
-_SMOOTHING_UNITS = {"corner": "1", "zero": "1", "pressure": "Pa"}
-_STRUCTURE_TYPES: Mapping[str, tuple[type, ...]] = {
-    "text": (str,),
-    "true or false": (bool,),
-    "true, false or a list": (bool, list),
-    "a whole number": (int,),
-    "a table": (dict,),
-    "text or a table": (str, dict),
-}
-
-
-class Drive(Protocol):
-    """What a drive.toml describes."""
-
-    def system(self) -> System:
-        """Its equations, with every parameter's default."""
-        ...
+_KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
+_DRIVE_SECTION = {"drive": {"kind": choice(DRIVE_KINDS)}}
 
 
 class WritableFit(Protocol):
@@ -127,7 +71,7 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
 
     Returns
     -------
-    drive : PneumaticDrive, ForceDrive, MotionDrive, FirstOrder, SecondOrder or Integrator
+    drive : PneumaticDrive, ForceDrive or another
         By [drive] kind and the other sections.
     parameters : ParameterSet
         All of `drive.system().parameters`; one that the file leaves out keeps the model's default.
@@ -141,10 +85,11 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
     places = FileLocations(path, document.as_string())
     sections = {name: section for name, section in document.unwrap().items() if name not in FIT_SECTIONS}
     for name, section in sections.items():
-        check_names("section", [name], _DRIVE_STRUCTURE, places.location(name))
+        check_names("section", [name], _KNOWN_SECTIONS, places.location(name))
         require(isinstance(section, dict), f"{places.location(name)}: {name} must be a section, [{name}]")
-    drive = _build_drive(sections, places)
-    return drive, _read_parameters(drive.system(), sections, places)
+    kind: DriveKind = Structure(sections, _DRIVE_SECTION, places.location).option("drive", "kind")
+    drive = kind.build(Structure(sections, kind.sections, places.location))
+    return drive, _read_parameters(drive.system(), kind, sections, places)
 
 
 def read_status(path: str | Path) -> Status | None:
@@ -192,8 +137,9 @@ def write_fit(path: str | Path, source: str | Path, result: WritableFit) -> None
         If one of the files cannot be read or written.
     """
     document, (drive, given) = read_toml(source), read_drive(source)
-    if any(n in given and result.parameters[n] != given[n] for n in (CONDUCTANCE_NAME, CRITICAL_RATIO_NAME)):
-        given = _without_nominal_flow(document, drive, given)
+    for alias in DRIVE_KINDS[drive.kind].aliases:
+        if any(n in given and result.parameters[n] != given[n] for n in (alias.parameter, *alias.uses)):
+            given = _without_alias(document, alias, drive, given)
     for name, found in result.parameters.items():
         if name in given and found != given[name]:
             write_parameter(document, name, found, given[name])
@@ -206,150 +152,39 @@ def write_fit(path: str | Path, source: str | Path, result: WritableFit) -> None
     write_text(path, tomlkit.dumps(document))
 
 
-def _without_nominal_flow(document: tomlkit.TOMLDocument, drive: Drive, given: ParameterSet) -> ParameterSet:
-    """Once the conductance or the critical ratio is estimated, a nominal flow no longer says both; drop it."""
-    valve: Any = document.get("valve", {})
-    if NOMINAL_FLOW_KEY not in valve:
+def _without_alias(document: tomlkit.TOMLDocument, alias: Alias, drive: Drive, given: ParameterSet) -> ParameterSet:
+    """Drop an alias from the file: once the parameter, or one that it is converted by, is estimated, it is wrong."""
+    section: Any = document.get(alias.section, {})
+    if alias.key not in section:
         return given
-    valve.remove(NOMINAL_FLOW_KEY)
-    return given | drive.system().parameters.select([CONDUCTANCE_NAME])
+    section.remove(alias.key)
+    return given | drive.system().parameters.select([alias.parameter])
 
 
-def _build_drive(sections: DriveSections, places: FileLocations) -> Drive:
-    for name, known in _DRIVE_STRUCTURE.items():
-        for key in known.keys() & sections.get(name, {}).keys():
-            right = type(sections[name][key]) in _STRUCTURE_TYPES[known[key]]
-            require(
-                right, f"{places.location(name, key)}: [{name}] {key} must be {known[key]}, got {sections[name][key]!r}"
-            )
-    kind = _read_choice(sections, "drive", "kind", _DRIVE_KINDS, places)
-    return _DRIVE_KINDS[kind](sections, places)
-
-
-def _pneumatic_drive(sections: DriveSections, places: FileLocations) -> Drive:
-    law = FLOW_LAWS[_read_choice(sections, "valve", "law", FLOW_LAWS, places, "iso6358")]()
-    spool = SPOOL_MODELS[_read_choice(sections, "valve", "spool", SPOOL_MODELS, places, "second_order")]
-    valve = ProportionalValve(law, spool, _smoothing(sections, places))
-    cylinder = Cylinder(**_structure_options(sections, "cylinder"))
-    return PneumaticDrive(valve, _friction(sections, places), _load(sections), _chamber(sections, places), cylinder)
-
-
-def _smoothing(sections: DriveSections, places: FileLocations) -> Smoothing:
-    """How the orifice's law is rounded: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
-    said, where = (
-        sections.get("valve", {}).get("smoothing", {}),
-        f"{places.location('valve', 'smoothing')}: [valve] smoothing",
-    )
-    check_names("key", said, _SMOOTHING_UNITS, where)
-    widths = {n: read_value(v, _SMOOTHING_UNITS[n], where=f"{where}: {n}") for n, v in said.items()}
-    for name, width in widths.items():
-        require(width > 0, f"{where}: {name} must be positive, got {said[name]}; smaller is sharper and stiffer")
-    return Smoothing(**widths)
-
-
-def _chamber(sections: DriveSections, places: FileLocations) -> ChamberModel:
-    said = _structure_options(sections, "chamber")
-    if _read_choice(sections, "chamber", "model", ("polytropic", "thermal"), places, "polytropic") == "polytropic":
-        return Polytropic(said.get("mixed", False))
-    require(
-        "mixed" not in said,
-        f"{places.location('chamber', 'mixed')}: [chamber] mixed: a thermal chamber has no exponents; leave it out",
-    )
-    return Thermal()
-
-
-def _force_drive(sections: DriveSections, places: FileLocations) -> Drive:
-    return ForceDrive(_friction(sections, places), _load(sections))
-
-
-def _load(sections: DriveSections) -> Load:
-    return Load(**_structure_options(sections, "load"))
-
-
-def _motion_drive(sections: DriveSections, places: FileLocations) -> Drive:
-    return MotionDrive(_friction(sections, places), chamber=sections.get("rig", {}).get("chamber", True))
-
-
-def _linear_plant(sections: DriveSections, places: FileLocations) -> Drive:
-    plant = sections.get("plant", {})
-    model = _read_choice(sections, "plant", "model", LINEAR_PLANTS, places)
-    signals = [plant.get("input", "valve_voltage"), plant.get("output", "speed")]
-    check_names("channel", signals, CHANNELS, f"{places.location('plant')}: [plant]")
-    known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
-    u, y = (known.get(name, Quantity(name, CHANNELS[name])) for name in signals)
-    # Order 3 follows a delay up to 4.6 rad of phase and adds three states; 0 leaves the dead time out.
-    order = plant.get("pade_order", 3 if "dead_time" in plant else 0)
-    if model == "second_order":
-        return SecondOrder(order, _friction(sections, places) if "friction" in sections else None, u, y)
-    return (FirstOrder if model == "first_order" else Integrator)(order, u, y)
-
-
-_DRIVE_KINDS: Mapping[str, Callable[[DriveSections, FileLocations], Drive]] = {
-    "pneumatic": _pneumatic_drive,
-    "force": _force_drive,
-    "motion": _motion_drive,
-    "linear": _linear_plant,
-}
-
-
-def _structure_options(sections: DriveSections, name: str) -> dict[str, Any]:
-    """What a section says of the structure."""
-    return {key: value for key, value in sections.get(name, {}).items() if key in _DRIVE_STRUCTURE[name]}
-
-
-def _friction(sections: DriveSections, places: FileLocations) -> FrictionModel:
-    said = sections.get("friction", {})
-    model = FRICTION_MODELS[_read_choice(sections, "friction", "model", FRICTION_MODELS, places)]()
-    if said.get("asymmetric", False):
-        model = Asymmetric(model)
-    dependent = said.get("pressure_dependent", False)
-    if not dependent:
-        return model
-    chambers = CHAMBER_PRESSURES if dependent is True else tuple(dependent)
-    check_names(
-        "chamber",
-        chambers,
-        CHAMBER_PRESSURES,
-        f"{places.location('friction', 'pressure_dependent')}: [friction] pressure_dependent",
-    )
-    return PressureDependent(model, chambers)
-
-
-def _read_choice(
-    sections: DriveSections,
-    section: str,
-    key: str,
-    known: Sequence[str] | Mapping[str, Any],
-    places: FileLocations,
-    usual: str | None = None,
-) -> str:
-    value = sections.get(section, {}).get(key, usual)
-    if value is None:
-        raise InputError(
-            f'{places.location(section)}: [{section}] says no {key}; write {key} = "...", one of: {", ".join(known)}'
-        )
-    check_names(key, [value], known, f"{places.location(section, key)}: [{section}]")
-    return str(value)
-
-
-def _read_parameters(system: System, sections: DriveSections, places: FileLocations) -> ParameterSet:
+def _read_parameters(system: System, kind: DriveKind, sections: Sections, places: FileLocations) -> ParameterSet:
     defaults, edits = system.parameters, dict[str, Parameter]()
-    known = {name.partition(".")[0] for name in defaults} | {"drive"}
-    known |= {name for name in ("friction", "plant") if any(n.startswith(f"{name}.") for n in defaults)}
-    for section, entries in sections.items():
-        if section not in known:
-            where = f"{places.location(section)}: kind {sections['drive']['kind']!r}"
-            raise UnknownNameError("section", section, known, where)
-        structure = _DRIVE_STRUCTURE.get(section, {})
-        keys = [name.partition(".")[2] for name in defaults if name.startswith(f"{section}.")]
-        for key in entries:
-            check_names("key", [key], [*structure, *keys], f"{places.location(section, key)}: [{section}]")
+    _check_keys(defaults, kind, sections, places)
     entries = {f"{s}.{k}": v for s, said in sections.items() for k, v in said.items() if f"{s}.{k}" in defaults}
     _check_hardware(system, entries, places)
-    entries |= _nominal_conductance(sections, entries, defaults, places)
+    for alias in kind.aliases:
+        entries |= _read_alias(alias, sections, entries, defaults, places)
     for name, entry in entries.items():
         edits[name] = read_parameter(entry, defaults[name], _parameter_place(name, places))
     return defaults | ParameterSet({name: edits[name] for name in defaults if name in edits})
+
+
+def _check_keys(defaults: ParameterSet, kind: DriveKind, sections: Sections, places: FileLocations) -> None:
+    """Refuse sections and keys that this drive has not."""
+    known = {"drive", *(name.partition(".")[0] for name in defaults)}
+    aliases = [(alias.section, alias.key) for alias in kind.aliases]
+    for section, entries in sections.items():
+        if section not in known:
+            raise UnknownNameError("section", section, known, f"{places.location(section)}: kind {kind.name!r}")
+        structure = {**_DRIVE_SECTION, **kind.sections}.get(section, {})
+        keys = [name.partition(".")[2] for name in defaults if name.startswith(f"{section}.")]
+        others = [key for where, key in aliases if where == section]
+        for key in entries:
+            check_names("key", [key], [*structure, *keys, *others], f"{places.location(section, key)}: [{section}]")
 
 
 def _check_hardware(system: System, entries: Mapping[str, Any], places: FileLocations) -> None:
@@ -366,36 +201,28 @@ def _check_hardware(system: System, entries: Mapping[str, Any], places: FileLoca
         raise InputError(f"{written} is impossible; {error.remedy}") from None
 
 
-def _nominal_conductance(
-    sections: DriveSections, entries: Mapping[str, Any], defaults: ParameterSet, places: FileLocations
+def _read_alias(
+    alias: Alias, sections: Sections, entries: Mapping[str, Any], defaults: ParameterSet, places: FileLocations
 ) -> dict[str, Any]:
-    """The conductance that [valve] nominal_flow means: 6 to 5 bar(g), in l/min(ANR), at the critical ratio given."""
-    said, where = (
-        sections.get("valve", {}).get(NOMINAL_FLOW_KEY),
-        f"{places.location('valve', NOMINAL_FLOW_KEY)}: [valve] {NOMINAL_FLOW_KEY}",
-    )
+    """The entry of the parameter that an alias says; nothing where the file does not hold the alias."""
+    said = sections.get(alias.section, {}).get(alias.key)
     if said is None:
         return {}
-    require(CONDUCTANCE_NAME not in entries, f"{where} and conductance say the same; leave one of them out")
-    b = CRITICAL_RATIO
-    if CRITICAL_RATIO_NAME in defaults:
-        b = read_parameter(
-            entries.get(CRITICAL_RATIO_NAME, defaults.value(CRITICAL_RATIO_NAME)),
-            defaults[CRITICAL_RATIO_NAME],
-            _parameter_place(CRITICAL_RATIO_NAME, places),
-        ).value
+    where, own = _parameter_place(f"{alias.section}.{alias.key}", places), alias.parameter.partition(".")[2]
+    require(alias.parameter not in entries, f"{where} and {own} say the same; leave one of them out")
+    values = {
+        n: read_parameter(entries[n], defaults[n], _parameter_place(n, places)).value
+        if n in entries
+        else defaults.value(n)
+        for n in alias.uses
+        if n in defaults
+    }
 
-    def conductance(text: Any) -> str:
-        is_anr = isinstance(text, str) and text.strip().endswith("(ANR)")
-        remedy = 'a nominal flow, 6 to 5 bar(g), is written at ANR (20 degC, 100 kPa): "700 l/min(ANR)"'
-        require(is_anr, f"{where}: {text!r}: {remedy}", UnitError)
-        flow = read_value(text.strip().removesuffix("(ANR)"), "m^3/s", where=where)
-        require(flow > 0, f"{where}: a flow is positive, got {text!r}")
-        return f"{conductance_of_nominal_flow(flow, b)!r} {defaults[CONDUCTANCE_NAME].unit}"
+    def convert(entry: Any) -> str:
+        return f"{alias.convert(entry, values, where)!r} {defaults[alias.parameter].unit}"
 
     fields = said if isinstance(said, dict) else {"value": said}
-    flows = ("value", "lower", "upper")
-    return {CONDUCTANCE_NAME: {f: conductance(v) if f in flows else v for f, v in fields.items()}}
+    return {alias.parameter: {f: convert(v) if f in ("value", "lower", "upper") else v for f, v in fields.items()}}
 
 
 def _parameter_place(name: str, places: FileLocations) -> str:

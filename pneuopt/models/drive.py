@@ -1,12 +1,15 @@
 """Drives wired from parts: `ForceDrive` (pushed by a known force), `MotionDrive` (moved, its friction measured)."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import casadi as ca
 
 from pneuopt.dynamics.system import Symbols, System, define
+from pneuopt.models.declaration import DriveKind, flag
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.load import Load
+from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
+from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
@@ -28,6 +31,7 @@ class ForceDrive:
     load : Load
     """
 
+    kind: ClassVar[str] = "force"
     friction: FrictionModel
     load: Load = field(default_factory=Load)
 
@@ -68,6 +72,7 @@ class MotionDrive:
         Whether the pressure of a chamber acts on the piston; input pressure_a [Pa(a)].
     """
 
+    kind: ClassVar[str] = "motion"
     friction: FrictionModel
     chamber: bool = True
 
@@ -102,6 +107,17 @@ class MotionDrive:
             pressures = (_PRESSURE_A, *pressures)
         return define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, motion_starts)
 
+
+FORCE_KIND = DriveKind(
+    ForceDrive.kind,
+    {"load": LOAD_KEYS, "friction": FRICTION_KEYS, "ambient": {}},
+    lambda said: ForceDrive(read_friction(said), Load(**said.options("load"))),
+)
+MOTION_KIND = DriveKind(
+    MotionDrive.kind,
+    {"rig": {"chamber": flag(True)}, "friction": FRICTION_KEYS, "ambient": {}},
+    lambda said: MotionDrive(read_friction(said), **said.options("rig")),
+)
 
 AMBIENT_PARAMETERS = ParameterSet(
     {

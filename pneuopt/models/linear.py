@@ -9,18 +9,23 @@ at 2, 3.5, 5.1, 6.8, 8.5 divided by the dead time (orders 1 to 5), and RK4 steps
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import casadi as ca
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, names
+from pneuopt.logs.experiments import CHANNELS
+from pneuopt.models.declaration import DriveKind, Key, Structure, choice
+from pneuopt.models.drive import FORCE, POSITION, SPEED
 from pneuopt.models.friction import FrictionModel
+from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
-SPEED = Quantity("speed", "m/s", nominal=0.5)
 MAX_PADE_ORDER = 5
+USUAL_PADE_ORDER = 3  # of a file's dead time: follows a delay up to 4.6 rad of phase, and adds three states
 Dynamics = Callable[[ca.SX, Symbols, Symbols], dict[str, ca.SX]]
 
 
@@ -42,6 +47,7 @@ class FirstOrder:
     -2.0
     """
 
+    kind: ClassVar[str] = "linear"
     pade_order: int = 0
     input: Quantity = VALVE_VOLTAGE
     output: Quantity = SPEED
@@ -90,6 +96,7 @@ class SecondOrder:
     1.0
     """
 
+    kind: ClassVar[str] = "linear"
     pade_order: int = 0
     friction: FrictionModel | None = None
     input: Quantity = VALVE_VOLTAGE
@@ -149,6 +156,7 @@ class Integrator:
     'm/(V*s)'
     """
 
+    kind: ClassVar[str] = "linear"
     pade_order: int = 0
     input: Quantity = VALVE_VOLTAGE
     output: Quantity = SPEED
@@ -167,6 +175,37 @@ class Integrator:
 
 
 Plant = FirstOrder | SecondOrder | Integrator
+
+
+def _build_plant(said: Structure) -> Plant:
+    options = said.options("plant")
+    signals = [options["input"], options["output"]]
+    check_names("channel", signals, CHANNELS, f"{said.location('plant', '')}: [plant]")
+    known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
+    u, y = (known.get(name, Quantity(name, CHANNELS[name])) for name in signals)
+    order = options["pade_order"]
+    if order is None:
+        order = USUAL_PADE_ORDER if said.says("plant", "dead_time") else 0
+    if options["model"] is SecondOrder:
+        return SecondOrder(order, read_friction(said) if said.says("friction") else None, u, y)
+    plant: Plant = options["model"](order, u, y)
+    return plant
+
+
+LINEAR_KIND = DriveKind(
+    FirstOrder.kind,
+    {
+        "plant": {
+            "model": choice({"first_order": FirstOrder, "second_order": SecondOrder, "integrator": Integrator}),
+            "input": Key("text", (str,), VALVE_VOLTAGE.name),
+            "output": Key("text", (str,), SPEED.name),
+            "pade_order": Key("a whole number", (int,)),
+        },
+        "friction": FRICTION_KEYS,
+    },
+    _build_plant,
+    any_friction=False,
+)
 
 
 def delay_inputs(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) -> DiscreteSystem:

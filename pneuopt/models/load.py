@@ -6,9 +6,12 @@ from math import pi
 import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
+from pneuopt.models.declaration import flag
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 GRAVITY = 9.80665  # [m/s^2] standard
+LOAD_KEYS = {"spring": flag(False), "inclined": flag(False)}
+"""[load] of a drive's file: the arguments of `Load`."""
 
 
 @dataclass(frozen=True)

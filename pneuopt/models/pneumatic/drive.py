@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -52,6 +52,7 @@ class PneumaticDrive:
     cylinder : Cylinder
     """
 
+    kind: ClassVar[str] = "pneumatic"
     valve: ProportionalValve = field(default_factory=ProportionalValve)
     friction: FrictionModel = field(default_factory=Stribeck)
     load: Load = field(default_factory=Load)

@@ -1,0 +1,18 @@
+"""The registry of drives, one row a kind: what files and the command line can read, and what they ask of it."""
+
+from collections.abc import Mapping
+
+from pneuopt.models.declaration import DriveKind
+from pneuopt.models.drive import FORCE_KIND, MOTION_KIND
+from pneuopt.models.linear import LINEAR_KIND
+from pneuopt.models.pneumatic.drive_file import PNEUMATIC_KIND
+
+DRIVE_KINDS: Mapping[str, DriveKind] = {
+    kind.name: kind
+    for kind in (
+        PNEUMATIC_KIND,
+        FORCE_KIND,
+        MOTION_KIND,
+        LINEAR_KIND,
+    )
+}
