@@ -10,7 +10,7 @@ PY := $(BIN)/python
 .PHONY: demo test test-slow lint format clean
 
 demo: .venv/installed
-	$(PY) problems/rig_demo.py --out out
+	$(PY) problems/demo/rig_demo.py --out out
 
 test: .venv/installed lint
 	$(PY) -m pytest -n 2 --cov --cov-report=term

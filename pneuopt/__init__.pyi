@@ -19,14 +19,15 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
-from pneuopt.dynamics.simulate import contacts, simulate, simulate_stick_slip
-from pneuopt.dynamics.system import DiscreteSystem, System, define, discretise
-from pneuopt.evaluation.dither_verdict import DitherVerdict, dither_effect, judge_dither
+from pneuopt.dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
+from pneuopt.dynamics.stick_slip import EventKind
+from pneuopt.dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
+from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.instruments import Actuator, Sensor
 from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
-from pneuopt.evaluation.margins import margins
-from pneuopt.evaluation.metrics import step_metrics
+from pneuopt.evaluation.margins import Margins, frequency_response, margins
+from pneuopt.evaluation.metrics import BandCentre, step_metrics
 from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
@@ -46,8 +47,8 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.evaluation.rig import Rig, record
-from pneuopt.evaluation.scenarios import corners, draws, samples, tolerances
+from pneuopt.evaluation.rig import Recording, Rig, record
+from pneuopt.evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.files.tuning import read_tuning, write_tuned
 from pneuopt.identification.compare_logs import LogComparison, compare_logs
@@ -91,6 +92,7 @@ from pneuopt.plotting import (
 )
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.full_space import FullSpace
 from pneuopt.shooting.least_squares import LeastSquares
@@ -112,7 +114,9 @@ __all__ = [
     "Actuator",
     "AirUse",
     "Asymmetric",
+    "BandCentre",
     "ClosedLoop",
+    "Code",
     "Condensed",
     "Confirmed",
     "ControlRate",
@@ -124,7 +128,9 @@ __all__ = [
     "Dither",
     "DitherVerdict",
     "Encoder",
+    "EventKind",
     "Experiment",
+    "Factor",
     "Feedforward",
     "FirstOrder",
     "ForceDrive",
@@ -140,9 +146,11 @@ __all__ = [
     "Karnopp",
     "LeastSquares",
     "LimitCycle",
+    "Linearisation",
     "Load",
     "LogComparison",
     "LuGre",
+    "Margins",
     "MaxComplementarySensitivity",
     "MaxSensitivity",
     "ModelSelection",
@@ -163,6 +171,7 @@ __all__ = [
     "PropagatedValue",
     "ProportionalValve",
     "Quantity",
+    "Recording",
     "Rig",
     "Ripple",
     "RiseTime",
@@ -175,18 +184,22 @@ __all__ = [
     "SoftL1",
     "Spool",
     "StandardForm",
+    "Status",
     "SteadyStateError",
     "Step",
     "StepEnvelope",
+    "StickSlipResult",
     "Stribeck",
     "System",
     "Thermal",
     "Trajectory",
     "TuningResult",
     "TwoPhase",
+    "Usefulness",
     "Verdict",
     "Viscous",
     "Waveform",
+    "apply_scenario",
     "average_dither",
     "bumpless_transfer",
     "coarse_delay",
@@ -200,6 +213,7 @@ __all__ = [
     "draws",
     "evaluate",
     "find_limit_cycle",
+    "frequency_response",
     "friction_ladder",
     "grid",
     "identifiability",

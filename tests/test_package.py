@@ -56,9 +56,9 @@ def test_the_data_are_those_that_the_readme_lists() -> None:
 
 def test_the_readme_names_scripts_that_exist() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"problems/(\w+\.py)", text))
-    scripts = (p for p in (ROOT / "problems").glob("*.py") if "__main__" in p.read_text(encoding="utf-8"))
-    assert named == {p.name for p in scripts}
+    named = set(re.findall(r"problems/\w+/\w+\.py", text))
+    scripts = (p for p in (ROOT / "problems").rglob("*.py") if "__main__" in p.read_text(encoding="utf-8"))
+    assert named == {p.relative_to(ROOT).as_posix() for p in scripts}
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ No window is opened and no global state is touched: each function returns a `Fig
 """
 
 from pneuopt.plotting.bode import plot_bode
-from pneuopt.plotting.canvas import check_figure_path, save_figure
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, check_figure_path, legend_above, save_figure
 from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
 from pneuopt.plotting.fits import plot_fit, plot_prediction
 from pneuopt.plotting.friction_map import friction_force, has_friction_map, plot_friction
@@ -13,10 +13,16 @@ from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
 
 __all__ = [
+    "BLUE",
+    "GREY",
+    "ORANGE",
+    "RED",
     "Response",
+    "axes_grid",
     "check_figure_path",
     "friction_force",
     "has_friction_map",
+    "legend_above",
     "plot_bode",
     "plot_correlation",
     "plot_fit",

@@ -19,11 +19,11 @@ from pneuopt.evaluation.metrics import step_metrics
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, Stribeck
 from pneuopt.models.linear import FirstOrder, SecondOrder
-from pneuopt.models.paper2015 import paper_plant
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
+from problems.shared.paper2015 import paper_plant
 
 
 def exact(plant: System, p: ParameterSet, t: Array, u: Array, x: Array) -> Array:

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from b32 import FREE, LOGGED, VALVE, generate
 
 import pneuopt as po
 from pneuopt.models.catalog import b32
 from pneuopt.models.pneumatic.drive import PneumaticDrive
+from problems.shared.b32 import FREE, LOGGED, VALVE, generate
 
 WRONG = {"valve.conductance": 5e-8, "valve.leak": 0.0, "load.mass": 4.0, "supply.pressure": 6.5e5}
 WRONG |= {"valve.critical_ratio": 0.3, "valve.dead_zone": 0.0}

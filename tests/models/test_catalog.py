@@ -13,13 +13,13 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Linearisation, parameter_vector
 from pneuopt.models import catalog
 from pneuopt.models.friction import Viscous
-from pneuopt.models.paper2015 import OperatingPoint, second_order
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import CRITICAL_RATIO, IsentropicNozzle, Iso6358, Smoothing
 from pneuopt.models.pneumatic.valve import Spool
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from problems.shared.paper2015 import OperatingPoint, second_order
 
 K_S = 20.0  # [V s/m] transducer
 SPEED, AIR = 1, slice(2, 4)  # places in the state of a drive without spool lag

@@ -4,13 +4,13 @@ import math
 from pathlib import Path
 from types import SimpleNamespace
 
-import benchmark_tuning
 import numpy as np
 import pytest
-from benchmark_tuning import Clock, Run, Study
 from numpy.typing import NDArray
 
 from pneuopt.tuning.space import search_space
+from problems.speed import benchmark_tuning
+from problems.speed.benchmark_tuning import Clock, Run, Study
 
 
 def test_a_run_that_never_settles_is_the_worst() -> None:

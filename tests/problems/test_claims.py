@@ -2,8 +2,9 @@ import json
 from pathlib import Path
 
 import pytest
-from claims import Claim, arguments, finish, frame, table
 from matplotlib.figure import Figure
+
+from problems.shared.claims import Claim, arguments, finish, frame, table
 
 GOOD = Claim("design.settling", 0.203, "s", 0.503, "<= 0.21")
 SHOWN = Claim("design.Kp", 0.3972, "V/V")

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-import crawl
 import pytest
-from r25 import lagging
 
 import pneuopt as po
+from problems.friction import crawl
+from problems.shared.r25 import lagging
 
 
 def test_the_screen_holds() -> None:

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-import averaged_dither
-import dither_map
 import numpy as np
 import pytest
-import stiction_windup
+
+from problems.dither import averaged_dither, dither_map
+from problems.friction import stiction_windup
 
 
 def test_friction_makes_the_papers_gains_overshoot_by_40_percent() -> None:

@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import b32
-import interval_coverage
-import mismatch
 import numpy as np
 import pandas as pd
 import pytest
 
 from pneuopt.models import catalog
+from problems.identify import interval_coverage, mismatch
+from problems.shared import b32
 
 
 def failed(rows: pd.DataFrame) -> list[str]:

@@ -3,14 +3,13 @@
 import re
 
 import numpy as np
-import paper_dither
-import paper_physical
 import pytest
-from claims import Claim
-from r25 import averaged, lagging, linearised
 
 from pneuopt.models.catalog import r25
 from pneuopt.models.friction import Viscous
+from problems.paper import paper_dither, paper_physical
+from problems.shared.claims import Claim
+from problems.shared.r25 import averaged, lagging, linearised
 
 CHAIN = ("_orifices", "_coefficients", "_balances", "_linear_chambers", "_one_pressure", "_equation_15", "_equation_16")
 

@@ -2,9 +2,11 @@
 
 import matplotlib as mpl
 import numpy as np
-import paper_tables
 import pytest
-from claims import Claim
+
+from problems.paper import paper_tables
+from problems.shared.claims import Claim
+from problems.shared.paper_loop import PLAIN
 
 
 @pytest.fixture(scope="module")
@@ -60,5 +62,5 @@ def test_the_whole_script_and_its_figures() -> None:
 
 
 def test_scipy_agrees_on_the_plain_step() -> None:
-    deviation = paper_tables._run(paper_tables.PLAIN)["speed"] - paper_tables._by_scipy(paper_tables.PLAIN)
+    deviation = paper_tables._run(PLAIN)["speed"] - paper_tables._by_scipy(PLAIN)
     assert np.abs(deviation).max() < 1e-7

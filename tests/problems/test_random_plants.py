@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import b32
 import numpy as np
 import pandas as pd
 import pytest
-import random_plants
 
 from pneuopt.models import catalog
+from problems.identify import random_plants
+from problems.shared import b32
 
 
 @pytest.mark.parametrize("kind", random_plants.KINDS)

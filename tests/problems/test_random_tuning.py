@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import random_problems
-import random_tuning
 
 import pneuopt as po
+from problems.shared import random_problems
+from problems.tune import random_tuning
 
 ROW = {"kind": "s32", "redrawn": 0, "known": 0.2, "sample_time": 0.0, "claimed": 0.1, "certified": 0.1, "cpu": 1.0}
 

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import pytest
-import robust_tuning
+
+from problems.tune import robust_tuning
 
 
 @pytest.mark.slow

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import pytest
-import sampled_tuning
+
+from problems.tune import sampled_tuning
 
 
 @pytest.mark.slow

@@ -2,21 +2,14 @@
 
 from pathlib import Path
 
-import b32
-import b32_partial
-import emps
 import pandas as pd
-import pareto
 import pytest
-import real_logs
-import rig_demo
-import seal_friction
-import simulation_speed
-import step_response
-import stick_slip
-import supply_and_load
-import t32
-import tune_drive
+
+from problems.demo import rig_demo
+from problems.friction import stick_slip
+from problems.identify import b32, b32_partial, emps, real_logs, seal_friction, step_response
+from problems.speed import simulation_speed, t32
+from problems.tune import pareto, supply_and_load, tune_drive
 
 DATASETS = Path(__file__).parents[3] / "shared" / "datasets"
 measured = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no measured logs in {DATASETS}")

@@ -22,7 +22,6 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder
-from pneuopt.models.paper2015 import paper_plant
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
@@ -31,6 +30,7 @@ from pneuopt.tuning.simulator import Responses, Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
+from problems.shared.paper2015 import paper_plant
 
 STEP = Step(1.0)
 LIMITS: list[Requirement] = [Overshoot(2e-4), PeakControl(1.225), MaxSensitivity(1.2)]

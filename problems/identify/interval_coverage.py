@@ -1,0 +1,147 @@
+"""Whether a 95 % confidence interval holds the truth 95 times in 100: b32.py's log under many draws of its noise.
+
+    python problems/identify/interval_coverage.py [--count N] [--first SEED] [--case right|wrong|estimated]
+                                         [--json FILE] [--out DIR]
+
+The exact log is generated once, its noise drawn anew; each draw is identified without a guess, six parameters free.
+`right`: the log states its noise levels. `wrong`: it states three times the position's, a fifth of pressure a's and
+three times pressure b's; identify scales its covariance by the residuals' level, one factor for all channels, so such
+a mixture is what it cannot mend. `estimated`: the same with `estimate_noise=True`. Of 400 draws, each interval is to
+cover 92 to 98 % (2.75 binomial deviations); of fewer draws as many deviations around 95 %. `scaled_error` is the
+standard deviation of an estimate's error over its own standard error, the median of the six. --out keeps a row a draw
+in coverage_CASE.csv. The whole study is --count 400.
+"""
+
+import functools
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
+
+import numpy as np
+
+import pneuopt as po
+from pneuopt.models.catalog import b32
+from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
+from problems.shared.b32 import FREE, LOGGED, NOISE, VALVE, completed
+from problems.shared.b32 import exact as exact_log
+from problems.shared.claims import Claim, arguments, finish, frame
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+COUNT, FIRST, WHOLE = 24, 1, 400
+CASES = {"right": BLUE, "wrong": ORANGE, "estimated": GREY}
+STATED = {"position": 3.0, "pressure_a": 0.2, "pressure_b": 3.0}  # over the truth, where they are wrong
+WANTED = (*FREE, *VALVE)
+NOMINAL, MARGIN = 95.0, 3.0  # [%], the margin at the whole number of draws
+SCALED = 0.1  # of the scaled error, likewise
+
+
+def run(
+    count: int = COUNT, first: int = FIRST, cases: tuple[str, ...] = tuple(CASES), out: Path | None = None
+) -> dict[str, "pd.DataFrame"]:
+    """A table a case: a row a draw; kept in `out` as soon as a case is done."""
+    draws = {}
+    for case in cases:
+        draws[case] = study(case, range(first, first + count))
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            draws[case].to_csv(out / f"coverage_{case}.csv", index=False)
+    return draws
+
+
+def study(case: str, seeds: range) -> "pd.DataFrame":
+    """A row a draw: for each parameter its error in standard errors, and whether the interval holds the truth."""
+    truth = b32()[1] | po.ParameterSet({"seed": po.Parameter(-1.0, "1")})
+    draws = {f"{case} {seed}": {"seed": float(seed)} for seed in seeds}
+    fn = functools.partial(identified, case)
+    rows = po.sweep(fn, truth, draws, progress=lambda line: print(f"{case}: {line}", end="\r", file=sys.stderr))
+    return completed(rows)
+
+
+def identified(case: str, truth: po.ParameterSet) -> dict[str, Any]:
+    """One draw's row."""
+    drive = b32()[0]
+    blind = truth.select(drive.parameters).with_values({n: drive.parameters.value(n) for n in WANTED}).freed(*WANTED)
+    log = drawn(case, round(truth.value("seed")))
+    fit = po.identify(drive.system(), [log], blind, estimate_noise=case == "estimated", throw=False)
+    row: dict[str, Any] = {"converged": float(fit.status.converged), "misfit": fit.stats["chi_square_ratio"]}
+    for name, found in fit.estimates.iterrows():
+        true = truth.value(str(name))
+        row[f"covered {name}"] = float(found["ci_low"] <= true <= found["ci_high"])
+        row[f"scaled {name}"] = (found["value"] - true) / found["stderr"]
+        row[f"found {name}"] = found["value"]
+    return row | {"correlation_time": fit.stats["correlation_time"], "status": str(fit.status)}
+
+
+def drawn(case: str, seed: int) -> po.Experiment:
+    """The log with a draw of its noise, and the noise levels that it states."""
+    rng = np.random.default_rng((seed, 2))
+    noise = {n: NOISE[n] for n in LOGGED if n in NOISE}
+    exact = _exact()
+    noisy = {n: exact[n] + sigma * rng.standard_normal(len(exact)) for n, sigma in noise.items()}
+    stated = noise if case == "right" else {n: sigma * STATED[n] for n, sigma in noise.items()}
+    return po.Experiment(exact.with_columns(noisy), stated, name=f"b32 {seed}")
+
+
+def main(draws: dict[str, "pd.DataFrame"]) -> "pd.DataFrame":
+    return frame([claim for case, rows in draws.items() for claim in _claims(case, rows)])
+
+
+def _claims(case: str, rows: "pd.DataFrame") -> list[Claim]:
+    done = rows[rows["converged"] == 1]
+    widened = math.sqrt(WHOLE / max(1, len(done)))
+    held = case != "wrong"
+    covering = f"{NOMINAL:g} +- {MARGIN * widened:.3g}" if held else ""
+    scaled = float(np.median([done[f"scaled {n}"].std() for n in WANTED]))
+    return [
+        Claim(f"{case}.draws", len(rows)),
+        Claim(f"{case}.converged", 100 * len(done) / len(rows), "%", None, ">= 99" if held else ""),
+        *[Claim(f"{case}.{n}", coverage(done, n), "%", NOMINAL, covering) for n in WANTED],
+        Claim(f"{case}.scaled_error", scaled, "1", 1.0, f"1 +- {SCALED * widened:.3g}" if held else ""),
+        Claim(f"{case}.misfit", float(rows["misfit"].median()), "1", 1.0),
+        Claim(f"{case}.seconds", float(rows["seconds"].median()), "s"),
+    ]
+
+
+def coverage(rows: "pd.DataFrame", name: str) -> float:
+    """How many of the draws' intervals hold a parameter's truth [%]; a missing interval holds nothing."""
+    return 100 * float(rows[f"covered {name}"].mean())
+
+
+def figure(draws: dict[str, "pd.DataFrame"]) -> "Figure":
+    """Coverage by parameter, a mark a case."""
+    picture, ((ax,),) = axes_grid(1, 1, (3.0,), width=8.0)
+    places = np.arange(len(WANTED))
+    margin = MARGIN * math.sqrt(WHOLE / max(map(len, draws.values())))
+    ax.axhspan(NOMINAL - margin, min(100.0, NOMINAL + margin), color="0.92")
+    ax.axhline(NOMINAL, color="k", lw=0.8, ls="--")
+    for k, (case, rows) in enumerate(draws.items()):
+        done = rows[rows["converged"] == 1]
+        found = np.array([coverage(done, n) for n in WANTED])
+        spread = np.sqrt(found * (100 - found) / max(1, len(done)))
+        label = f"{case} noise levels" if case != "estimated" else "estimated from the residuals"
+        ax.errorbar(places + 0.15 * (k - 1), found, spread, fmt="o", color=CASES[case], capsize=3, label=label)
+    ax.set_xticks(places, [n.replace(".", "\n").replace("_", " ") for n in WANTED])
+    ax.set_ylabel("95 % intervals that\nhold the truth [%]")
+    legend_above(picture, ax)
+    return picture
+
+
+@functools.cache
+def _exact() -> po.Trajectory:
+    return exact_log(b32()[1]).select(LOGGED)
+
+
+if __name__ == "__main__":
+    parser = arguments(__doc__)
+    parser.add_argument("--count", type=int, default=COUNT, help="draws of each case")
+    parser.add_argument("--first", type=int, default=FIRST, metavar="SEED", help="seed of the first draw")
+    parser.add_argument("--case", choices=tuple(CASES), action="append", help="all by default")
+    options = parser.parse_args()
+    draws = run(options.count, options.first, tuple(options.case or CASES), options.out)
+    sys.exit(finish(main(draws), options, lambda: {"coverage": figure(draws)}))

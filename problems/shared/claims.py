@@ -1,0 +1,189 @@
+"""What the scripts here share: a claim a row, the table on screen, --json and --out, and the exit status.
+
+A claim is a figure that anyone can compute again: name, value, unit, the reference beside it (the published figure, if
+any), the bound it is held to (if any), and whether it holds.
+"""
+
+import argparse
+import json
+import math
+import operator
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    import pneuopt as po
+
+
+COLUMNS = ("name", "value", "unit", "reference", "bound", "holds")
+KNOBS = {n: f"pid.{n}" for n in ("Kp", "Ki", "Kd", "Tf")}
+KNOBS |= {f"dither_{n}": f"dither.{n}" for n in ("amplitude", "offset")}
+METRICS = {
+    "settling_time": ("SettlingTime", "s"),
+    "overshoot": ("Overshoot", "%"),
+    "steady_state_error": ("SteadyStateError", "%"),
+    "peak_control": ("PeakControl", ""),
+    "max_sensitivity": ("MaxSensitivity", "1"),
+    "ripple": ("Ripple", ""),
+}
+COMPARISONS: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One row.
+
+    Parameters
+    ----------
+    name : str
+        "table1.1.overshoot": the table or design, the case, the figure.
+    value : float
+    unit : str
+        "1" if it has none.
+    reference : float or None
+        The published or rival figure.
+    bound : str
+        "<= 0.21", ">= 16" or "6.3 +- 0.1"; empty: nothing is claimed, the figure is only shown.
+    """
+
+    name: str
+    value: float
+    unit: str = "1"
+    reference: float | None = None
+    bound: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value keeps its bound; NaN never does."""
+        return within(self.value, self.bound)
+
+
+def within(value: float, bound: str) -> bool:
+    """Whether a value keeps a bound.
+
+    Examples
+    --------
+    >>> within(0.2, "<= 0.21"), within(0.5003, "0.500 +- 0.005"), within(float("nan"), ">= 1"), within(7.0, "")
+    (True, True, False, True)
+    """
+    if not bound:
+        return True
+    if match := re.fullmatch(r"(<=|>=) *(\S+)", bound):
+        return COMPARISONS[match[1]](value, float(match[2]))
+    centre, width = (float(part) for part in bound.split("+-"))
+    return abs(value - centre) <= width
+
+
+def frame(claims: Iterable[Claim]) -> "pd.DataFrame":
+    """The claims as a DataFrame, a row each."""
+    import pandas as pd
+
+    rows = [asdict(claim) | {"holds": claim.holds} for claim in claims]
+    return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float, "reference": float})
+
+
+def design(
+    name: str, parameters: "po.ParameterSet", certified: "pd.DataFrame", bounds: Mapping[str, str] | None = None
+) -> list[Claim]:
+    """A tuned loop's rows: its gains and dither, and its certified metrics, the worst over the references.
+
+    Parameters
+    ----------
+    name : str
+    parameters : ParameterSet
+    certified : DataFrame
+        Of `tune` or `evaluate`: a row a metric, a column a reference.
+    bounds : mapping of str to str, optional
+        By row, as in "settling_time".
+    """
+    bounds, rows = bounds or {}, []
+    for row, parameter in KNOBS.items():
+        if parameter in parameters:
+            rows.append(Claim(f"{name}.{row}", parameters.value(parameter), parameters[parameter].unit))
+    for row, (metric, unit) in METRICS.items():
+        if metric in certified.index:
+            worst = float(np.max(certified.loc[metric].to_numpy(dtype=float)))
+            rows.append(Claim(f"{name}.{row}", worst, unit, None, bounds.get(row, "")))
+    return rows
+
+
+def table(rows: "pd.DataFrame") -> str:
+    """The claims as text, 80 columns wide.
+
+    A row that fails is marked; one without a bound is neither held nor failed.
+    """
+    lines = [f"{'':<31}{'ours':>10}  {'unit':<6}{'reference':>10}  {'bound':<14}"]
+    for row in rows.to_dict("records"):
+        mark = "" if not row["bound"] else "ok" if row["holds"] else "FAIL"
+        figures = f"{_number(row['value']):>10}  {row['unit']:<6}{_number(row['reference']):>10}"
+        lines.append(f"{row['name']:<31}{figures}  {row['bound']:<14} {mark}")
+    bounded = rows[rows["bound"] != ""]
+    lines.append(
+        f"{int(bounded['holds'].sum())} of {len(bounded)} claims hold; {len(rows) - len(bounded)} figures shown only"
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def arguments(description: str | None) -> argparse.ArgumentParser:
+    """A parser with the options that every script has; a script adds its own."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the claims as records")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write the figures as PNG")
+    return parser
+
+
+def finish(
+    rows: "pd.DataFrame", options: argparse.Namespace, figures: Callable[[], Mapping[str, "Figure"]] | None = None
+) -> int:
+    """Print the claims, write what the options ask for.
+
+    Parameters
+    ----------
+    rows : DataFrame
+    options : argparse.Namespace
+        Of `arguments`.
+    figures : callable, optional
+        Makes the figures, name to Figure; called only with --out.
+
+    Returns
+    -------
+    int
+        The exit status: 0 if every claim holds, else 1.
+    """
+    print(table(rows))
+    if options.json is not None:
+        _write(options.json, json.dumps(records(rows), indent=1) + "\n")
+    if options.out is not None and figures is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        for name, figure in figures().items():
+            figure.savefig(options.out / f"{name}.png", dpi=150)
+            print(f"{options.out / name}.png")
+    return 0 if bool(rows["holds"].all()) else 1
+
+
+def records(rows: "pd.DataFrame") -> list[dict[str, object]]:
+    """The claims as JSON records; what is not a number is null."""
+    return [
+        {str(k): None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+        for row in rows.to_dict("records")
+    ]
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.4g}" if abs(value) < 1e5 else f"{value:.6g}"
+
+
+def _write(path: Path, text: str) -> None:
+    """Whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)

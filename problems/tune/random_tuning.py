@@ -1,0 +1,159 @@
+"""Random tuning problems, each known to be feasible: how many `tune` solves, and whether its claims can be believed.
+
+    python problems/tune/random_tuning.py [--count N] [--first SEED] [--jobs J] [--resume] [--json FILE] [--out DIR]
+
+The problems are those of random_problems.py: linear plants and drives with friction, sampled and continuous, with
+dither and without, one to three steps; the limits are what a design found by brute force keeps, loosened by a tenth.
+`tune` has its default method and start, and is told nothing of that design. Solved is what is handed out as converged:
+its limits are kept by the independent simulation at the gains as printed. "repaired" are those of them that took a
+wider margin than the first; "rejected" is what the certificate refused, "relaxed" what the search called infeasible,
+"refused" what ended in an error. "deviation" is the largest |claimed - certified| settling time of the designs handed
+out. --out keeps a row a problem in random_tuning.csv as they come; --resume goes on from there. The whole study is
+--count 100.
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
+
+import numpy as np
+
+import pneuopt as po
+from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
+from problems.shared.claims import Claim, arguments, finish, frame
+from problems.shared.random_problems import problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+COUNT, FIRST = 9, 0
+WHOLE = 100  # problems of the study
+OUTCOMES = {po.Code.CONVERGED: "solved", po.Code.NOT_CERTIFIED: "rejected", po.Code.INFEASIBLE: "relaxed"}
+FILE = "random_tuning.csv"
+
+
+def main(rows: "pd.DataFrame") -> "pd.DataFrame":
+    solved = rows[rows["outcome"] == "solved"]
+    share = 100 * len(solved) / len(rows)
+    ended = rows["outcome"].value_counts()
+    gained = solved["certified"] / solved["known"]
+    claims = [
+        Claim("problems", len(rows)),
+        Claim("problems.redrawn", int(rows["redrawn"].sum())),
+        Claim("solved", share, "%", None, ">= 90"),
+        Claim("solved.repaired", int(solved["repaired"].sum())),
+        *(Claim(n, int(ended.get(n, 0))) for n in ("rejected", "relaxed", "refused", "other")),
+        Claim("deviation.worst", float(solved["deviation"].max()), "s", None, "<= 1e-3"),
+        Claim("deviation.median", float(solved["deviation"].median()), "s"),
+        Claim("settling.over_brute_force", float(gained.median())),
+        Claim("cpu.median", float(rows["cpu"].median()), "s"),
+        Claim("cpu.worst", float(rows["cpu"].max()), "s"),
+    ]
+    kinds = rows.groupby("kind")["outcome"]
+    claims += [Claim(f"{kind}.solved", 100 * float((o == "solved").mean()), "%") for kind, o in kinds]
+    return frame(claims)
+
+
+def run(seeds: list[int], jobs: int, kept: Path | None) -> "pd.DataFrame":
+    """A row a problem; those that `kept` already has are not tuned again."""
+    import pandas as pd
+
+    read = pd.read_csv(kept).to_dict("records") if kept is not None and kept.exists() else []
+    rows = [{str(k): v for k, v in row.items()} for row in read]
+    done = {int(r["seed"]) for r in rows}
+    for row in _outcomes([s for s in seeds if s not in done], jobs):
+        rows.append(row)
+        print(f"{row['seed']} {row['kind']}: {row['outcome']} {row['certified']:.4g} s, {row['status']}", flush=True)
+        if kept is not None:
+            pd.DataFrame(rows).to_csv(kept, index=False)
+    table = pd.DataFrame(rows)
+    return table[table["seed"].isin(seeds)].sort_values("seed")
+
+
+def _outcomes(seeds: list[int], jobs: int) -> Iterator[dict[str, Any]]:
+    if jobs == 1:
+        yield from map(tuned, seeds)
+        return
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        yield from (future.result() for future in as_completed([pool.submit(tuned, seed) for seed in seeds]))
+
+
+def tuned(seed: int) -> dict[str, Any]:
+    """The row of one problem."""
+    given = problem(seed)
+    free, sample = given.parameters.free_names, given.loop.pid.sample_time
+    row: dict[str, Any] = {"seed": seed, "kind": given.kind, "redrawn": given.redrawn, "known": _known(given.known)}
+    row |= {"sample_time": sample or 0.0, "dither": given.loop.dither is not None, "free": len(free)}
+    row |= {"steps": len(given.steps), "limits": " ".join(type(q).__name__ for q in given.subject_to)}
+    begun = time.process_time()
+    try:
+        found = po.tune(
+            given.loop,
+            given.steps,
+            given.parameters,
+            minimise=given.minimise,
+            subject_to=given.subject_to,
+            throw=False,
+        )
+    except po.PneuoptError as error:
+        row |= {"outcome": "refused", "status": str(error), "repaired": False}
+        return row | {"claimed": np.nan, "certified": np.nan, "deviation": np.nan, "cpu": time.process_time() - begun}
+    outcome = OUTCOMES.get(found.status.code, "other")
+    row |= {"outcome": outcome, "status": str(found.status), "cpu": time.process_time() - begun}
+    row["repaired"] = outcome == "solved" and found.stats.get("margin", np.inf) > 1.01 * _first_margin(found)
+    row |= {n: _worst(getattr(found, n)) for n in ("claimed", "certified")}
+    return row | {"deviation": found.stats["deviation.SettlingTime"]}
+
+
+def _known(figures: dict[str, float]) -> float:
+    return figures["SettlingTime"]
+
+
+def _first_margin(found: po.TuningResult) -> float:
+    """What the first attempt tightens the limits by."""
+    return (po.TwoPhase if "starts" in found.stats else po.Screening)().margin
+
+
+def _worst(metrics: "pd.DataFrame") -> float:
+    return float(np.max(metrics.loc["SettlingTime"].to_numpy(dtype=float)))
+
+
+def figure(rows: "pd.DataFrame") -> "Figure":
+    """Each solved problem: certified settling time over brute force's, and how far the claim was off."""
+    picture, ((left, right),) = axes_grid(1, 2, (3.4,), width=9.0)
+    solved = rows[rows["outcome"] == "solved"]
+    ends = np.array([0.8 * solved["known"].min(), 1.25 * solved["known"].max()])
+    left.loglog(ends, ends, color=GREY, lw=0.8, ls="--", label="as good as brute force")
+    for is_sampled, colour in ((False, BLUE), (True, ORANGE)):
+        part = solved[(solved["sample_time"] > 0) == is_sampled]
+        name = "sampled" if is_sampled else "continuous"
+        left.loglog(part["known"], part["certified"], "o", ms=4, color=colour, label=name)
+        right.loglog(part["certified"], np.maximum(part["deviation"], 1e-8), "o", ms=4, color=colour)
+    right.axhline(1e-3, color=GREY, lw=0.8, ls="--")
+    left.set(xlabel="brute force [s]", ylabel="tuned, certified [s]", title="settling time")
+    right.set(xlabel="settling time, certified [s]", ylabel="|claimed - certified| [s]", title="the claim")
+    legend_above(picture, left)
+    return picture
+
+
+if __name__ == "__main__":
+    parser = arguments(__doc__)
+    parser.add_argument("--count", type=int, default=COUNT, help="problems")
+    parser.add_argument("--first", type=int, default=FIRST, metavar="SEED", help="seed of the first problem")
+    parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes")
+    parser.add_argument("--resume", action="store_true", help="go on with the rows that --out holds")
+    options = parser.parse_args()
+    kept = None if options.out is None else options.out / FILE
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        if not options.resume:
+            kept.unlink(missing_ok=True)
+    rows = run(list(range(options.first, options.first + options.count)), options.jobs, kept)
+    sys.exit(finish(main(rows), options, lambda: {"random_tuning": figure(rows)}))

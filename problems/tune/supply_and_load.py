@@ -1,0 +1,98 @@
+"""What a nominal tuning is worth elsewhere: its certified settling time and overshoot over supply pressure and load.
+
+    python problems/tune/supply_and_load.py [--json FILE] [--out DIR]
+
+A sampled speed PID with dither is tuned on a 32 mm cylinder (catalogue set, LuGre friction) at 6 bar(g) and 5 kg for a
+slow and a fast step, then simulated, gains as printed, over 4 to 8 bar(g) and 2 to 10 kg: `grid`, `sweep`, `plot_map`.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
+
+import pneuopt as po
+from pneuopt.models.catalog import s32
+from problems.shared.claims import Claim, arguments, design, finish, frame
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+STEPS = [po.Step(0.1, horizon=0.8), po.Step(0.25, horizon=0.8)]  # [m/s] from 30 mm of 300 mm
+HAND = {"pid.Kp": 10.0, "pid.Ki": 40.0, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
+RANGES = {
+    "pid.Kp": (0.2, 60.0),
+    "pid.Ki": (0.5, 400.0),
+    "pid.Kd": (0.0, 0.5),
+    "pid.Tf": (0.002, 0.05),
+    "dither.amplitude": (0.0, 2.0),
+    "dither.offset": (-1.5, 1.5),
+}
+LIMITS = (po.Overshoot(0.05), po.MaxSensitivity(1.6))
+BOUNDS = {"settling_time": "<= 0.08", "overshoot": "<= 5", "max_sensitivity": "<= 1.6"}
+ATMOSPHERE = 1.01325e5  # [Pa(a)]
+PRESSURES = [1e5 * gauge + ATMOSPHERE for gauge in (4.0, 5.0, 6.0, 7.0, 8.0)]  # [Pa(a)]
+MASSES = [2.0, 3.5, 5.0, 7.5, 10.0]  # [kg]
+METRICS = {"SettlingTime": "s", "Overshoot": "%"}
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What was tuned, and its study: a row a case, each metric the worst of the steps."""
+
+    best: po.TuningResult
+    study: "pd.DataFrame"
+    seconds: float
+
+
+def run() -> Job:
+    drive, rig = s32()
+    loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3), po.Dither(frequency=100.0), measured="speed")
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
+    nominal = {"supply.pressure": 6e5 + ATMOSPHERE, "load.mass": 5.0, "cylinder.start": 0.1}
+    given = (rig.fixed("*") | own).with_values(nominal | HAND).with_bounds(RANGES).freed(*RANGES)
+    best = po.tune(loop, STEPS, given, minimise=po.SettlingTime(band=0.02), subject_to=LIMITS)
+    began = time.perf_counter()
+    cases = po.grid(best.parameters, {"supply.pressure": PRESSURES, "load.mass": MASSES})
+    study = po.sweep(partial(po.evaluate, loop, STEPS), best.parameters, cases)
+    seconds = time.perf_counter() - began
+    for metric in METRICS:
+        study[metric] = study[[c for c in study if str(c).startswith(f"{metric}[")]].max(axis=1, skipna=False)
+    return Job(best, study, seconds)
+
+
+def main(job: Job) -> "pd.DataFrame":
+    study, good = job.study, job.study[job.study["error"] == ""]
+    claims = design("tuned", job.best.parameters, job.best.certified, BOUNDS)
+    claims += [
+        Claim("map.cases", len(study)),
+        Claim("map.failed", len(study) - len(good), "1", None, "<= 0"),
+        Claim("map.never_settle", int(good["SettlingTime"].isna().sum())),
+        Claim("map.overshoot_within_5", int((good["Overshoot"] <= 5).sum())),
+        Claim("map.seconds", job.seconds, "s"),
+    ]
+    for metric, unit in METRICS.items():
+        worst = good.sort_values(metric, na_position="first").iloc[-1]
+        name = "settling_time" if metric == "SettlingTime" else "overshoot"
+        claims.append(Claim(f"map.{name}.best", good[metric].min(), unit))
+        claims.append(Claim(f"map.{name}.median", good[metric].median(), unit))
+        claims.append(Claim(f"map.{name}.worst", worst[metric], unit))
+        claims.append(Claim(f"map.{name}.worst.pressure", worst["supply.pressure"] / 1e5, "bar"))
+        claims.append(Claim(f"map.{name}.worst.mass", worst["load.mass"], "kg"))
+    return frame(claims)
+
+
+def figure(job: Job) -> "Figure":
+    shown = job.study.assign(**{"supply.pressure": (job.study["supply.pressure"] - ATMOSPHERE) / 1e5})
+    return po.plot_map(shown, {"supply.pressure": "bar(g)", "load.mass": "kg"}, METRICS)
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__).parse_args()
+    job = run()
+    sys.exit(finish(main(job), options, lambda: {"supply_and_load": figure(job)}))

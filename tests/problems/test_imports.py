@@ -1,0 +1,45 @@
+"""Scripts use what a user has: `pneuopt`'s public names. What measures the insides is listed here, with the reason."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PUBLIC = {"pneuopt", "pneuopt.plotting", "pneuopt.models.catalog"}
+SEARCH = "runs a search's own simulator and merit, to compare what finds the better design with them, and how fast"
+INSIDE = {
+    "problems/shared/b32.py": "makes its logs by machine code, and times one simulation of it as the unit of cost",
+    "problems/shared/random_problems.py": "finds feasible designs by brute force on the search's batched simulator",
+    "problems/speed/benchmark_identification.py": "times the full-space solver from the start that the log gives",
+    "problems/speed/benchmark_tuning.py": SEARCH,
+    "problems/speed/linear_tuning.py": SEARCH,
+    "problems/speed/simulation_speed.py": "times the compiled simulation, lane by lane",
+    "problems/speed/t32.py": SEARCH,
+    "problems/tune/pareto.py": "times the solver along a front, and sets brute force on its designs",
+    "problems/dither/dither_map.py": "simulates the cells of a map in one batch",
+}
+SCRIPTS = sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "problems").rglob("*.py"))
+
+
+def private_imports(script: str) -> set[str]:
+    tree = ast.parse((ROOT / script).read_text(encoding="utf-8"))
+    modules = {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    modules |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    return {m for m in modules if m.split(".")[0] == "pneuopt"} - PUBLIC
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_script_imports_public_names_only_or_is_listed_with_its_reason(script: str) -> None:
+    assert bool(private_imports(script)) == (script in INSIDE), private_imports(script)
+
+
+def test_what_is_listed_exists() -> None:
+    assert set(INSIDE) <= set(SCRIPTS)
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_script_that_runs_finds_the_checkout_and_is_no_library(script: str) -> None:
+    text = (ROOT / script).read_text(encoding="utf-8")
+    assert ("sys.path.append(str(Path(__file__).parents[2]))" in text) == ("__main__" in text)
+    assert "__main__" not in text or not script.startswith("problems/shared/")
