@@ -1,13 +1,14 @@
 """`System` (an ODE with named signals) and `DiscreteSystem` (its sampled step), which every solver reads."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
+from pneuopt.dynamics.excitation import Excitation
 from pneuopt.dynamics.guards import HardwareCheckHook, ValidityLimit
 from pneuopt.dynamics.hooks import Log, LogWarningHook, RestHook, Start, StartHook
 from pneuopt.dynamics.runge_kutta import rk4
@@ -60,6 +61,8 @@ class System:
     meter : casadi.Function, optional
         ``(t, x, u, p) -> (air, spool)``: mass flow from the supply [kg/s], the spool's position [half travels]; no
         outputs, for nobody logs them.
+    excitation : Excitation
+        Which motion a log must show for its parameters to be identifiable.
     """
 
     states: tuple[Quantity, ...]
@@ -73,6 +76,7 @@ class System:
     validity_limits: tuple[ValidityLimit, ...] = ()
     log_warning_hook: LogWarningHook | None = None
     meter: ca.Function | None = None
+    excitation: Excitation = field(default_factory=Excitation)
 
     def __repr__(self) -> str:
         return describe(self)

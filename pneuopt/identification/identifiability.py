@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.excitation import Excitation, Lack
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.dynamics.system import System
@@ -56,12 +57,15 @@ class Verdict:
         By parameter: why the logs do not tell it, or only roughly, and what run would.
     unchanged : tuple of str
         Parameters that a fit left at their given values.
+    excitation : Excitation
+        The model's: which runs would show or separate its parameters.
     """
 
     table: "pd.DataFrame"
     indistinguishable: tuple[tuple[str, ...], ...]
     reasons: Mapping[str, str]
     unchanged: tuple[str, ...] = ()
+    excitation: Excitation = field(default_factory=Excitation)
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -78,7 +82,7 @@ class Verdict:
             f"the logs {'do not tell' if untold else 'tell only roughly'} {join_names(names)}: {reason}"
             for (untold, reason), names in by_reason.items()
         ]
-        groups = [_describe_group(group, self.table["inflation"]) for group in self.indistinguishable]
+        groups = [_describe_group(group, self.table["inflation"], self.excitation) for group in self.indistinguishable]
         return (*single, *groups, *([self._describe_left_alone()] if self.unchanged else []))
 
     def _describe_left_alone(self) -> str:
@@ -101,7 +105,7 @@ class Verdict:
             identifiable[name] = bool(identifiable[name]) and not is_blind
             reasons.pop(name, None)
             if not found.high - found.low < MAX_RELATIVE_INTERVAL * abs(found.estimate):
-                reasons[name] = f"{found.sentence}; {remedy([name])}"
+                reasons[name] = f"{found.sentence}; {remedy(self.excitation, [name])}"
         return replace(self, table=self.table.assign(told=identifiable), reasons=reasons)
 
     def with_unidentifiable(self, names: Sequence[str], seen: "Verdict", kept: Sequence[str]) -> "Verdict":
@@ -112,11 +116,10 @@ class Verdict:
         together = tuple(group for group in seen.indistinguishable if {*group} & {*names})
         grouped = {n for group in together for n in group}
         reasons = {n: reason for n, reason in self.reasons.items() if n not in names}
-        vague = {n: f"{_VAGUER_THAN_PRIOR}; {remedy([n])}" for n in names if n not in grouped}
+        vague = {n: f"{_VAGUER_THAN_PRIOR}; {remedy(self.excitation, [n])}" for n in names if n not in grouped}
         reasons |= {**vague, **{n: seen.reasons[n] for n in names if n in seen.reasons}}
-        return Verdict(
-            table, (*self.indistinguishable, *together), reasons, tuple(str(n) for n in table.index if n in kept)
-        )
+        unchanged = tuple(str(n) for n in table.index if n in kept)
+        return Verdict(table, (*self.indistinguishable, *together), reasons, unchanged, self.excitation)
 
     def __str__(self) -> str:
         return "\n".join(self.sentences) or "the logs tell every free parameter"
@@ -208,7 +211,7 @@ def _make_verdict(
     names, (spread, alone, weak) = list(free), _standard_deviations(root)
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    rows, reasons = {}, {}
+    rows, reasons, excitation = {}, {}, problem.system.plant.excitation
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]
@@ -216,20 +219,21 @@ def _make_verdict(
             continue
         unit, size = p.value if p.log else 1.0, 1.0 if p.log else _comparison_size(name, p, problem)
         relative = spread[i] / size if size > 0 else math.nan
-        lack = None if trusted else missing_excitation(name, names, seen)
+        lack = None if trusted else missing_excitation(excitation, name, names, seen)
         is_blind = (
             lack is not None
             or math.isinf(spread[i])
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
         if is_blind or relative > MAX_RELATIVE_DEVIATION:
-            reasons[name] = _unidentifiable_reason(name, alone[i], relative, lack)
+            reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(excitation, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
         rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_blind]
     columns = ["value", "stderr", "relative", "alone", "inflation", "told"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
     groups = (tuple(names[i] for i in np.flatnonzero(row)) for row in weak)
-    return Verdict(table, tuple(group for group in groups if _matters(table.loc[list(group)])), reasons)
+    together = tuple(group for group in groups if _matters(table.loc[list(group)]))
+    return Verdict(table, together, reasons, excitation=excitation)
 
 
 def _matters(members: "pd.DataFrame") -> bool:
@@ -245,26 +249,26 @@ def _comparison_size(name: str, p: Parameter, problem: EstimationProblem) -> flo
     return max(abs(p.value), abs(given), 1.0 if p.unit == "1" else 0.0)
 
 
-def _unidentifiable_reason(name: str, alone: float, relative: float, lack: tuple[str, str] | None) -> str:
+def _unidentifiable_reason(alone: float, relative: float, lack: Lack | None, usual_remedy: str) -> str:
     """Why the logs do not tell a parameter, and what to do."""
     if lack is not None:
-        return f"{lack[0]}; {lack[1]}"
+        return f"{lack.reason}; {lack.remedy}"
     if math.isinf(alone):
         return "nothing measured depends on it; fix it, or log a run that does"
     message = (
         f"within {relative:.0%} (1 standard deviation)" if relative < UNIDENTIFIABLE_DEVIATION else _VAGUER_THAN_PRIOR
     )
-    return f"{message}; {remedy([name])}"
+    return f"{message}; {usual_remedy}"
 
 
-def _describe_group(group: Sequence[str], inflation: "pd.Series[float]") -> str:
+def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:
     times = float(inflation[list(group)].max())
     message = (
         f"known {times:.0f} times better if the others were"
         if times < INFINITE_INFLATION
         else "nothing tells them apart"
     )
-    return f"{join_names(group)} only count together ({message}): {remedy(group)}"
+    return f"{join_names(group)} only count together ({message}): {remedy(excitation, group)}"
 
 
 def join_names(names: Sequence[str]) -> str:

@@ -1,6 +1,6 @@
 """Drives wired from parts: `ForceDrive` (pushed by a known force), `MotionDrive` (moved, its friction measured)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import casadi as ca
@@ -10,6 +10,7 @@ from pneuopt.models.declaration import DriveKind, flag
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
+from pneuopt.models.needs import LOAD_EXCITATION, RIG_EXCITATION
 from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
@@ -55,7 +56,8 @@ class ForceDrive:
             return {"position": v, "speed": acceleration, **rates}, {"position": y, "speed": v}
 
         inputs = (FORCE, *_pressure_inputs(self.friction))
-        return define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, force_starts)
+        system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, force_starts)
+        return replace(system, excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION)
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,8 @@ class MotionDrive:
         pressures = _pressure_inputs(self.friction)
         if self.chamber and "pressure_a" not in (q.name for q in pressures):
             pressures = (_PRESSURE_A, *pressures)
-        return define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, motion_starts)
+        system = define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, motion_starts)
+        return replace(system, excitation=self.friction.excitation.with_prefix("friction") | RIG_EXCITATION)
 
 
 FORCE_KIND = DriveKind(

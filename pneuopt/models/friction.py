@@ -5,11 +5,19 @@ Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoo
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import casadi as ca
 
+from pneuopt.dynamics.excitation import Excitation
 from pneuopt.dynamics.system import Symbols
+from pneuopt.models.needs import (
+    ASYMMETRY_EXCITATION,
+    BRISTLE_EXCITATION,
+    COULOMB_EXCITATION,
+    STRIBECK_EXCITATION,
+    VISCOUS_EXCITATION,
+)
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
@@ -49,6 +57,11 @@ class FrictionModel(Protocol):
         """Defaults, with units and bounds."""
         ...
 
+    @property
+    def excitation(self) -> Excitation:
+        """Which motion a log must show for each parameter to be identifiable; parameters by their own names."""
+        ...
+
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """Force at speed v [m/s] with internal states z, inputs u and parameters p."""
         ...
@@ -58,6 +71,7 @@ class FrictionModel(Protocol):
 class Viscous:
     """F = viscous * v."""
 
+    excitation: ClassVar[Excitation] = VISCOUS_EXCITATION
     states: tuple[Quantity, ...] = ()
     inputs: tuple[Quantity, ...] = ()
 
@@ -75,6 +89,7 @@ class Viscous:
 class Coulomb:
     """F = coulomb * tanh(v / smoothing) + viscous * v."""
 
+    excitation: ClassVar[Excitation] = COULOMB_EXCITATION
     states: tuple[Quantity, ...] = ()
     inputs: tuple[Quantity, ...] = ()
 
@@ -94,6 +109,7 @@ class Coulomb:
 class Stribeck:
     """F = g(v) tanh(v / smoothing) + viscous * v, with `stribeck_curve` g."""
 
+    excitation: ClassVar[Excitation] = STRIBECK_EXCITATION
     states: tuple[Quantity, ...] = ()
     inputs: tuple[Quantity, ...] = ()
 
@@ -117,6 +133,7 @@ class LuGre:
     The damping fades with speed (v_d), which keeps the model passive for any viscous friction (PHYSICS section 3).
     """
 
+    excitation: ClassVar[Excitation] = BRISTLE_EXCITATION
     inputs: tuple[Quantity, ...] = ()
 
     @property
@@ -170,6 +187,11 @@ class Asymmetric:
         coulomb = {"coulomb_asymmetry": ratio} if "coulomb" in self.base.parameters else {}
         return self.base.parameters | ParameterSet({**coulomb, **added})
 
+    @property
+    def excitation(self) -> Excitation:
+        """Both directions, and what the base needs."""
+        return ASYMMETRY_EXCITATION | self.base.excitation
+
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""
         side = smooth_sign(v, p, "asymmetry_width")
@@ -209,6 +231,11 @@ class PressureDependent:
         """Those of the base, and one coefficient [N/Pa] a chamber."""
         slope = Parameter(0.0, "N/Pa", lower=-1e-3, upper=1e-3)
         return self.base.parameters | ParameterSet({f"coulomb_{name}": slope for name in self.chambers})
+
+    @property
+    def excitation(self) -> Excitation:
+        """What the base needs."""
+        return self.base.excitation
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from pneuopt.dynamics.excitation import Excitation
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.friction import Force, FrictionModel
 from pneuopt.quantities.errors import ModelError, require
@@ -58,6 +59,11 @@ class Karnopp:
         """Those of the base but the smoothing widths, and direction [1], which only a simulation sets."""
         kept = {n: p for n, p in self.base.parameters.items() if n not in SMOOTHING_WIDTHS}
         return ParameterSet({**kept, "direction": Parameter(0.0, "1", -1.0, 1.0, source="switched by simulate")})
+
+    @property
+    def excitation(self) -> Excitation:
+        """What the base needs."""
+        return self.base.excitation
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""

@@ -136,7 +136,8 @@ class SecondOrder:
         shape = ResponseShape(
             tuple(own)[:2], _second_order_polynomials, None if friction is None else _friction_polynomials
         )
-        return _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), own, dynamics, shape)
+        plant = _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), own, dynamics, shape)
+        return plant if friction is None else replace(plant, excitation=friction.excitation.with_prefix("friction"))
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,11 @@ def with_sensors(
     sensed = define(*own, sensors.rates, start_hook=sensors.starts)
     finder = partial(sensors.rest, system.rest_hook) if system.rest_hook else None
     return replace(
-        sensed, rest_hook=finder, hardware_check_hook=system.hardware_check_hook, validity_limits=system.validity_limits
+        sensed,
+        rest_hook=finder,
+        hardware_check_hook=system.hardware_check_hook,
+        validity_limits=system.validity_limits,
+        excitation=system.excitation,
     )
 
 

@@ -8,12 +8,14 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
+from pneuopt.dynamics.excitation import Excitation, SeparatingRun
 from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, gauge_pressures, rename_quantity, without_prefix
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import Load
+from pneuopt.models.needs import LOAD_EXCITATION
 from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.pneumatic.gas import GAS_CONSTANT
@@ -184,6 +186,7 @@ class PneumaticDrive:
             hardware_check_hook=self.check,
             validity_limits=cylinder_guards(self.cylinder.stops),
             log_warning_hook=doubts,
+            excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION | _FLOW_EXCITATION,
         )
         return replace(known, meter=self._meter_function())
 
@@ -269,6 +272,16 @@ class PneumaticDrive:
         return self.rest(parameters, **outputs)
 
 
+_FLOW_PARAMETERS = frozenset({"valve.conductance", "valve.critical_ratio", "supply.pressure", "valve.leak"})
+_FLOW_EXCITATION = Excitation(
+    runs=(
+        SeparatingRun(
+            _FLOW_PARAMETERS,
+            _FLOW_PARAMETERS,
+            "log chambers filling up to the supply's pressure and emptying to the ambient's",
+        ),
+    )
+)
 _AIR_PARAMETERS = ParameterSet(
     {
         "ambient.temperature": Parameter(293.15, "K", 200.0, 400.0, source="ISO 8778 standard atmosphere (ANR)"),

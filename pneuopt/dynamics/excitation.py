@@ -1,0 +1,100 @@
+"""Which motion a log must show for a model's parameters to be identifiable: models declare it (`System.excitation`).
+
+Names are those of parameters. A part of a plant uses its own ("viscous") for its own parameters and whole ones
+("load.force") for those of other parts; `Excitation.with_prefix` turns the first into the second.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.parameters import ParameterSet
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedMotion:
+    """What the logs' speeds look like, all together, and the parameters as far as they are known.
+
+    Attributes
+    ----------
+    slow, fast : float
+        The speed [m/s] that a tenth of the moving samples stay below, and a tenth exceed.
+    forward : float
+        Share of the moving samples, 0 to 1.
+    reversals : int
+    acceleration : float
+        Root mean square [m/s^2] of slopes over a hundredth of a log.
+    speed : ndarray
+        Every known sample [m/s].
+    values, given : ParameterSet
+        As the logs seem to say, and as the user says.
+    """
+
+    slow: float
+    fast: float
+    forward: float
+    reversals: int
+    acceleration: float
+    speed: Array
+    values: ParameterSet
+    given: ParameterSet
+
+
+class Lack(NamedTuple):
+    """What the logs do not show of a parameter, and the run that would show it, in words."""
+
+    reason: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Need:
+    """What a parameter needs of the logs' motion.
+
+    Parameters
+    ----------
+    lack : callable
+        From the motion to what is lacking; None where nothing is.
+    confused_with : frozenset of str
+        The need counts only where one of these parameters is free, too; empty: always.
+    """
+
+    lack: Callable[[LoggedMotion], Lack | None]
+    confused_with: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class SeparatingRun:
+    """The run that separates some parameters from others, in words.
+
+    Parameters
+    ----------
+    some, others : frozenset of str
+        It suits a group that holds one of each, or one of `some` alone.
+    words : str
+    """
+
+    some: frozenset[str]
+    others: frozenset[str]
+    words: str
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A model's needs by parameter, and the runs that separate its parameters; of these the first that suits counts."""
+
+    needs: Mapping[str, Need] = field(default_factory=dict)
+    runs: tuple[SeparatingRun, ...] = ()
+
+    def __or__(self, other: "Excitation") -> "Excitation":
+        return Excitation({**self.needs, **other.needs}, self.runs + other.runs)
+
+    def with_prefix(self, prefix: str) -> "Excitation":
+        """The same with every part's own name ("viscous") made whole ("friction.viscous")."""
+
+        def whole(names: frozenset[str]) -> frozenset[str]:
+            return frozenset(n if "." in n else f"{prefix}.{n}" for n in names)
+
+        needs = {f"{prefix}.{n}": replace(e, confused_with=whole(e.confused_with)) for n, e in self.needs.items()}
+        return Excitation(needs, tuple(replace(r, some=whole(r.some), others=whole(r.others)) for r in self.runs))
