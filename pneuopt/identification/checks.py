@@ -10,9 +10,9 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import names
-from pneuopt.identification.statistics import noise_level
 from pneuopt.logs.doctor import Finding, examine
 from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 

@@ -15,8 +15,8 @@ from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.silence import REFIT_STAGES, fit_holding_unidentifiable
-from pneuopt.identification.statistics import noise_level
 from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, Status

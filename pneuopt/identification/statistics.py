@@ -1,4 +1,4 @@
-"""What a fit is worth: confidence intervals, noise levels, agreement of a prediction with a measurement."""
+"""What a fit is worth: confidence intervals, agreement of a prediction with a measurement."""
 
 import math
 from collections.abc import Mapping
@@ -35,49 +35,6 @@ def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
     nrmse = float(np.linalg.norm(e)) / spread if spread > 0 else math.nan
     rmse = float(np.sqrt(np.mean(e**2))) if y.size else math.nan
     return {"rmse": rmse, "nrmse": nrmse, "fit_percent": 100 * (1 - nrmse), "samples": float(y.size)}
-
-
-def noise_level(column: ArrayLike, t: ArrayLike | None = None) -> float:
-    """Estimate white noise from how far samples lie off the line of their neighbours; the resolution is the floor.
-
-    Parameters
-    ----------
-    column : array_like, shape (n,)
-        NaN where a sample is missing.
-    t : array_like, shape (n,), optional
-        Time [s], where the samples are not evenly spaced.
-
-    Returns
-    -------
-    float
-        Standard deviation [unit of the channel]: 1.4826 MAD of those distances, each over its own deviation for unit
-        noise, which motion slower than the sampling hardly touches; at least q / sqrt(12), with q the smallest
-        difference between two samples. NaN for a constant channel, which shows none.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> round(noise_level(np.sin(np.linspace(0, 6, 4000)) + 0.01 * rng.standard_normal(4000)), 3)
-    0.01
-    """
-    column = np.asarray(column, dtype=float)
-    time = np.arange(column.size, dtype=float) if t is None else np.asarray(t, dtype=float)
-    known = np.isfinite(column)
-    steps = np.abs(np.diff(column[known]))
-    if not np.any(steps > 0):
-        return math.nan
-    off = _line_deviation(time, column)  # not across a hole, as long as some samples have both neighbours
-    off = off[np.isfinite(off)] if np.isfinite(off).any() else _line_deviation(time[known], column[known])
-    random = 1.4826 * float(np.median(np.abs(off - np.median(off)))) if off.size else 0.0
-    resolution = float(np.min(steps[steps > 1e-9 * np.max(steps)])) / math.sqrt(12)
-    return max(random, resolution)
-
-
-def _line_deviation(t: Array, y: Array) -> Array:
-    """Distance of inner samples from the line through their neighbours, scaled to the noise of one sample."""
-    left = (t[2:] - t[1:-1]) / (t[2:] - t[:-2])
-    distance = y[1:-1] - left * y[:-2] - (1 - left) * y[2:]
-    return np.asarray(distance / np.sqrt(1 + left**2 + (1 - left) ** 2))
 
 
 def correlation_time(residuals: ArrayLike) -> float:
