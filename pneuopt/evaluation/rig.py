@@ -21,7 +21,8 @@ from pneuopt.dynamics.smooth import Integration
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack
 from pneuopt.evaluation.instruments import Actuator, Sensor
-from pneuopt.logs.experiments import CHANNELS, Experiment
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from pneuopt.logs.csv import CHANNELS, read_columns
+from pneuopt.logs.columns import CHANNELS, read_channels
+from pneuopt.logs.readers import read_table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import read_si, read_value
-
-__all__ = ["CHANNELS", "COMMAND_CHANNELS", "Experiment", "differentiate", "read_log", "resample", "split"]
-
 
 COMMAND_CHANNELS = ("valve_voltage", "speed_reference", "position_reference")
 """Channels that a controller holds from sample to sample; the others vary in between."""
@@ -90,12 +88,13 @@ def read_log(
     columns: Mapping[str, str | Mapping[str, str | float]] | None = None,
     sidecar: str | Path | None = None,
 ) -> Experiment:
-    """Read a log: a CSV file with one header row, and what its sidecar says about it.
+    """Read a log, and what its sidecar says about it.
 
     Parameters
     ----------
     path : str or Path
-        Columns apart by comma, semicolon or tab; decimal point or comma; an empty cell is a missing sample.
+        The suffix says the format: text (.csv, .txt, .tsv, .dat), with a first row that names the columns, which comma,
+        semicolon or tab keep apart, and with decimal point or comma. An empty cell is a missing sample.
     columns : mapping, optional
         Channel to column, in place of the sidecar's [columns]: "t [ms]", or a mapping with `column`, `unit`,
         `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied). Without either, the header has to say
@@ -113,14 +112,14 @@ def read_log(
         If anything in the files is missing, ambiguous or not a number; the message names file, row, column, remedy.
     """
     path = Path(path)
-    raw = _read_bytes(path)
+    sha256 = hashlib.sha256(_read_bytes(path)).hexdigest()
     side, said = _read_sidecar(path, sidecar)
     entries, where = (columns, "columns") if columns is not None else (said.get("columns"), f"{side}: columns")
-    values = read_columns(path, raw, entries, where)
+    values = read_channels(read_table(path), entries, where)
     trajectory = Trajectory(values.pop("time"), values)
     conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in said.get("conditions", {}).items()}
     noise = _read_noise(said.get("noise", {}), trajectory, f"{side}: noise")
-    return Experiment(trajectory, noise, conditions, path.stem, hashlib.sha256(raw).hexdigest())
+    return Experiment(trajectory, noise, conditions, path.stem, sha256)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:

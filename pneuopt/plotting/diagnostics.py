@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from pneuopt.identification.statistics import correlation, ljung_box
-from pneuopt.logs.experiments import CHANNELS, Experiment
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.experiments import Experiment
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, PLOT_UNITS, RED, axes_grid, note_omissions
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require

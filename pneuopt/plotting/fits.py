@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from pneuopt.logs.experiments import CHANNELS, Experiment
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.experiments import Experiment
 from pneuopt.plotting.canvas import (
     BLUE,
     GREY,

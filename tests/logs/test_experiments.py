@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pneuopt.logs.experiments import CHANNELS, Experiment, differentiate, read_log, resample, split
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.quantities.errors import InputError, LogError, UnitError, UnknownNameError
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, si_conversion

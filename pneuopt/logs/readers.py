@@ -1,0 +1,39 @@
+"""The registry of log formats: one reader a suffix. A new format is a file with a `read_table`, and a row here."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from pneuopt.logs import csv
+from pneuopt.logs.table import Table
+from pneuopt.quantities.errors import LogError, require
+
+READERS: Mapping[str, Callable[[Path], Table]] = {
+    ".csv": csv.read_table,
+    ".txt": csv.read_table,
+    ".tsv": csv.read_table,
+    ".dat": csv.read_table,
+}
+"""The suffix of a file, in lower case, to the function that reads it."""
+
+
+def read_table(path: Path) -> Table:
+    """Read a log's columns with the reader of its suffix.
+
+    Parameters
+    ----------
+    path : Path
+        Of a file that can be read.
+
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    LogError
+        If no reader has that suffix, or the file is not of that format.
+    """
+    suffix = path.suffix.lower()
+    shown = f"{suffix!r} files" if suffix else "a name without suffix"
+    require(suffix in READERS, f"{path}: no reader for {shown}; known: {', '.join(READERS)}", LogError)
+    return READERS[suffix](path)

@@ -1,0 +1,131 @@
+"""Every registered reader of logs passes the same tests; a new one needs a row in `WRITERS`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pneuopt.logs.experiments import Experiment, read_log
+from pneuopt.logs.readers import READERS
+from pneuopt.quantities.errors import LogError, UnknownNameError
+
+Columns = Mapping[str, Sequence[float]]
+N = 12
+TIME = [0.1 * k for k in range(N)]
+LOG: Columns = {"time_s": TIME, "position_mm": [float(k * k) for k in range(N)], "U_valve": [0.5 * k for k in range(N)]}
+SIDECAR = """
+[columns]
+time = "time_s"
+valve_voltage = { column = "U_valve", unit = "V", centre = "1 V" }
+pressure_a = { column = "position_mm", unit = "mV", scale = "2 bar(g)/V" }
+[conditions]
+"load.mass" = "5 kg"
+"""
+
+
+def write_text(path: Path, columns: Columns) -> None:
+    rows = (",".join("" if np.isnan(v) else repr(v) for v in row) for row in zip(*columns.values(), strict=True))
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
+
+
+WRITERS: dict[str, Callable[[Path, Columns], None]] = {
+    ".csv": write_text,
+    ".txt": write_text,
+    ".tsv": write_text,
+    ".dat": write_text,
+}
+FIRST_ROWS = dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), 2)
+"""The row number of a format's first sample, where it is not 1."""
+
+
+@pytest.fixture(params=sorted(READERS))
+def suffix(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def written(folder: Path, suffix: str, columns: Columns, sidecar: str = "") -> Path:
+    path = folder / f"run{suffix}"
+    WRITERS[suffix](path, columns)
+    if sidecar:
+        path.with_suffix(".toml").write_text(sidecar, encoding="utf-8")
+    return path
+
+
+def test_every_format_is_written_here(suffix: str) -> None:
+    assert suffix in WRITERS, f"add a writer of {suffix} files to WRITERS, so that its reader is tested"
+
+
+def test_the_same_log_gives_the_same_experiment(tmp_path: Path, suffix: str) -> None:
+    run = read_log(written(tmp_path, suffix, LOG))
+    assert (run.name, run.trajectory.names, len(run.sha256)) == ("run", ("position",), 64)
+    np.testing.assert_array_equal(run.trajectory.t, TIME)
+    np.testing.assert_array_equal(run.trajectory["position"], 1e-3 * np.array(LOG["position_mm"]))
+
+
+def test_a_sidecar_means_the_same_for_every_format(tmp_path: Path, suffix: str) -> None:
+    def read(of: str) -> Experiment:
+        return read_log(written(tmp_path, of, LOG, SIDECAR))
+
+    expected, found = read(".csv"), read(suffix)
+    assert found.conditions == expected.conditions == {"load.mass": 5.0}
+    assert found.trajectory.names == expected.trajectory.names == ("valve_voltage", "pressure_a")
+    for channel in expected.trajectory.names:
+        np.testing.assert_array_equal(found.trajectory[channel], expected.trajectory[channel])
+
+
+def test_the_suffix_may_be_in_capitals(tmp_path: Path, suffix: str) -> None:
+    path = written(tmp_path, suffix, LOG)
+    assert read_log(path.rename(path.with_suffix(suffix.upper()))).trajectory.names == ("position",)
+
+
+def test_missing_samples_are_nan(tmp_path: Path, suffix: str) -> None:
+    holes = [np.nan if k in {3, 4} else float(k) for k in range(N)]
+    run = read_log(written(tmp_path, suffix, {"time_s": TIME, "position_mm": holes}))
+    assert np.flatnonzero(np.isnan(run.trajectory["position"])).tolist() == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("column", "sample", "said"),
+    [
+        ("position_mm", np.inf, "row {row}, column 'position_mm': '?inf'? is not a number"),
+        ("time_s", np.nan, "row {row}, column 'time_s': the time is missing; delete the row"),
+        ("time_s", 0.2, r"row {row}: time runs backwards \(0.4 s, then 0.2 s\); delete the row"),
+    ],
+)
+def test_a_bad_cell_is_named_by_row_and_column(
+    tmp_path: Path, suffix: str, column: str, sample: float, said: str
+) -> None:
+    columns = {name: list(values) for name, values in LOG.items()}
+    columns[column][5] = sample
+    path = written(tmp_path, suffix, columns)
+    with pytest.raises(LogError, match=said.format(row=FIRST_ROWS.get(suffix, 1) + 5)) as error:
+        read_log(path)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_a_column_that_is_not_there_is_named(tmp_path: Path, suffix: str) -> None:
+    path = written(tmp_path, suffix, LOG)
+    with pytest.raises(UnknownNameError, match=r"unknown column 'position'; did you mean 'position_mm'\?"):
+        read_log(path, columns={"time": "time_s", "position": {"column": "position", "unit": "mm"}})
+
+
+@pytest.mark.parametrize("raw", [b"", b"\x00\x01\xffno log at all\n" * 40], ids=["empty", "noise"])
+def test_a_file_that_is_not_of_its_format_is_refused_in_one_line(tmp_path: Path, suffix: str, raw: bytes) -> None:
+    path = tmp_path / f"run{suffix}"
+    path.write_bytes(raw)
+    with pytest.raises(LogError) as error:
+        read_log(path)
+    message = str(error.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    assert ";" in message, "the message ends with a remedy"
+
+
+@pytest.mark.parametrize(("name", "shown"), [("run.xlsx", "'.xlsx'"), ("run", "a name without suffix")])
+def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path: Path, name: str, shown: str) -> None:
+    (tmp_path / name).write_text("time_s,position_mm\n", encoding="utf-8")
+    with pytest.raises(LogError) as error:
+        read_log(tmp_path / name)
+    assert shown in str(error.value)
+    assert f"known: {', '.join(READERS)}" in str(error.value)
