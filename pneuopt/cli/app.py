@@ -51,7 +51,7 @@ def options(
         raise typer.Exit
 
 
-@app.command()
+@app.command("identify")
 def identify_command(
     drive: Annotated[
         Path, typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is identified.")
@@ -79,7 +79,7 @@ def identify_command(
         raise typer.Exit(run(drive, _expand_patterns(logs), Outputs(output, json, plot), window, quiet))
 
 
-@app.command()
+@app.command("tune")
 def tune_command(
     fit: Annotated[
         Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant; nothing of it is tuned.")
@@ -100,7 +100,7 @@ def tune_command(
         raise typer.Exit(run_tune(fit, tuning, Outputs(output, json, plot), quiet))
 
 
-@app.command()
+@app.command("simulate")
 def simulate_command(
     fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml.")],
     tuning: Annotated[
@@ -125,7 +125,7 @@ def simulate_command(
             raise typer.Exit(run_predict(fit, log, outputs))
 
 
-@app.command()
+@app.command("study")
 def study_command(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning, and a grid's axes or a front.")
@@ -143,7 +143,7 @@ def study_command(
         raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet))
 
 
-@app.command()
+@app.command("info")
 def info_command() -> None:
     """Show versions, compiler and cache: say them when asking for help."""
     import os
