@@ -51,10 +51,10 @@ def show_selection(console: Console, chosen: ModelSelection) -> None:
             str(row["contains"]),
             format_number(row["p_value"], 2),
         ]
+        unidentifiable = row["unidentifiable"]
+        missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
         note = "" if row["converged"] else "not converged"
-        table.add_row(
-            str(row["model"]), *figures, note or (f"{UNIDENTIFIABLE_NOTE}: {row['untold']}" if row["untold"] else "")
-        )
+        table.add_row(str(row["model"]), *figures, note or missing)
     console.print(table)
 
 

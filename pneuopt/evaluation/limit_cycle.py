@@ -56,7 +56,7 @@ class LimitCycle:
 
         Examples
         --------
-        >>> LimitCycle(0.012, 2.34, 0.4, 7).told("m/s")
+        >>> LimitCycle(0.012, 2.34, 0.4, 7).describe("m/s")
         'a limit cycle of +-0.012 m/s at 2.34 Hz, at a standstill 40 % of the time'
         """
         sticks = f", at a standstill {100 * self.stick_share:.0f} % of the time" if self.stick_share >= 0.005 else ""
@@ -103,7 +103,7 @@ def find_limit_cycle(
     --------
     >>> t = np.linspace(0.0, 4.0, 2001)
     >>> hunting = 0.05 + 0.02 * np.sin(2 * np.pi * 2.5 * t)
-    >>> print(find_limit_cycle(t, hunting).told("m/s"))
+    >>> print(find_limit_cycle(t, hunting).describe("m/s"))
     a limit cycle of +-0.02 m/s at 2.5 Hz
     >>> find_limit_cycle(t, 0.05 + 0.02 * np.exp(-t) * np.sin(2 * np.pi * 2.5 * t)) is None
     True

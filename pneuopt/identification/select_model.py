@@ -30,8 +30,8 @@ class ModelSelection:
     ----------
     table : DataFrame
         A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's),
-        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse, untold and
-        at_bound (names of parameters that the logs do not tell, or that ended at a bound), message.
+        contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
+        unidentifiable and at_bound (names of parameters), message.
     recommended : str
         A candidate's name.
     reason : str

@@ -14,7 +14,7 @@ from typing import ClassVar
 import casadi as ca
 
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, names
-from pneuopt.logs.experiments import CHANNELS
+from pneuopt.logs.columns import CHANNELS
 from pneuopt.models.declaration import DriveKind, Key, Structure, choice
 from pneuopt.models.drive import FORCE, POSITION, SPEED
 from pneuopt.models.friction import FrictionModel

@@ -118,8 +118,8 @@ def test_a_candidate_with_untold_parameters_gives_way_to_a_simpler_one_that_fits
     assert found.recommended == "coulomb"
     columns = found.table.to_dict()
     assert columns["converged"]["stribeck"]
-    assert columns["untold"]["stribeck"] == "friction.static, friction.stribeck_velocity"
-    assert columns["untold"]["coulomb"] == columns["at_bound"]["coulomb"] == ""
+    assert columns["unidentifiable"]["stribeck"] == "friction.static, friction.stribeck_velocity"
+    assert columns["unidentifiable"]["coulomb"] == columns["at_bound"]["coulomb"] == ""
     assert found.reason.startswith("coulomb, of 2 converged candidates, has the lowest BIC")
     assert "not tell" not in found.reason
     only = select_model({"stribeck": pair["stribeck"], "also": pair["stribeck"]}, [fast], ParameterSet(), free=FREE[:4])
