@@ -14,7 +14,8 @@ from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
 from pneuopt.evaluation.evaluate import LIMIT_CYCLE_METRICS
-from pneuopt.evaluation.requirements import MINIMUM_REQUIREMENTS, PERCENT_METRICS, Requirement, metric_name
+from pneuopt.evaluation.metric import Requirement, Sense
+from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, percent_factor, user_limit
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 from pneuopt.studies.sweep import INTERRUPTED_CASE
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 MAX_REFERENCE_COLUMNS = 3  # beside each other
 MAX_CASE_ROWS, MAX_FAILURE_REASONS = 40, 5  # of a study
 MAX_GAIN_COLUMNS = 6  # of a front, on 80 columns
-SMALLEST_IS_WORST = ("GainMargin", "PhaseMargin")
 
 
 def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> None:
@@ -115,7 +115,7 @@ def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[
     units, grid = metric_units(loop), new_table("requirement", "claimed", "certified", "limit", "room", "", "unit")
     for row in table.reset_index(names="requirement").to_dict(orient="records"):
         metric = str(row["requirement"])
-        values = [100 * row[n] if metric in PERCENT_METRICS else row[n] for n in ("claimed", "certified", "allowed")]
+        values = [percent_factor(metric) * row[n] for n in ("claimed", "certified", "allowed")]
         figures = [_format_metric(metric, v) for v in values[:2]] + [format_number(values[2], 4)]
         room = "-" if math.isnan(row["room"]) else f"{100 * row['room']:.3g} %"
         grid.add_row(metric, *figures, room, "active" if row["active"] else "", units[metric])
@@ -132,7 +132,8 @@ def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
     grid = new_table("relaxed alone", "asked", "would do", "by")
     for row in table.reset_index(names="limit").to_dict(orient="records"):
         share = "-" if math.isnan(row["share"]) else f"{100 * row['share']:.3g} %"
-        factor, unit = (100, " %") if row["limit"] in PERCENT_METRICS else (1, "")
+        factor = percent_factor(row["limit"])
+        unit = " %" if factor == 100 else ""
         asked, needed = (format_number(factor * row[n], 4) + unit for n in ("asked", "needed"))
         if row["limit"] == "all":
             grid.add_row("all together", "", "", share)
@@ -175,7 +176,7 @@ def show_cases(console: Console, table: "pd.DataFrame", axes: Mapping[str, str],
         The columns, and their units.
     """
     first = next(iter(metrics))
-    ordered = table.sort_values(first, ascending=first in SMALLEST_IS_WORST, na_position="first", kind="stable")
+    ordered = table.sort_values(first, ascending=larger_is_better(first), na_position="first", kind="stable")
     shown = table if len(table) <= MAX_CASE_ROWS else ordered.head(MAX_CASE_ROWS)
     grid = new_table(*(f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items()))
     for row in shown.to_dict(orient="records"):
@@ -208,7 +209,7 @@ def show_front(
     shown = dict(list(gains.items())[:MAX_GAIN_COLUMNS])
     grid = new_table(*(_narrow_heading(n, unit) for n, unit in {**requirements, **shown}.items()))
     grid.padding = (0, 1, 0, 0)
-    relation = ">=" if second in (kind.__name__ for kind in MINIMUM_REQUIREMENTS) else "<="
+    relation = ">=" if larger_is_better(second) else "<="
     for row in table.to_dict(orient="records"):
         figures = [format_number(row[n], 4) for n in (first, second)]
         if row["error"]:
@@ -224,30 +225,8 @@ def show_front(
 
 def metric_units(loop: ClosedLoop) -> Mapping[str, str]:
     """The metrics that are shown, in that order, with their units."""
-    return {
-        "SettlingTime": "s",
-        "RiseTime": "s",
-        "Overshoot": "%",
-        "SteadyStateError": "%",
-        "StepEnvelope": "",
-        "IAE": "s",
-        "ISE": "s",
-        "ITAE": "s^2",
-        "PeakControl": loop.command.unit,
-        "ControlRate": f"{loop.command.unit}/s",
-        "Ripple": loop.feedback.unit,
-        "LimitCycleAmplitude": loop.feedback.unit,
-        "LimitCycleFrequency": "Hz",
-        "StickShare": "1",
-        "AirUse": "l(ANR)",
-        "ValveTravel": "half travels",
-        "MaxSensitivity": "",
-        "MaxComplementarySensitivity": "",
-        "GainMargin": "",
-        "PhaseMargin": "deg",
-        "FrictionSlope": "N*s/m",
-        "NoiseGain": f"{loop.command.unit}/({loop.feedback.unit})",
-    }
+    units = (loop.command.unit, loop.feedback.unit)
+    return {metric.name: metric.shown_unit(*units) for metric in METRICS.values() if metric.shown}
 
 
 def _format_gain(value: float) -> str:
@@ -272,7 +251,7 @@ def _metric_values(frame: "pd.DataFrame | None", metric: str, several: bool) -> 
     if frame is None or metric not in frame.index:
         return []
     values: list[float] = frame.T[metric].tolist()
-    worst = min if metric in SMALLEST_IS_WORST else max
+    worst = min if larger_is_better(metric) else max
     unknown = any(math.isnan(v) for v in values)
     return [math.nan if unknown else worst(values)] if several else values
 
@@ -294,10 +273,8 @@ def _other_form(parameters: ParameterSet) -> str:
 
 
 def _format_limit(requirement: Requirement) -> str:
-    if isinstance(requirement, MINIMUM_REQUIREMENTS):
-        return "" if requirement.min is None else f">= {format_number(requirement.min, 4)}"
-    factor = 100 if metric_name(requirement) in PERCENT_METRICS else 1
-    return "" if requirement.max is None else f"<= {format_number(factor * requirement.max, 4)}"
+    limit, relation = user_limit(requirement), ">=" if requirement.metric.sense is Sense.AT_LEAST else "<="
+    return "" if limit is None else f"{relation} {format_number(requirement.metric.factor * limit, 4)}"
 
 
 def _format_metric(metric: str, value: float) -> str:

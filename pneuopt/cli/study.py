@@ -19,16 +19,16 @@ from pneuopt.cli.shared import (
     settling_band,
     warn_of_status,
 )
-from pneuopt.cli.show_loops import SMALLEST_IS_WORST, metric_units, show_cases, show_front
+from pneuopt.cli.show_loops import metric_units, show_cases, show_front
 from pneuopt.cli.terminal import make_console, progress
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import (
-    MINIMUM_REQUIREMENTS,
-    PERCENT_METRICS,
-    Requirement,
+    METRICS,
     SettlingTime,
     StepEnvelope,
+    larger_is_better,
     metric_name,
     upper_limit,
     user_limit,
@@ -138,7 +138,7 @@ def _front_requirements(
     given = {metric_name(q): q for q in (*task.minimise, *task.subject_to)}
     first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
     ends = {"lower": front_spec.lower, "upper": front_spec.upper}
-    begin, end = ("lower", "upper") if isinstance(second, MINIMUM_REQUIREMENTS) else ("upper", "lower")
+    begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
     start, until = ends[begin], ends[end]
     loosest = second if start is None else construct_at(lambda: with_user_limit(second, start), f"{where} {begin}")
     if until is not None:
@@ -173,14 +173,9 @@ def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str,
 
 def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
     """The front with figures as the metrics are shown, overshoot in percent."""
-    columns = [
-        c
-        for q in (first, second)
-        if metric_name(q) in PERCENT_METRICS
-        for c in (metric_name(q), f"claimed {metric_name(q)}")
-    ]
-    columns += ["limit"] if metric_name(second) in PERCENT_METRICS else []
-    return front.assign(**{c: 100 * front[c] for c in columns})
+    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
+    factors["limit"] = second.metric.factor
+    return front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})
 
 
 def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
@@ -205,7 +200,7 @@ def _worst_of_references(table: "pd.DataFrame", axes: Sequence[Axis], metrics: S
         seen[axis.name] = axis.in_axis_unit(table[axis.name])
     for metric in metrics:
         own = table[[c for c in table if _metric_name(c) == metric]]
-        worst = own.min if metric in SMALLEST_IS_WORST else own.max
+        worst = own.min if larger_is_better(metric) else own.max
         seen[metric] = worst(axis=1, skipna=False) if len(own.columns) else math.nan
     return seen
 
@@ -217,8 +212,8 @@ def _metric_name(column: Hashable) -> str:
 
 def _grid_csv(table: "pd.DataFrame", axes: Mapping[str, str], loop: ClosedLoop) -> str:
     """As CSV, each column with its unit."""
-    known = {**axes, **metric_units(loop), "PeakTime": "s", "OvershootFinal": "%", "Undershoot": "%", "seconds": "s"}
-    known |= dict.fromkeys(("SettlingMin", "SettlingMax", "Peak", "SteadyStateValue"), loop.feedback.unit)
+    own = (loop.command.unit, loop.feedback.unit)
+    known = {**axes, **{n: metric.shown_unit(*own) for n, metric in METRICS.items()}, "seconds": "s"}
     return _to_csv(table, {str(c): known.get(_metric_name(c), "") for c in table})
 
 

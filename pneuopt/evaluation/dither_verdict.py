@@ -15,6 +15,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.hooks import Rest
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.space import command_range
@@ -265,7 +266,7 @@ def _weigh_changes(
     table: "pd.DataFrame", size: float, loop: ClosedLoop, told: list[str]
 ) -> tuple[Usefulness, tuple[str, ...]]:
     """The verdict, and what it stands on, from what is told already: against it."""
-    unit, signs = loop.feedback.unit, [-1] * len(told)
+    signs = [-1] * len(told)
     for metric, (words, least, relative) in CRITERIA.items():
         before, after = (float(table[c][metric]) for c in ("without", "with"))
         room = least * max(before, after) if relative else least * (size if "Limit" in metric else 1.0)
@@ -273,34 +274,31 @@ def _weigh_changes(
             continue
         signs.append(1 if after < before else -1)
         change = (
-            f"{words} {_format_metric(metric, before, unit)} without, {_format_metric(metric, after, unit)} with it"
+            f"{words} {_format_metric(metric, before, loop)} without, {_format_metric(metric, after, loop)} with it"
         )
         told.append(f"{'better' if after < before else 'worse'}: {change}")
     if not signs:
         kept = ("SettlingTime", "SteadyStateError")
-        figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), unit)}" for m in kept]
+        figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), loop)}" for m in kept]
         told.append(f"nothing changes: {', '.join(figures)}")
-    told.append("price: " + ", ".join(_price_clause(n, table, unit) for n in PRICE_METRICS if n in table.index))
+    told.append("price: " + ", ".join(_price_clause(n, table, loop) for n in PRICE_METRICS if n in table.index))
     verdict = Usefulness.USELESS if not signs else Usefulness.USEFUL if signs[0] > 0 else Usefulness.HARMFUL
     return verdict, tuple(told)
 
 
-def _price_clause(metric: str, table: "pd.DataFrame", unit: str) -> str:
-    before, after = (_format_metric(metric, float(table[c][metric]), unit) for c in ("without", "with"))
+def _price_clause(metric: str, table: "pd.DataFrame", loop: ClosedLoop) -> str:
+    before, after = (_format_metric(metric, float(table[c][metric]), loop) for c in ("without", "with"))
     return f"{PRICE_METRICS[metric]} {after} (without {before})"
 
 
-_METRIC_UNITS = {"SettlingTime": "s", "IAE": "s", "SteadyStateError": "%", "Overshoot": "%", "AirUse": "l(ANR)"}
-
-
-def _format_metric(metric: str, value: float, unit: str) -> str:
+def _format_metric(metric: str, value: float, loop: ClosedLoop) -> str:
     if metric == "SettlingTime" and value == inf:
         return "never"
     if metric == "LimitCycleAmplitude" and value == 0:
         return "none"
     if metric in ("Ripple", "LimitCycleAmplitude"):
-        return _format_with_prefix(value, unit)
-    return f"{value:.3g} {_METRIC_UNITS.get(metric, '')}".rstrip()
+        return _format_with_prefix(value, loop.feedback.unit)
+    return f"{value:.3g} {METRICS[metric].shown_unit(loop.command.unit, loop.feedback.unit)}".rstrip()
 
 
 def _format_with_prefix(value: float, unit: str) -> str:
@@ -308,7 +306,7 @@ def _format_with_prefix(value: float, unit: str) -> str:
 
     Examples
     --------
-    >>> _small(0.00076, "N"), _small(6.4e-11, "m"), _small(12.1, "N")
+    >>> _format_with_prefix(0.00076, "N"), _format_with_prefix(6.4e-11, "m"), _format_with_prefix(12.1, "N")
     ('0.76 mN', '0.064 nm', '12 N')
     """
     for factor, prefix in ((1.0, ""), (1e3, "m"), (1e6, "u"), (1e9, "n")):

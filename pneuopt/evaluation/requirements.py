@@ -3,26 +3,30 @@
 Values are fractions of the step's size, seconds, or the command's unit: `Overshoot(max=0.05)` is 5 %. Margins and the
 like are those of the loop linearised about the state in which the response ends, the moving reference: friction counts
 with its slope at that speed. A gain or phase margin has a `min`; as a term its reciprocal is minimised.
+
+A new requirement is a class with its `Metric`, in a file of its own or here, and a row of `REQUIREMENT_KINDS`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.evaluation.metric import AtLeast, AtMost, Metric, Sense, Source
+from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
 from pneuopt.quantities.errors import require
 
 Value = TypeVar("Value", float, NDArray[np.float64])
-PERCENT_METRICS = ("Overshoot", "SteadyStateError")
 EnvelopeBounds = tuple[tuple[float, float, float], ...]
 
 
+@final
 @dataclass(frozen=True)
-class SettlingTime:
+class SettlingTime(Requirement):
     """Time after the step from which the response stays within the band around the reference [s].
 
     Parameters
@@ -33,127 +37,59 @@ class SettlingTime:
         [s]
     """
 
+    metric = Metric("SettlingTime", "s", Source.RESPONSE, headline=True, exact=True)
     band: float = 0.02
     max: float | None = None
 
     def __post_init__(self) -> None:
         require(0 < self.band < 1, f"SettlingTime: band is a fraction between 0 and 1, got {self.band}; 2 % is 0.02")
-        _check_limit(self, 0.0)
+        super().__post_init__()
 
 
+@final
+class RiseTime(AtMost):
+    """Time from 10 to 90 % of the change to the final value [s]."""
+
+    metric = Metric("RiseTime", "s", Source.RESPONSE)
+
+
+@final
+class Overshoot(AtMost):
+    """How far the response passes the reference, as a fraction of the step."""
+
+    metric = Metric(
+        "Overshoot",
+        "1",
+        Source.RESPONSE,
+        percent=True,
+        limits=(0.0, 1.0),
+        advice="5 % is 0.05",
+        floor=0.0,
+        headline=True,
+        exact=True,
+    )
+
+
+@final
+class SteadyStateError(AtMost):
+    """Distance from the reference at the end of the horizon, as a fraction of the step."""
+
+    metric = Metric(
+        "SteadyStateError",
+        "1",
+        Source.RESPONSE,
+        percent=True,
+        limits=(0.0, 1.0),
+        advice="2 % is 0.02",
+        floor=0.0,
+        headline=True,
+        exact=True,
+    )
+
+
+@final
 @dataclass(frozen=True)
-class Overshoot:
-    """How far the response passes the reference, as a fraction of the step.
-
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
-        require((self.max or 0) < 1, f"Overshoot: max is a fraction below 1, got {self.max}; 5 % is 0.05")
-
-
-@dataclass(frozen=True)
-class SteadyStateError:
-    """Distance from the reference at the end of the horizon, as a fraction of the step.
-
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
-        require((self.max or 0) < 1, f"SteadyStateError: max is a fraction below 1, got {self.max}; 2 % is 0.02")
-
-
-@dataclass(frozen=True)
-class RiseTime:
-    """Time from 10 to 90 % of the change to the final value [s].
-
-    Parameters
-    ----------
-    max : float, optional
-        [s]
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
-
-
-@dataclass(frozen=True)
-class Ripple:
-    """Peak to peak of the signal, not averaged, over the last dither periods or 5 % of the record [measured unit].
-
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
-
-
-@dataclass(frozen=True)
-class IAE:
-    """Integral of the error's size from the step to the end of the horizon, over the step's size [s].
-
-    Parameters
-    ----------
-    max : float, optional
-        [s]
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
-
-
-@dataclass(frozen=True)
-class ISE:
-    """Integral of the squared error likewise, over the square of the step's size [s].
-
-    Parameters
-    ----------
-    max : float, optional
-        [s]
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
-
-
-@dataclass(frozen=True)
-class ITAE:
-    """Integral of the error's size times the time since the step, over the step's size [s^2].
-
-    Parameters
-    ----------
-    max : float, optional
-        [s^2]
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
-
-
-@dataclass(frozen=True)
-class StepEnvelope:
+class StepEnvelope(Requirement):
     """The response between bounds that vary over time: distance from their middle over their half width, the largest.
 
     Parameters
@@ -169,6 +105,7 @@ class StepEnvelope:
     >>> tube = StepEnvelope(((0.0, -0.1, 1.1), (0.5, 0.95, 1.05)))
     """
 
+    metric = Metric("StepEnvelope", "1", Source.RESPONSE)
     bounds: EnvelopeBounds
     max: float | None = 1.0
 
@@ -179,159 +116,160 @@ class StepEnvelope:
         for t, lower, upper in self.bounds:
             proper = -inf < lower < upper < inf
             require(proper, f"StepEnvelope: at {t:g} s the bounds must be finite and in order, got {lower}, {upper}")
-        _check_limit(self, 0.0)
+        super().__post_init__()
 
 
-@dataclass(frozen=True)
-class PeakControl:
-    """Largest absolute command, dither included [the command's unit].
+@final
+class IAE(AtMost):
+    """Integral of the error's size from the step to the end of the horizon, over the step's size [s]."""
 
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
+    metric = Metric("IAE", "s", Source.RESPONSE)
 
 
-@dataclass(frozen=True)
-class ControlRate:
-    """Largest change of the command over time, dither included, the jump at the step left out [its unit/s].
+@final
+class ISE(AtMost):
+    """Integral of the squared error from the step to the end of the horizon, over the square of the step's size [s]."""
 
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
+    metric = Metric("ISE", "s", Source.RESPONSE)
 
 
-@dataclass(frozen=True)
-class AirUse:
-    """What a pneumatic drive draws from its supply, from the step to the end of the horizon [l(ANR), ISO 8778].
+@final
+class ITAE(AtMost):
+    """Integral of the error's size times the time since the step, over the step's size [s^2]."""
 
-    Parameters
-    ----------
-    max : float, optional
-        [l(ANR)]
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
+    metric = Metric("ITAE", "s^2", Source.RESPONSE)
 
 
-@dataclass(frozen=True)
-class MaxSensitivity:
-    """``Ms = max |1/(1 + L(jw))|``, the inverse of the Nyquist curve's distance from -1; 1.2 is careful, 2 is bold.
+@final
+class PeakControl(AtMost):
+    """Largest absolute command, dither included [the command's unit]."""
 
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 1.0)
+    metric = Metric("PeakControl", "{command}", Source.COMMAND, headline=True, exact=True)
 
 
-@dataclass(frozen=True)
-class MaxComplementarySensitivity:
-    """``Mt = max |L(jw)/(1 + L(jw))|``, the closed loop's resonance peak.
+@final
+class ControlRate(AtMost):
+    """Largest change of the command over time, dither included, the jump at the step left out [its unit/s]."""
 
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
+    metric = Metric("ControlRate", "{command}/s", Source.COMMAND)
 
 
-@dataclass(frozen=True)
-class GainMargin:
-    """Factor on the loop's gain, up or down, that makes it oscillate; at least 2 is usual.
+@final
+class Ripple(AtMost):
+    """Peak to peak of the signal, not averaged, over the last dither periods or 5 % of the record [measured unit]."""
 
-    Parameters
-    ----------
-    min : float, optional
-    """
-
-    min: float | None = None
-
-    def __post_init__(self) -> None:
-        least = self.min
-        require(least is None or 1 < least < inf, f"GainMargin: min is a factor above 1, got {least}; 2 is usual")
+    metric = Metric("Ripple", "{measured}", Source.RESPONSE)
 
 
-@dataclass(frozen=True)
-class PhaseMargin:
-    """Phase by which the loop at gain one stays clear of -180 deg [deg].
+@final
+class AirUse(AtMost):
+    """What a pneumatic drive draws from its supply, from the step to the end of the horizon [l(ANR), ISO 8778]."""
 
-    Parameters
-    ----------
-    min : float, optional
-        [deg]
-    """
-
-    min: float | None = None
-
-    def __post_init__(self) -> None:
-        least = self.min
-        require(least is None or 0 < least < inf, f"PhaseMargin: min is an angle above 0 deg, got {least}; 45 is usual")
+    metric = Metric("AirUse", "l(ANR)", Source.METER)
 
 
-@dataclass(frozen=True)
-class NoiseGain:
-    """``max |C(jw)/(1 + L(jw))|``, from measurement noise to the command [its unit/measured unit]; see `noise_gain`.
+@final
+class MaxSensitivity(AtMost):
+    """``Ms = max |1/(1 + L(jw))|``, the inverse of the Nyquist curve's distance from -1; 1.2 is careful, 2 is bold."""
 
-    Parameters
-    ----------
-    max : float, optional
-    """
-
-    max: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_limit(self, 0.0)
+    metric = Metric("MaxSensitivity", "1", Source.LINEAR_LOOP, limits=(1.0, inf), headline=True, exact=True)
 
 
-Robustness = MaxSensitivity | MaxComplementarySensitivity | GainMargin | PhaseMargin | NoiseGain
-Requirement = (
-    SettlingTime
-    | RiseTime
-    | Overshoot
-    | SteadyStateError
-    | Ripple
-    | IAE
-    | ISE
-    | ITAE
-    | StepEnvelope
-    | PeakControl
-    | ControlRate
-    | AirUse
-    | Robustness
+@final
+class MaxComplementarySensitivity(AtMost):
+    """``Mt = max |L(jw)/(1 + L(jw))|``, the closed loop's resonance peak."""
+
+    metric = Metric("MaxComplementarySensitivity", "1", Source.LINEAR_LOOP)
+
+
+@final
+class GainMargin(AtLeast):
+    """Factor on the loop's gain, up or down, that makes it oscillate; at least 2 is usual."""
+
+    metric = Metric(
+        "GainMargin",
+        "1",
+        Source.LINEAR_LOOP,
+        sense=Sense.AT_LEAST,
+        limits=(1.0, inf),
+        advice="it is a factor, 2 is usual",
+        cost=lambda margin: np.exp(-np.abs(np.log(margin))),
+    )
+
+
+@final
+class PhaseMargin(AtLeast):
+    """Phase by which the loop at gain one stays clear of -180 deg [deg]."""
+
+    metric = Metric(
+        "PhaseMargin",
+        "deg",
+        Source.LINEAR_LOOP,
+        sense=Sense.AT_LEAST,
+        advice="45 is usual",
+        cost=lambda margin: np.divide(1.0, np.abs(margin)),
+    )
+
+
+@final
+class NoiseGain(AtMost):
+    """``max |C(jw)/(1 + L(jw))|``, from measurement noise to the command [its unit/measured unit]; see `noise_gain`."""
+
+    metric = Metric("NoiseGain", "{command}/({measured})", Source.LINEAR_LOOP)
+
+
+REQUIREMENT_KINDS: tuple[type[Requirement], ...] = (
+    SettlingTime,
+    RiseTime,
+    Overshoot,
+    SteadyStateError,
+    StepEnvelope,
+    IAE,
+    ISE,
+    ITAE,
+    PeakControl,
+    ControlRate,
+    Ripple,
+    AirUse,
+    MaxSensitivity,
+    MaxComplementarySensitivity,
+    GainMargin,
+    PhaseMargin,
+    NoiseGain,
 )
-ROBUSTNESS_REQUIREMENTS = (MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin, NoiseGain)
-MINIMUM_REQUIREMENTS = (GainMargin, PhaseMargin)
-REQUIREMENT_KINDS: tuple[type[Requirement], ...] = get_args(Requirement)
+"""Every kind of requirement, a row each; in this order tables show them."""
+
+ROBUSTNESS_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.source is Source.LINEAR_LOOP)
+
+_FIGURES = (
+    Metric("LimitCycleAmplitude", "{measured}", Source.RESPONSE),
+    Metric("LimitCycleFrequency", "Hz", Source.RESPONSE),
+    Metric("StickShare", "1", Source.RESPONSE),
+    Metric("ValveTravel", "half travels", Source.METER),
+    Metric("FrictionSlope", "N*s/m", Source.LINEAR_LOOP),
+    Metric("SettlingMin", "{measured}", Source.RESPONSE, shown=False),
+    Metric("SettlingMax", "{measured}", Source.RESPONSE, shown=False),
+    Metric("OvershootFinal", "1", Source.RESPONSE, percent=True, shown=False),
+    Metric("Undershoot", "1", Source.RESPONSE, percent=True, shown=False),
+    Metric("Peak", "{measured}", Source.RESPONSE, shown=False),
+    Metric("PeakTime", "s", Source.RESPONSE, shown=False),
+    Metric("SteadyStateValue", "{measured}", Source.RESPONSE, shown=False),
+)
+METRICS: Mapping[str, Metric] = {
+    metric.name: metric
+    for source in Source
+    for metric in (*(kind.metric for kind in REQUIREMENT_KINDS), *_FIGURES)
+    if metric.source is source
+}
+"""By name every metric, source by source: those that a requirement may limit, and the further figures of `evaluate`."""
 
 
 def upper_limit(requirement: Requirement) -> float:
     """The largest allowed value of `requirement_values`: a margin's is the reciprocal of its `min`; inf without."""
-    if isinstance(requirement, MINIMUM_REQUIREMENTS):
-        return inf if requirement.min is None else 1 / requirement.min
-    return inf if requirement.max is None else requirement.max
+    limit = user_limit(requirement)
+    if limit is None:
+        return inf
+    return 1 / limit if requirement.metric.sense is Sense.AT_LEAST else limit
 
 
 def describe_value(requirement: Requirement, value: float) -> tuple[str, str]:
@@ -339,38 +277,41 @@ def describe_value(requirement: Requirement, value: float) -> tuple[str, str]:
 
     Examples
     --------
-    >>> told(GainMargin(min=2.0), 1 / 1.8), told(Overshoot(max=0.05), 0.06)
+    >>> describe_value(GainMargin(min=2.0), 1 / 1.8), describe_value(Overshoot(max=0.05), 0.06)
     (('1.8', 'at least 2'), ('0.06', 'allowed 0.05'))
     """
-    limit = (
-        f"at least {requirement.min:.6g}"
-        if isinstance(requirement, MINIMUM_REQUIREMENTS)
-        else f"allowed {requirement.max:.6g}"
-    )
-    return f"{user_value(requirement, value):.6g}", limit
+    words = "at least" if requirement.metric.sense is Sense.AT_LEAST else "allowed"
+    return f"{user_value(requirement, value):.6g}", f"{words} {user_limit(requirement):.6g}"
 
 
 def user_value(requirement: Requirement, value: float) -> float:
     """A value as `requirement_values` gives it, as the user writes it: a margin itself."""
-    if isinstance(requirement, MINIMUM_REQUIREMENTS):
+    if requirement.metric.sense is Sense.AT_LEAST:
         return 1 / value if value else inf
     return value
 
 
 def user_limit(requirement: Requirement) -> float | None:
     """The limit as the user writes it, `max` or `min`."""
-    return requirement.min if isinstance(requirement, MINIMUM_REQUIREMENTS) else requirement.max
+    limit: float | None = getattr(requirement, requirement.metric.sense.value)
+    return limit
 
 
 def with_user_limit(requirement: Requirement, limit: float | None) -> Requirement:
     """The same with another limit, as the user writes it, `max` or `min`, by copy."""
-    key: dict[str, Any] = {"min" if isinstance(requirement, MINIMUM_REQUIREMENTS) else "max": limit}
-    return replace(requirement, **key)
+    key: dict[str, Any] = {requirement.metric.sense.value: limit}
+    same: Any = requirement
+    return replace(same, **key)  # type: ignore[no-any-return]
+
+
+def with_upper_limit(requirement: Requirement, value: float) -> Requirement:
+    """The same with another largest value of `requirement_values`, by copy."""
+    return with_user_limit(requirement, 1 / value if requirement.metric.sense is Sense.AT_LEAST else value)
 
 
 def metric_name(requirement: Requirement) -> str:
     """The metric that a requirement reads, a column of `evaluate`."""
-    return type(requirement).__name__
+    return requirement.metric.name
 
 
 def requirement_values(metrics: Mapping[str, Value]) -> dict[str, Value]:
@@ -378,19 +319,15 @@ def requirement_values(metrics: Mapping[str, Value]) -> dict[str, Value]:
 
     Fractions where metrics are in percent; a margin's reciprocal, of a gain margin below one the margin itself.
     """
-    return {k.__name__: _requirement_value(k, metrics[k.__name__]) for k in REQUIREMENT_KINDS if k.__name__ in metrics}
+    limited = (kind.metric for kind in REQUIREMENT_KINDS if kind.metric.name in metrics)
+    return {metric.name: metric.requirement_value(metrics[metric.name]) for metric in limited}
 
 
-def _requirement_value(kind: type, metric: Value) -> Value:
-    with np.errstate(divide="ignore"):
-        if kind is GainMargin:
-            return np.exp(-np.abs(np.log(metric)))  # type: ignore[no-any-return]
-        if kind is PhaseMargin:
-            return np.divide(1.0, np.abs(metric))  # type: ignore[no-any-return]
-    return metric / (100 if kind.__name__ in PERCENT_METRICS else 1)
+def larger_is_better(metric: str) -> bool:
+    """Whether the smallest value of a metric, a row of `evaluate`, is the worst."""
+    return metric in METRICS and METRICS[metric].sense is Sense.AT_LEAST
 
 
-def _check_limit(requirement: Requirement, least: float) -> None:
-    limit = getattr(requirement, "max", None)
-    wrong = limit is not None and not least < limit < inf
-    require(not wrong, f"{metric_name(requirement)}: max must be above {least:g} and finite, got {limit}")
+def percent_factor(metric: str) -> float:
+    """A metric, a row of `evaluate`, over the fraction that a limit on it is: 100 where it counts in percent."""
+    return METRICS[metric].factor if metric in METRICS else 1

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from math import inf
 
 from pneuopt.evaluation.requirements import (
-    MINIMUM_REQUIREMENTS,
     REQUIREMENT_KINDS,
     EnvelopeBounds,
     MaxComplementarySensitivity,
@@ -18,6 +17,7 @@ from pneuopt.evaluation.requirements import (
     StepEnvelope,
     metric_name,
     upper_limit,
+    with_upper_limit,
 )
 from pneuopt.quantities.errors import require
 
@@ -122,10 +122,8 @@ def specify(
     for q, weight in weights.items():
         require(0 < weight < inf, f"the weight of {metric_name(q)} must be positive, got {weight:g}")
     for q in subject_to:
-        bound = "min" if isinstance(q, MINIMUM_REQUIREMENTS) else "max"
-        require(
-            upper_limit(q) < inf, f"{metric_name(q)} in subject_to has no limit; write {metric_name(q)}({bound}=...)"
-        )
+        told = f"{metric_name(q)} in subject_to has no limit; write {metric_name(q)}({q.metric.sense.value}=...)"
+        require(upper_limit(q) < inf, told)
     terms = [metric_name(q) for q in weights]
     require(len(set(terms)) == len(terms), f"minimise names a kind of requirement twice: {', '.join(terms)}")
     bands = {q.band for q in (*weights, *subject_to) if isinstance(q, SettlingTime)}
@@ -156,10 +154,3 @@ def _check_envelope(tube: EnvelopeBounds, requirements: Sequence[Requirement], b
             t, lower, _ = max(tube, key=lambda row: row[1])
             told = f"StepEnvelope: from {t:g} s on the lower bound is {lower:g}, Overshoot allows {1 + q.max:g}"
             require(lower <= 1 + q.max, f"{told}; lower the bound, or raise Overshoot's max")
-
-
-def with_upper_limit(requirement: Requirement, value: float) -> Requirement:
-    """The same with another largest value, by copy."""
-    if isinstance(requirement, MINIMUM_REQUIREMENTS):
-        return replace(requirement, min=1 / value)
-    return replace(requirement, max=value)

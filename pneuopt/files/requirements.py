@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.evaluation.requirements import REQUIREMENT_KINDS, Requirement
+from pneuopt.evaluation.metric import Requirement
+from pneuopt.evaluation.requirements import REQUIREMENT_KINDS
 from pneuopt.quantities.errors import UnitError, require
 from pneuopt.quantities.units import read_value
 
@@ -13,6 +14,8 @@ REQUIREMENTS_BY_KEY: Mapping[str, type[Requirement]] = {
     re.sub("(?<=[a-z])(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in REQUIREMENT_KINDS
 }
 """By its key each kind of requirement."""
+
+NORMAL_VOLUME = "(ANR)"  # what a volume of air is followed by that counts at ISO 8778's state
 
 
 def bound_units(loop: ClosedLoop) -> dict[str, str]:
@@ -28,20 +31,8 @@ def bound_units(loop: ClosedLoop) -> dict[str, str]:
     ('N', 'm/s', '1')
     """
     command, measured = loop.command.unit, loop.feedback.unit.partition("(")[0]
-    times = dict.fromkeys(("settling_time", "rise_time", "iae", "ise"), "s")
-    return (
-        dict.fromkeys(REQUIREMENTS_BY_KEY, "1")
-        | times
-        | {
-            "itae": "s^2",
-            "ripple": measured,
-            "air_use": "l",
-            "peak_control": command,
-            "control_rate": f"{command}/s",
-            "phase_margin": "deg",
-            "noise_gain": f"{command}/({measured})",
-        }
-    )
+    units = {key: kind.metric.unit_in(command, measured) for key, kind in REQUIREMENTS_BY_KEY.items()}
+    return {key: unit.removesuffix(NORMAL_VOLUME) for key, unit in units.items()}
 
 
 def read_bound(key: str, given: Any, unit: str, where: str) -> float:
@@ -62,8 +53,8 @@ def read_bound(key: str, given: Any, unit: str, where: str) -> float:
     UnitError
         If it cannot be read.
     """
-    if key == "air_use":
-        normal = isinstance(given, str) and given.strip().endswith("(ANR)")
+    if REQUIREMENTS_BY_KEY[key].metric.unit.endswith(NORMAL_VOLUME):
+        normal = isinstance(given, str) and given.strip().endswith(NORMAL_VOLUME)
         require(normal, f'{where}: {given!r}: air is counted at 20 degC and 100 kPa (ANR): "2 l(ANR)"', UnitError)
-        given = given.strip().removesuffix("(ANR)")
+        given = given.strip().removesuffix(NORMAL_VOLUME)
     return read_value(given, unit, where=where)

@@ -11,7 +11,8 @@ import tomlkit
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
-from pneuopt.evaluation.requirements import MINIMUM_REQUIREMENTS, EnvelopeBounds, Requirement
+from pneuopt.evaluation.metric import Requirement
+from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.loop import LOOP_SECTIONS, TUNABLE_SECTIONS, construct_at, read_fixed_value, read_loop_sections
@@ -211,7 +212,7 @@ def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path
     units, found = bound_units(loop), []
     for key, given in table.get("limits", {}).items():
         spot = f"{where} {key}"
-        bound = "min" if issubclass(REQUIREMENTS_BY_KEY[key], MINIMUM_REQUIREMENTS) else "max"
+        bound = REQUIREMENTS_BY_KEY[key].metric.sense.value
         entry = given if isinstance(given, dict) else {bound: given}
         check_names("key", entry, (bound, *_extra_keys(key)), spot)
         require(bound in entry or key == "step_envelope", f"{spot} says no {bound}")

@@ -24,10 +24,11 @@ from pneuopt.evaluation.requirements import (
     upper_limit,
     user_limit,
     user_value,
+    with_upper_limit,
     with_user_limit,
 )
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
-from pneuopt.evaluation.specification import Specification, with_upper_limit
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet

@@ -15,14 +15,8 @@ from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.means import TAIL_SHARE
-from pneuopt.evaluation.requirements import (
-    MINIMUM_REQUIREMENTS,
-    Requirement,
-    SettlingTime,
-    metric_name,
-    upper_limit,
-    user_limit,
-)
+from pneuopt.evaluation.metric import Requirement, Sense
+from pneuopt.evaluation.requirements import SettlingTime, metric_name, upper_limit, user_limit, with_user_limit
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
@@ -42,8 +36,7 @@ def relaxation_specification(
     as the searches' penalties are.
     """
     limits, horizon = limits_with_settling(spec, references), min(r.horizon - r.at for r in references)
-    term: dict[str, Any] = {"min" if isinstance(requirement, MINIMUM_REQUIREMENTS) else "max": None}
-    weights = {replace(requirement, **term): horizon / upper_limit(requirement)}
+    weights = {with_user_limit(requirement, None): horizon / upper_limit(requirement)}
     return replace(spec, weights=weights, limits=tuple(q for q in limits if q is not requirement))
 
 
@@ -121,7 +114,7 @@ def relaxation_row(
     gains = dict(zip(names, point.tolist(), strict=True)) if np.isfinite(value) else dict.fromkeys(names, nan)
     if requirement is None:
         return {"asked": nan, "needed": nan, "share": _round_outwards(value, upwards=True), **gains}
-    asked, least = user_limit(requirement), isinstance(requirement, MINIMUM_REQUIREMENTS)
+    asked, least = user_limit(requirement), requirement.metric.sense is Sense.AT_LEAST
     assert asked is not None
     needed = _round_outwards(value, upwards=not least)
     return {"asked": asked, "needed": needed, "share": (asked - needed if least else needed - asked) / asked, **gains}

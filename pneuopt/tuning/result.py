@@ -11,9 +11,9 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import (
-    MINIMUM_REQUIREMENTS,
-    Requirement,
+    REQUIREMENT_KINDS,
     describe_value,
     metric_name,
     requirement_values,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 MAX_CERTIFIED_EXCESS = 0.01  # relative excess of the certified over the claimed settling time
 ACTIVE_ROOM = 0.02  # of a limit, the room within which it counts as reached
 RELAXATION_COLUMNS = ("asked", "needed", "share")
-TABLE_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "MaxSensitivity")
+TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.metric.headline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +258,7 @@ def _requirement_row(requirement: Requirement, claimed: "pd.DataFrame", certifie
     k = [int(np.argmax(np.where(np.isnan(v), np.inf, v))) for v in values]
     claim, proof = (float(v[i]) for v, i in zip(values, k, strict=True))
     limit, allowed = user_limit(requirement), upper_limit(requirement)
-    least = isinstance(requirement, MINIMUM_REQUIREMENTS)
+    least = requirement.metric.sense is Sense.AT_LEAST
     room = nan if limit is None else (user_value(requirement, proof) * allowed - 1 if least else 1 - proof / allowed)
     return {
         "claimed": user_value(requirement, claim),

@@ -12,7 +12,8 @@ from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.cases import cases
-from pneuopt.evaluation.requirements import MINIMUM_REQUIREMENTS, ROBUSTNESS_REQUIREMENTS, requirement_values
+from pneuopt.evaluation.metric import Source
+from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS, larger_is_better, requirement_values
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
@@ -31,7 +32,9 @@ from pneuopt.tuning.space import (
 )
 
 RUNAWAY_LEVEL = 1e12
-BASE_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl", "Ripple", "Excess")
+HEADLINES = {name: metric.source is Source.LINEAR_LOOP for name, metric in METRICS.items() if metric.headline}
+BASE_METRICS = (*(name for name, linear in HEADLINES.items() if not linear), "Ripple", "Excess")
+BASE_MARGINS = tuple(name for name, linear in HEADLINES.items() if linear)
 MAX_MIXED_LANES = 32  # lanes: different references then share the lanes of a processor, the shorter ones padded
 MAX_CHUNK_LANES = 128  # lanes that are run, and read, at a time: what a processor's cache holds
 COARSE_SAMPLES_A_PERIOD = (
@@ -70,9 +73,9 @@ class Simulator:
         scenarios: Scenarios = NO_SCENARIOS,
         spec: Specification | None = None,
     ) -> None:
-        linearised, kinds = [k.__name__ for k in ROBUSTNESS_REQUIREMENTS], spec.kinds if spec else ()
+        linearised, kinds = [k.metric.name for k in ROBUSTNESS_REQUIREMENTS], spec.kinds if spec else ()
         self.response_metrics = tuple(dict.fromkeys((*BASE_METRICS, *(k for k in kinds if k not in linearised))))
-        self.margin_metrics = tuple(dict.fromkeys(("MaxSensitivity", *(k for k in kinds if k in linearised))))
+        self.margin_metrics = tuple(dict.fromkeys((*BASE_MARGINS, *(k for k in kinds if k in linearised))))
         self._envelope = spec.envelope if spec else ()
         self._wider: tuple[float, ...] = ()
         self.cases = cases(references, scenarios, space.parameters, space.names)
@@ -350,8 +353,7 @@ class Responses:
     def margin_metrics(self, rows: Mask) -> dict[str, Array]:
         """Margins and peaks of some candidates, a column a case; NaN and infinite where the response runs away."""
         measured, names = self._measured, self._simulator.margin_metrics
-        absent = {k.__name__: np.nan for k in MINIMUM_REQUIREMENTS}
-        found = {n: np.full(len(measured.sound), absent.get(n, np.inf)) for n in names}
+        found = {n: np.full(len(measured.sound), np.nan if larger_is_better(n) else np.inf) for n in names}
         row, case = np.nonzero(self._lanes)
         wanted = measured.sound & rows[row]
         if wanted.any():

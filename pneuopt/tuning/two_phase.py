@@ -19,6 +19,8 @@ from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
 from pneuopt.evaluation.margins import frequency_grid, sensitivity_terms
 from pneuopt.evaluation.means import TAIL_SHARE
 from pneuopt.evaluation.requirements import (
+    METRICS,
+    REQUIREMENT_KINDS,
     MaxSensitivity,
     Overshoot,
     PeakControl,
@@ -37,7 +39,7 @@ from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, regular_nodes
 from pneuopt.tuning.space import RK4_MAX_H_LAMBDA, Space, fastest_eigenvalue, rk4_substeps
 
-EXACT_REQUIREMENTS = (Overshoot, SteadyStateError, PeakControl, MaxSensitivity)
+EXACT_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.exact and kind is not SettlingTime)
 UNKNOWN_UPPER_BOUNDS = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
 SETTLING_PARAMETER = "SettlingTime"
 BAND_PARAMETER = "band.share"  # of the settling band as transcribed: a number that a continuation may move
@@ -119,7 +121,7 @@ def check_exact(spec: Specification) -> None:
 
 
 def _inexact_requirements(spec: Specification) -> list[str]:
-    return [n for n in spec.kinds if n not in {k.__name__ for k in (SettlingTime, *EXACT_REQUIREMENTS)}]
+    return [n for n in spec.kinds if not METRICS[n].exact]
 
 
 def without_clip(loop: ClosedLoop) -> ClosedLoop:
@@ -365,7 +367,7 @@ def _sensitivity_frequencies(loop: ClosedLoop, averaged: ParameterSet, point: Ar
 
 def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:
     q = ca.SX.sym("q", len(parameters))
-    terms = {kind.__name__: spec.weight(kind) for kind in (SettlingTime, *EXACT_REQUIREMENTS)}
+    terms = {kind.metric.name: spec.weight(kind) for kind in REQUIREMENT_KINDS if kind.metric.exact}
     return tuple(
         Cost(n, ca.Function("cost", [q], [q[list(parameters).index(n)]]), Where.PARAMETERS, weight=weight)
         for n, weight in terms.items()

@@ -12,14 +12,8 @@ from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import (
-    MINIMUM_REQUIREMENTS,
-    PERCENT_METRICS,
-    REQUIREMENT_KINDS,
-    Requirement,
-    metric_name,
-    upper_limit,
-)
+from pneuopt.evaluation.metric import Requirement
+from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, user_limit
 from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.quantities.arrays import Array
@@ -32,7 +26,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SUMMARY_PERCENTILE = 95.0  # [%]
-LARGER_IS_BETTER = tuple(kind.__name__ for kind in MINIMUM_REQUIREMENTS)  # metrics of which the smallest is the worst
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +126,7 @@ def _simulate_plants(
     simulator = Simulator(loop, steps, Space(parameters, ()), scenarios, spec)
     rows = simulator.table(np.zeros(0), spec)
     found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
-    shown = [kind.__name__ for kind in REQUIREMENT_KINDS if kind.__name__ in spec.kinds]
+    shown = [name for name in METRICS if name in spec.kinds]
     return _worst_by_plant(found.loc[shown, found.columns[len(steps) :]], list(scenarios), len(steps))
 
 
@@ -154,7 +147,7 @@ def _worst_value(values: Array, metric: str) -> float:
 
 def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
     """From the best to the worst; what is no number is the worst."""
-    cost = -values if metric in LARGER_IS_BETTER else values
+    cost = -values if larger_is_better(metric) else values
     return np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
 
 
@@ -186,12 +179,11 @@ def _quantile(values: Array, metric: str, percent: float) -> float:
 
 def _metric_limit(requirement: Requirement) -> float:
     """As the metric counts: percent where it does, a margin itself."""
-    if isinstance(requirement, MINIMUM_REQUIREMENTS):
-        return 1 / upper_limit(requirement)
-    return upper_limit(requirement) * (100 if metric_name(requirement) in PERCENT_METRICS else 1)
+    limit = user_limit(requirement)
+    return math.nan if limit is None else requirement.metric.factor * limit
 
 
 def _keeps_limit(values: Array, limit: float, metric: str) -> NDArray[np.bool_]:
     if math.isnan(limit):
         return np.isfinite(values)
-    return np.asarray(values >= limit if metric in LARGER_IS_BETTER else values <= limit)
+    return np.asarray(values >= limit if larger_is_better(metric) else values <= limit)

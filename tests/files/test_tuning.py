@@ -207,7 +207,7 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
         ("{ weight = 2 }", "{ band = 0.1 }", "[minimise] overshoot: unknown key 'band'"),
         ('band = "2 %"', 'band = "3 %"', "[minimise] and [limits]: settling bands differ: [0.02, 0.03]"),
         ('"5 %"', '"5 mm"', "[limits] overshoot: unit 'mm' does not measure '1'"),
-        ('"5 %"', '"500 %"', "[limits] overshoot: Overshoot: max is a fraction below 1"),
+        ('"5 %"', '"500 %"', "[limits] overshoot: Overshoot: max must be above 0 and below 1, a fraction"),
         ("= 1.6", "= 0.9", "[limits] max_sensitivity: MaxSensitivity: max must be above 1"),
         ('max = "500 ms", ', "", "[limits] settling_time says no max"),
         ('"4500 mV"', "4.5", '[limits] peak_control: 4.5 has no unit; write "4.5 V"'),
@@ -359,7 +359,7 @@ def test_every_kind_of_requirement_has_a_key_and_its_units(tmp_path: Path) -> No
     [
         ("gain_margin = 2.5", "gain_margin = { max = 2.5 }", "[limits] gain_margin: unknown key 'max'"),
         ("gain_margin = 2.5", "gain_margin = {}", "[limits] gain_margin says no min"),
-        ("gain_margin = 2.5", "gain_margin = 0.5", "[limits] gain_margin: GainMargin: min is a factor above 1"),
+        ("gain_margin = 2.5", "gain_margin = 0.5", "[limits] gain_margin: GainMargin: min must be above 1"),
         ('"45 deg"', "45", '[limits] phase_margin min: 45 has no unit; write "45 deg"'),
         ('"2 V/ms"', '"2 V"', "[limits] control_rate: unit 'V' does not measure 'V/s'"),
         ('[["0 s", "-10 %", "110 %"],', '[["0 s", "-10 %"],', "bounds: write instants with a lower and an upper"),

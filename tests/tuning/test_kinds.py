@@ -109,7 +109,7 @@ def test_what_cannot_be_kept_is_said_as_it_was_asked() -> None:
 def test_each_kind_is_an_objective(kind: type[Requirement]) -> None:
     """Whatever is minimised ends better than where another one is."""
     other = tuned(RiseTime(0.3), minimise=ControlRate())
-    best = tuned(RiseTime(0.3), minimise=kind())  # type: ignore[call-arg]
+    best = tuned(RiseTime(0.3), minimise=kind())
     assert best.status.converged, best.status
     loop, given = speed_loop()
     values = [
