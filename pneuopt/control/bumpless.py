@@ -50,8 +50,8 @@ def bumpless_transfer(
     >>> old = loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 9.0, "pid.b": 0.5})
     >>> new = old.with_values({"pid.Kp": 4.0})
     >>> before = loop.initial(old, reference=1.0)
-    >>> after = take_over(loop, before, old, new, reference=1.0)
-    >>> [loop.update(0, x, [1.0], loop.numbers(new))[-1].__float__() for x in (before, after)]
+    >>> after = bumpless_transfer(loop, before, old, new, reference=1.0)
+    >>> [loop.update(0, x, [1.0], loop.parameter_vector(new))[-1].__float__() for x in (before, after)]
     [0.0, 1.0]
     """
     loop.check(new)

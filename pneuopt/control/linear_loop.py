@@ -79,7 +79,7 @@ def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.comple
 
     Examples
     --------
-    >>> round(float(np.angle(delayed([1.0], 1.0), deg=True)[0]), 2)
+    >>> round(float(np.angle(pade_delay_response([1.0], 1.0), deg=True)[0]), 2)
     -57.22
     """
     s = 1j * np.asarray(omega, dtype=float) * dead_time

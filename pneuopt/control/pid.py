@@ -229,7 +229,7 @@ def unit_ratio(numerator: str, denominator: str) -> str:
 
     Examples
     --------
-    >>> ratio("V", "m/s"), ratio("V*s", "m/s"), ratio("V", "m/s*s"), ratio("N", "N"), ratio("1", "Pa(g)")
+    >>> unit_ratio("V", "m/s"), unit_ratio("V*s", "m/s"), unit_ratio("V", "m/s*s"), unit_ratio("N", "N"), unit_ratio("1", "Pa(g)")
     ('V*s/m', 'V*s^2/m', 'V/m', '1', '1/Pa')
     """
     powers = _unit_powers(_difference_unit(numerator))

@@ -59,7 +59,7 @@ def air_consumption(t: Array, flow: Array, spool: Array, start: float) -> dict[s
     A gram a second for two seconds, and a spool that opens and closes:
 
     >>> t = np.array([0.0, 1.0, 2.0])
-    >>> found = consumption(t, np.full((1, 3), 1e-3), np.array([[0.0, 0.5, 0.0]]), 0.0)
+    >>> found = air_consumption(t, np.full((1, 3), 1e-3), np.array([[0.0, 0.5, 0.0]]), 0.0)
     >>> round(found["AirUse"].item(), 4), found["ValveTravel"].item()
     (1.6878, 1.0)
     """

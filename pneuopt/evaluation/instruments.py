@@ -37,7 +37,7 @@ class Sensor:
 
         Examples
         --------
-        >>> round(Sensor(noise=2e-6, resolution=12e-6).spread * 1e6, 6)
+        >>> round(Sensor(noise=2e-6, resolution=12e-6).standard_deviation * 1e6, 6)
         4.0
         """
         return float(np.hypot(self.noise, self.resolution / np.sqrt(12)))
@@ -75,7 +75,7 @@ class Actuator:
         Examples
         --------
         >>> valve = Actuator(hysteresis=0.2)
-        >>> round(valve.follow(1.0, 0.0), 9), valve.follow(0.95, 0.9)
+        >>> round(valve.apply_hysteresis(1.0, 0.0), 9), valve.apply_hysteresis(0.95, 0.9)
         (0.9, 0.9)
         """
         half = self.hysteresis / 2

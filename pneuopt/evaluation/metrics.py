@@ -56,7 +56,7 @@ def step_metrics(
         Instant of the step [s].
     band : float
         Half width of the settling band, as a fraction.
-    about : About
+    band_centre : BandCentre
         Centre of the band.
     dither_period : float, optional
         Average over this time first, without phase shift [s]: a whole number of dither periods (`Dither.period`).

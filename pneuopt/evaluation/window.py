@@ -51,7 +51,7 @@ class DitherPeriodMean:
         Examples
         --------
         >>> t = np.linspace(0.0, 2.0, 21)[None]
-        >>> Window(0.5, 0.1).means(3 * t**2, t**3, 0.0)[0, 5].round(9).item()  # (0.75^3 - 0.25^3)/0.5
+        >>> DitherPeriodMean(0.5, 0.1).means(3 * t**2, t**3, 0.0)[0, 5].round(9).item()  # (0.75^3 - 0.25^3)/0.5
         0.8125
         """
         m, h, n = self.half_period_samples, self.spacing, signal.shape[1]

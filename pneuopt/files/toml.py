@@ -72,7 +72,7 @@ class FileLocations:
 
         Examples
         --------
-        >>> Places("drive.toml", '[valve]\nleak = 0.01  # tight').at("valve", "leak")
+        >>> FileLocations("drive.toml", '[valve]\nleak = 0.01  # tight').location("valve", "leak")
         'drive.toml:2'
         """
         head: tuple[str, ...] = ()

@@ -80,7 +80,7 @@ def propagate_error(result: EstimateSource, function: Callable[[ParameterValues]
     ...     estimates=pd.DataFrame({"value": [60.0, 40.0]}, index=names),
     ...     covariance=pd.DataFrame([[4.0, 0.0], [0.0, 1.0]], index=names, columns=names),
     ... )
-    >>> ratio = derived(fit, lambda p: p["static"] / p["coulomb"])
+    >>> ratio = propagate_error(fit, lambda p: p["static"] / p["coulomb"])
     >>> ratio.value, round(ratio.stderr, 4)
     (1.5, 0.0625)
     """

@@ -96,7 +96,7 @@ def plain_value(value: Any) -> Any:
 
     Examples
     --------
-    >>> plain({"a": (1, None, Path("b"))})
+    >>> plain_value({"a": (1, None, Path("b"))})
     {'a': [1, 'b']}
     """
     if isinstance(value, Mapping):

@@ -178,7 +178,7 @@ def si_conversion(unit_text: str, unit: str, *, where: str = "") -> tuple[float,
 
     Examples
     --------
-    >>> scale_of("mm", "m"), scale_of("bar(g)", "Pa(a)")
+    >>> si_conversion("mm", "m"), si_conversion("bar(g)", "Pa(a)")
     ((0.001, 0.0), (100000.0, 101325.0))
     """
     factor, offset = _exact_conversion(unit_text, unit, where)
@@ -190,7 +190,7 @@ def read_unit(text: str | float, unit: str) -> str:
 
     Examples
     --------
-    >>> unit_of("6 bar(g)", "Pa(a)"), unit_of(0.3, "1")
+    >>> read_unit("6 bar(g)", "Pa(a)"), read_unit(0.3, "1")
     ('bar(g)', '1')
     """
     return _split_number(text, "")[1] or unit

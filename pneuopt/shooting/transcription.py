@@ -194,7 +194,7 @@ def regular_nodes(n: int, samples: int) -> Indices:
 
     Examples
     --------
-    >>> every(10, 4).tolist()
+    >>> regular_nodes(10, 4).tolist()
     [0, 4, 8]
     """
     return np.arange(0, n, max(1, samples), dtype=np.intp)

@@ -115,14 +115,14 @@ def describe_confirmation(solution: Solution, before: float, after: float) -> st
 
     Examples
     --------
-    >>> from pneuopt.shooting.solution import Code, Status
+    >>> from pneuopt.quantities.status import Code, Status
     >>> from types import SimpleNamespace
     >>> done = SimpleNamespace(status=Status(Code.CONVERGED), stats={"cost": 0.2, "iterations": 8.0})
-    >>> told(done, 0.21, 0.2)
+    >>> describe_confirmation(done, 0.21, 0.2)
     'full space: bettered from 0.21 to 0.2 in 8 iterations'
-    >>> told(done, 0.201, np.inf)
+    >>> describe_confirmation(done, 0.201, np.inf)
     'full space: confirmed, a local optimum within 0.5 % after 8 iterations'
-    >>> told(done, 0.3, np.inf)
+    >>> describe_confirmation(done, 0.3, np.inf)
     "full space: ended in 0.2 after 8 iterations, which the simulation does not show; the search's 0.3 stands"
     """
     if not solution.status.converged:

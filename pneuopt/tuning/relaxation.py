@@ -136,7 +136,7 @@ def _round_outwards(value: float, *, upwards: bool) -> float:
 
     Examples
     --------
-    >>> _away(0.08112, upwards=True), _away(1.8467, upwards=False)
+    >>> _round_outwards(0.08112, upwards=True), _round_outwards(1.8467, upwards=False)
     (0.0812, 1.84)
     """
     if not 0 < abs(value) < inf:

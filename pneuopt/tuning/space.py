@@ -103,7 +103,7 @@ class Space:
         >>> from pneuopt.quantities.parameters import Parameter
         >>> gains = ParameterSet({"pid.Kp": Parameter(0.39661, "1", 0.0, 1.0, free=True)})
         >>> space = Space(gains, ("pid.Kp",))
-        >>> space.printed(space.start, 4).item(), space.neighbours(np.array([0.3966]), 4).ravel().tolist()
+        >>> space.round_point(space.start, 4).item(), space.neighbours(np.array([0.3966]), 4).ravel().tolist()
         (0.3966, [0.3965, 0.3967])
         """
         found = np.array(point)
@@ -129,7 +129,7 @@ class Space:
         --------
         >>> from pneuopt.quantities.parameters import Parameter
         >>> space = Space(ParameterSet({"pid.Kp": Parameter(0.4, "1", 0.0, 0.4001, free=True)}), ("pid.Kp",))
-        >>> space.around(space.start, 4).ravel().tolist()
+        >>> space.neighbourhood(space.start, 4).ravel().tolist()
         [0.3998, 0.3999, 0.4, 0.4001]
         """
         n, sides = len(printed), np.arange(-2, 3)

@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli.app import app
-from pneuopt.cli.app import identify_command as identifying
-from pneuopt.cli.app import tune_command as looping
+from pneuopt.cli import identify as identify_module
+from pneuopt.cli import tune as tune_module
 from pneuopt.cli.show_fits import show_estimates
 from pneuopt.cli.terminal import make_console
 from pneuopt.files.drive import read_drive, read_status
@@ -177,7 +177,7 @@ def test_an_interrupted_fit_is_written_and_marked(folder: Path, monkeypatch: pyt
 
         return LeastSquares(progress=stop)
 
-    monkeypatch.setattr(identifying, "LeastSquares", interrupting)
+    monkeypatch.setattr(identify_module, "LeastSquares", interrupting)
     result = run("identify drive.toml run_01.csv -o fit.toml")
     assert result.exit_code == 130
     assert result.stdout.startswith("NOT converged (interrupted): the best iterate so far")
@@ -192,7 +192,7 @@ def test_an_interruption_elsewhere_writes_nothing(folder: Path, monkeypatch: pyt
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(looping, "tune", interrupt)
+    monkeypatch.setattr(tune_module, "tune", interrupt)
     before = set(folder.iterdir())
     result = run("tune drive.toml tuning.toml -o tuned.toml")
     assert result.exit_code == 130
@@ -210,7 +210,7 @@ def test_an_interrupted_tuning_shows_the_best_so_far_and_writes_nothing(
 
         return tune(*args, **(options | {"progress": stop}))
 
-    monkeypatch.setattr(looping, "tune", stopped)
+    monkeypatch.setattr(tune_module, "tune", stopped)
     before = set(folder.iterdir())
     result = run("tune drive.toml tuning.toml -o tuned.toml --json tuned.json")
     assert result.exit_code == 130
@@ -222,7 +222,7 @@ def test_an_interrupted_tuning_shows_the_best_so_far_and_writes_nothing(
 
 def test_a_fit_that_fails_is_written_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = LeastSquares().stages[:1]
-    monkeypatch.setattr(identifying, "LeastSquares", lambda **_: LeastSquares(stages=few, tolerance=1e-9))
+    monkeypatch.setattr(identify_module, "LeastSquares", lambda **_: LeastSquares(stages=few, tolerance=1e-9))
     result = run("identify drive.toml run_01.csv -o fit.toml")
     assert result.exit_code == 1
     assert result.stdout.startswith("NOT converged")
@@ -256,8 +256,8 @@ def test_help_loads_nothing_heavy() -> None:
 def test_ctrl_c_ends_a_real_process_with_130(folder: Path) -> None:
     code = (
         "import os, signal\n"
-        "from pneuopt.commands import looping\n"
-        "looping.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
+        "from pneuopt.cli import tune\n"
+        "tune.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
         "from pneuopt.cli.app import main\n"
         "main()\n"
     )

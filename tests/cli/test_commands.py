@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli.app import app
-from pneuopt.cli.app import study_command as studying
+from pneuopt.cli import study as study_module
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
@@ -73,7 +73,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     with ThreadPoolExecutor(1) as executor:
-        monkeypatch.setattr(studying, "sweep", partial(sweep, executor=executor))
+        monkeypatch.setattr(study_module, "sweep", partial(sweep, executor=executor))
         yield tmp_path
 
 
@@ -86,7 +86,7 @@ def front(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     edit("tuning.toml", "[limits]", '[limits]\npeak_control = "120 N"')
     edit("tuning.toml", 'max = "1 s"', 'max = "250 ms"')
     (folder / "front.toml").write_text(FRONT, encoding="utf-8")
-    monkeypatch.setattr(studying, "pareto_front", partial(pareto_front, method=Screening(12, 6, (), 40)))
+    monkeypatch.setattr(study_module, "pareto_front", partial(pareto_front, method=Screening(12, 6, (), 40)))
     return folder
 
 
@@ -166,7 +166,7 @@ def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pyte
 
     with ThreadPoolExecutor(1) as executor:
         interrupted = partial(sweep, executor=executor)
-        monkeypatch.setattr(studying, "sweep", lambda *a, **k: interrupted(*a, **{**k, "progress": interrupt}))
+        monkeypatch.setattr(study_module, "sweep", lambda *a, **k: interrupted(*a, **{**k, "progress": interrupt}))
         result = run(LINE)
     assert result.exit_code == 130
     assert result.stdout.startswith("4 cases, each the worst of 2 references: 3 interrupted")
@@ -176,7 +176,7 @@ def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pyte
 
 def test_processes_do_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run("study study.toml -o threads.csv")
-    monkeypatch.setattr(studying, "sweep", sweep)
+    monkeypatch.setattr(study_module, "sweep", sweep)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     assert run("study study.toml -o processes.csv").exit_code == 0
     one, other = (pd.read_csv(f"{name}.csv").drop(columns="seconds [s]") for name in ("threads", "processes"))
@@ -269,7 +269,7 @@ def table(*errors: str) -> pd.DataFrame:
 def test_designs_that_fail_are_rows_of_a_front(
     front: Path, monkeypatch: pytest.MonkeyPatch, errors: tuple[str, ...], status: int, verdict: str
 ) -> None:
-    monkeypatch.setattr(studying, "pareto_front", lambda *_, **__: table(*errors))
+    monkeypatch.setattr(study_module, "pareto_front", lambda *_, **__: table(*errors))
     result = run(FRONT_LINE)
     assert result.exit_code == status
     assert result.stdout.startswith(f"{len(errors)} designs between Overshoot and PeakControl: {verdict}\n")

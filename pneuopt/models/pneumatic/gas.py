@@ -122,7 +122,7 @@ def clip_pressure_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoot
 
     Examples
     --------
-    >>> high, z, s = clipped_ratio(6e5, 5e5, 0.3, Smoothing())
+    >>> high, z, s = clip_pressure_ratio(6e5, 5e5, 0.3, Smoothing())
     >>> round(float(high)), round(float(z), 4)
     (600000, 0.238)
     """
