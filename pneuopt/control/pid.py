@@ -229,8 +229,8 @@ def unit_ratio(numerator: str, denominator: str) -> str:
 
     Examples
     --------
-    >>> unit_ratio("V", "m/s"), unit_ratio("V*s", "m/s"), unit_ratio("V", "m/s*s"), unit_ratio("N", "N"), unit_ratio("1", "Pa(g)")
-    ('V*s/m', 'V*s^2/m', 'V/m', '1', '1/Pa')
+    >>> [unit_ratio(*pair) for pair in (("V", "m/s"), ("V*s", "m/s"), ("V", "m/s*s"), ("N", "N"), ("1", "Pa(g)"))]
+    ['V*s/m', 'V*s^2/m', 'V/m', '1', '1/Pa']
     """
     powers = _unit_powers(_difference_unit(numerator))
     for name, power in _unit_powers(_difference_unit(denominator)).items():

@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
-from pneuopt.cli.app import app
 from pneuopt.cli import identify as identify_module
 from pneuopt.cli import tune as tune_module
+from pneuopt.cli.app import app
 from pneuopt.cli.show_fits import show_estimates
 from pneuopt.cli.terminal import make_console
 from pneuopt.files.drive import read_drive, read_status

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner, Result
 
-from pneuopt.cli.app import app
 from pneuopt.cli import study as study_module
+from pneuopt.cli.app import app
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
