@@ -85,8 +85,9 @@ _HOME = {
     "pneuopt.dynamics.simulate": ("StickSlipResult", "contacts", "simulate", "simulate_stick_slip"),
     "pneuopt.evaluation.instruments": ("Actuator", "Sensor"),
     "pneuopt.evaluation.rig": ("Recording", "Rig", "record"),
-    "pneuopt.identification.identify": ("IdentificationResult", "identify", "predict", "validate"),
-    "pneuopt.identification.identifiability": ("Verdict", "identifiability"),
+    "pneuopt.identification.identify": ("identify", "predict", "validate"),
+    "pneuopt.identification.identifiability": ("identifiability",),
+    "pneuopt.identification.result": ("IdentificationResult", "Verdict"),
     "pneuopt.identification.profiles": ("Profile", "profile"),
     "pneuopt.identification.propagation": ("PropagatedValue", "propagate_error"),
     "pneuopt.evaluation.requirements": (

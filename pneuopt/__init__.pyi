@@ -52,11 +52,12 @@ from pneuopt.evaluation.scenarios import Factor, apply_scenario, corners, draws,
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.files.tuning import read_tuning, write_tuned
 from pneuopt.identification.compare_logs import LogComparison, compare_logs
-from pneuopt.identification.identifiability import Verdict, identifiability
-from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.identifiability import identifiability
+from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.losses import Huber, SoftL1
 from pneuopt.identification.profiles import Profile, profile
 from pneuopt.identification.propagation import PropagatedValue, propagate_error
+from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.identification.select_model import ModelSelection, select_model
 from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.models.drive import ForceDrive, MotionDrive

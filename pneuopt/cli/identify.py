@@ -21,8 +21,9 @@ from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import read_drive, write_fit
-from pneuopt.identification.identifiability import Verdict, identifiability
-from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.identifiability import identifiability
+from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiments import Experiment, read_log, split
 from pneuopt.models.declaration import Drive

@@ -14,7 +14,7 @@ from pneuopt.cli.terminal import make_console, show_output_files
 from pneuopt.evaluation.requirements import EnvelopeBounds, SettlingTime, StepEnvelope
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
-from pneuopt.identification.identify import IdentificationResult
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.plotting import check_figure_path, save_figure
 from pneuopt.quantities.output import check_output_paths, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet

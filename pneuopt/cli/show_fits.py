@@ -7,8 +7,7 @@ from rich.console import Console
 from rich.text import Text
 
 from pneuopt.cli.terminal import format_number, new_table
-from pneuopt.identification.identifiability import Verdict
-from pneuopt.identification.review import UNIDENTIFIABLE_NOTE
+from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
 from pneuopt.identification.select_model import ModelSelection
 
 if TYPE_CHECKING:

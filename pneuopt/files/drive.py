@@ -6,7 +6,7 @@ Which kinds of drive there are, and which sections and keys each has, is declare
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import tomlkit
 
@@ -21,44 +21,13 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import read_value
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from pneuopt.identification.identifiability import Verdict
+    from pneuopt.identification.result import IdentificationResult
 
 FIT_SECTIONS = ("estimates", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
 _DRIVE_SECTION = {"drive": {"kind": choice(DRIVE_KINDS)}}
-
-
-class WritableFit(Protocol):
-    """What `write_fit` needs of a result."""
-
-    @property
-    def parameters(self) -> ParameterSet:
-        """All parameters, the free ones as found."""
-        ...
-
-    @property
-    def estimates(self) -> "pd.DataFrame":
-        """A row a free parameter."""
-        ...
-
-    @property
-    def status(self) -> Status:
-        """How it ended."""
-        ...
-
-    @property
-    def verdict(self) -> "Verdict | None":
-        """What the logs do not tell, and why."""
-        ...
-
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        """Versions, options, the data's sha256."""
-        ...
 
 
 def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
@@ -117,10 +86,10 @@ def read_status(path: str | Path) -> Status | None:
     return Status(Code(said["code"]), str(said.get("message", "")))
 
 
-def write_fit(path: str | Path, source: str | Path, result: WritableFit) -> None:
+def write_fit(path: str | Path, source: str | Path, result: "IdentificationResult") -> None:
     """Write a drive's file with the values found: the user's text and comments, [estimates], [status], [verdict], ...
 
-    A parameter that the logs do not tell keeps its given value and text (see `IdentificationResult`).
+    An unidentifiable parameter keeps its given value and text (see `IdentificationResult`).
 
     Parameters
     ----------
@@ -128,8 +97,7 @@ def write_fit(path: str | Path, source: str | Path, result: WritableFit) -> None
         `read_drive` reads it; a result that did not converge is written, too, and `read_status` says so.
     source : str or Path
         The drive.toml that the result was made from.
-    result : Fitted
-        An `IdentificationResult`, say.
+    result : IdentificationResult
 
     Raises
     ------

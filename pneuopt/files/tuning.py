@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import tomlkit
 
@@ -22,11 +22,10 @@ from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_tab
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import Status
 from pneuopt.quantities.units import read_value
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from pneuopt.tuning.result import TuningResult
 
 TuningSections = Mapping[str, Any]
 
@@ -65,30 +64,6 @@ class Tuning:
     validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
 
 
-class WritableTuning(Protocol):
-    """What `write_tuned` needs of a result."""
-
-    @property
-    def parameters(self) -> ParameterSet:
-        """All parameters, the free ones as tuned."""
-        ...
-
-    @property
-    def certified(self) -> "pd.DataFrame":
-        """A row a metric, a column a reference."""
-        ...
-
-    @property
-    def status(self) -> Status:
-        """How it ended."""
-        ...
-
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        """Versions, options, what it was made from."""
-        ...
-
-
 def read_tuning(path: str | Path, plant: System) -> Tuning:
     """Read a tuning for a plant, whose signals set the units.
 
@@ -122,7 +97,7 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     return Tuning(loop, _references(table, loop, path), parameters, minimise, subject_to, *drawn)
 
 
-def write_tuned(path: str | Path, source: str | Path, result: WritableTuning) -> None:
+def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") -> None:
     """Write a tuning's file with the gains found: the user's text and comments, [certified], [status], [provenance].
 
     Parameters
@@ -131,8 +106,7 @@ def write_tuned(path: str | Path, source: str | Path, result: WritableTuning) ->
         `read_tuning` reads it. A result that is not certified leaves the old gains in it, and the status says so.
     source : str or Path
         The tuning.toml that the result was made from.
-    result : Tuned
-        A `TuningResult`, say.
+    result : TuningResult
 
     Raises
     ------

@@ -10,8 +10,9 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import System
 from pneuopt.identification.checks import check_logs
-from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.identify import identify
 from pneuopt.identification.problem import as_estimation_model
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet

@@ -5,7 +5,7 @@ Nothing here knows what the system is: it hands over its starts (`System.starts`
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,14 +22,14 @@ from pneuopt.identification.checks import (
     emit_log_warnings,
     outputs_in_log,
 )
-from pneuopt.identification.identifiability import Verdict
-from pneuopt.identification.losses import Loss, Refit, fit_robustly, white_chi_square
-from pneuopt.identification.multistart import multistart
+from pneuopt.identification.losses import Loss
+from pneuopt.identification.multistart import fit_from_starts
 from pneuopt.identification.problem import (
     EstimationProblem,
     apply_conditions,
     as_estimation_model,
 )
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.review import review_fit
 from pneuopt.identification.statistics import (
     agreement,
@@ -38,6 +38,7 @@ from pneuopt.identification.statistics import (
     cross_correlation,
     ljung_box,
 )
+from pneuopt.identification.unidentifiable import rests_on_prior
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
@@ -45,56 +46,12 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_PRIOR_VARIANCE_SHARE = 0.1  # of a variance: what rests on a prior by more than that, the logs do not tell
 NOTHING_IDENTIFIABLE = "the logs tell none of the free parameters by itself; fix some, or log runs that tell them apart"
-ACCEPTED_CHI_SQUARE_RATIO = (
-    1.05  # squared residuals a sample, in noise variances, up to which no other start is tried (NUMERICS 3.6)
-)
-
-
-@dataclass(frozen=True, eq=False)
-class IdentificationResult:
-    """What `identify` found.
-
-    Attributes
-    ----------
-    parameters : ParameterSet
-        The system's, with the given values and the estimates; a `per_log` parameter keeps its given value here, and so
-        does one that the logs do not tell, unless they refuse that value or tell it only together with another: then
-        it is where the other estimates stand.
-    estimates : DataFrame
-        A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
-        at_bound, unit, source, note. The value is NaN where the note is "not told". No interval there, at a bound, or
-        without convergence. Where a linear interval would lie it is the profile likelihood's, infinite at an open end.
-        What is not told may lie a factor of ten from where it stays: the other intervals allow for that.
-    covariance : DataFrame
-        Of the estimates, scaled by the residuals' own level and correlation; NaN for what has no interval.
-    fit : DataFrame
-        A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit.
-    trajectories : mapping of str to Trajectory
-        Fitted states and outputs of each log.
-    status : Status
-    stats : mapping of str to float
-    provenance : mapping of str to str
-    verdict : Verdict
-        What the logs do not tell, why, and what run would: ``print(result.verdict)``.
-    """
-
-    parameters: ParameterSet
-    estimates: "pd.DataFrame"
-    covariance: "pd.DataFrame"
-    fit: "pd.DataFrame"
-    trajectories: Mapping[str, Trajectory]
-    status: Status
-    stats: Mapping[str, float]
-    provenance: Mapping[str, str]
-    verdict: Verdict | None = None
 
 
 def identify(
@@ -146,8 +103,8 @@ def identify(
     check_content(experiments)
     doubted = emit_log_warnings(model, experiments, parameters)
     problem = EstimationProblem(model, tuple(experiments), model.parameters | parameters, method)
-    found, label = _best_fit(problem, loss, estimate_noise=estimate_noise)
-    result = review_fit(found.problem, *_result(found, label, loss))
+    held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
+    result = review_fit(held, *_result(held, fit, label, loss))
     if doubted:
         result = replace(result, status=replace(result.status, message="; ".join((result.status.message, *doubted))))
     if throw and not result.status.converged:
@@ -214,32 +171,33 @@ def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) 
     method = LeastSquares()  # over the whole log in one segment, stiction would trap the start in a local optimum
     problem = EstimationProblem(system, (experiment,), fixed, method)
     start = problem.candidates()[0]
-    initial = solve_least_squares(problem.transcription(start), method).solution.trajectories[0]
+    initial = solve_least_squares(problem.transcription(start), method).trajectories[0]
     state = {s.name: float(initial[s.name][0]) for s in system.states}
     return simulate(system, inputs, known, initial=state)
 
 
-def _result(found: Refit, label: str, loss: Loss | None) -> tuple[IdentificationResult, tuple[str, ...]]:
+def _result(
+    problem: EstimationProblem, fit: Fit, label: str, loss: Loss | None
+) -> tuple[IdentificationResult, tuple[str, ...]]:
     """Read the solver's answer back into parameters and tables; and what the logs do not tell by themselves."""
-    problem, fit, solution = found.problem, found.fit, found.fit.solution
-    free = solution.parameters.free_names
-    estimates = problem.unknowns().with_values({n: solution.parameters.value(n) for n in free}).select(free)
+    free = fit.parameters.free_names
+    estimates = problem.unknowns().with_values({n: fit.parameters.value(n) for n in free}).select(free)
     shared = [n for n in free if n in problem.parameters]
-    values = {n: solution.parameters.value(n) for n in shared}
-    runs = {e.name: t for e, t in zip(problem.experiments, solution.trajectories, strict=True)}
+    values = {n: fit.parameters.value(n) for n in shared}
+    runs = {e.name: t for e, t in zip(problem.experiments, fit.trajectories, strict=True)}
     starts = len(problem.experiments) * len(problem.system.states)
-    squares = fit.chi_square if fit.jumps is None else 2 * solution.stats["cost"]
+    squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
     variance = squares / max(1, fit.count - len(free) - starts)
     correlated = max(
         _residual_correlation_time(problem.system, problem.experiments, runs), _jump_correlation_time(fit.jumps)
     )
-    covariance = None if fit.covariance is None else fit.covariance * variance * correlated * found.variance_inflation
+    covariance = None if fit.covariance is None else fit.covariance * variance * correlated * fit.variance_inflation
     leaning = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
-        leaning = np.diag(fit.prior_covariance) > MAX_PRIOR_VARIANCE_SHARE * np.diag(covariance)
+        leaning = rests_on_prior(covariance, fit.prior_covariance)
     untold = tuple(n for n, leans in zip(free, leaning, strict=True) if leans or n in problem.held)
-    status = Status(Code.NOT_CONVERGED, NOTHING_IDENTIFIABLE) if free and set(untold) == set(free) else solution.status
+    status = Status(Code.NOT_CONVERGED, NOTHING_IDENTIFIABLE) if free and set(untold) == set(free) else fit.status
     result = IdentificationResult(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, status),
@@ -247,7 +205,7 @@ def _result(found: Refit, label: str, loss: Loss | None) -> tuple[Identification
         _fit_table(problem.system, problem.experiments, runs),
         runs,
         status,
-        {**solution.stats, "chi_square_ratio": variance, "correlation_time": correlated},
+        {**fit.stats, "chi_square_ratio": variance, "correlation_time": correlated},
         {
             **provenance(problem.method, *([loss] if loss else [])),
             "start": label,
@@ -255,81 +213,6 @@ def _result(found: Refit, label: str, loss: Loss | None) -> tuple[Identification
         },
     )
     return result, untold
-
-
-def _best_fit(problem: EstimationProblem, loss: Loss | None, *, estimate_noise: bool) -> tuple[Refit, str]:
-    """The first candidate that converges at the noise's level; else the least cost, once two have found it, or of all.
-
-    A wrong basin can converge, too; its residuals then exceed the noise.
-    """
-    fits: list[tuple[Refit, str]] = []
-    interrupted, tightest = False, problem.method.stages[-1].gap
-    try:
-        for candidate in multistart(problem, lambda: _has_state_noise(fits[0][0].fit)):
-            found = fit_robustly(problem, candidate, loss, estimate_noise=estimate_noise)
-            if _explains_to_noise(found) and not found.problem.held:
-                return found, candidate.label
-            fits.append((found, candidate.label))
-            fits.sort(key=lambda each: _rank(each[0].fit, tightest))
-            interrupted = found.fit.solution.status.code is Code.INTERRUPTED
-            if interrupted or (len(fits) > 1 and _are_alike(fits[0][0].fit, fits[1][0].fit)):
-                break
-    except KeyboardInterrupt:
-        if not fits:
-            raise
-        interrupted = True
-    found, label = fits[0]
-    status = found.fit.solution.status
-    if interrupted and (len(fits) > 1 or status.code is not Code.INTERRUPTED):
-        status = Status(Code.INTERRUPTED, f"the best of {len(fits)} starts so far; run again for an answer")
-    elif not status.converged and len(fits) > 1:
-        status = Status(status.code, f"none of {len(fits)} starts will do; in the best, {status.message}")
-    if len(problem.experiments) > 1:
-        status = Status(status.code, f"{status.message}; compare_logs tells whether the logs are of one drive")
-    solution = replace(found.fit.solution, status=status)
-    return replace(found, fit=replace(found.fit, solution=solution)), label
-
-
-def _explains_to_noise(found: Refit) -> bool:
-    """Whether nothing better is to be found; a wrong basin of soft bristles has left 1.1 noise variances a sample.
-
-    Where the log states too little noise, the white part of the residuals is what is left of it.
-    """
-    fit = found.fit
-    if not fit.solution.status.converged or fit.jumps is not None:
-        return False
-    return (
-        fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
-        or fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * white_chi_square(found)
-    )
-
-
-def _has_state_noise(fit: Fit) -> bool:
-    """Whether it is the optimum of a model that the log's states do not quite follow."""
-    return fit.solution.status.converged and fit.jumps is not None
-
-
-def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
-    """The order of fits: by cost, but noise of the states explains too much to be compared with a fit without.
-
-    And so do the loose gaps, wider than the last stage's, in which an interruption may leave a search.
-    """
-    if fit.solution.status.code is Code.INTERRUPTED and fit.solution.stats["gap_deviation"] > tightest:
-        return 3, _fit_cost(fit)
-    if fit.jumps is not None:
-        return 1, _fit_cost(fit)
-    return 0 if 2 * _fit_cost(fit) <= MAX_CHI_SQUARE_RATIO * fit.count else 2, _fit_cost(fit)
-
-
-def _fit_cost(fit: Fit) -> float:
-    return fit.solution.stats["cost"]
-
-
-def _are_alike(best: Fit, second: Fit) -> bool:
-    """Whether both converged, at the same cost."""
-    converged = best.solution.status.converged and second.solution.status.converged
-    same = (best.jumps is None) == (second.jumps is None)
-    return converged and same and _fit_cost(second) <= 1.001 * _fit_cost(best)
 
 
 def _fit_table(system: Fittable, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":

@@ -11,10 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
-from pneuopt.identification.problem import EstimationProblem
-from pneuopt.identification.silence import REFIT_STAGES, fit_holding_unidentifiable
+from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.arrays import Array
@@ -101,32 +99,16 @@ class SoftL1:
         return np.asarray((1 + (r / self.threshold) ** 2) ** -1.5)
 
 
-@dataclass(frozen=True, eq=False)
-class Refit:
-    """A fit, and the problem with the weights and noise levels that it solved.
-
-    Attributes
-    ----------
-    problem : Problem
-    fit : Fit
-    variance_inflation : float
-        By how much the estimates' variance exceeds what the weighted squares say.
-    """
-
-    problem: EstimationProblem
-    fit: Fit
-    variance_inflation: float = 1.0
-
-
 def fit_robustly(
-    problem: EstimationProblem, candidate: Start, loss: Loss | None = None, *, estimate_noise: bool = False
-) -> Refit:
-    """Fit from one candidate; again with new weights and noise levels until neither they nor the estimates move.
+    problem: EstimationProblem, fit: Fit, loss: Loss | None = None, *, estimate_noise: bool = False
+) -> tuple[EstimationProblem, Fit]:
+    """Repeat a fit with new weights and noise levels until neither they nor the estimates move.
 
     Parameters
     ----------
-    problem : Problem
-    candidate : Start
+    problem : EstimationProblem
+    fit : Fit
+        Of that problem.
     loss : Loss, optional
     estimate_noise : bool
         Each channel's noise becomes the white part of its residuals (`noise_level`): what a wrong model leaves in them
@@ -134,62 +116,63 @@ def fit_robustly(
 
     Returns
     -------
-    Refit
-        Its spread is Huber's sandwich ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for all.
+    problem : EstimationProblem
+        With the weights and noise levels that the last fit was made with.
+    fit : Fit
+        With neither loss nor noise to estimate the same as before. Its `variance_inflation` is Huber's sandwich
+        ``E psi^2 / (E psi')^2`` over the mean weighted square, one factor for all.
     """
-    found = Refit(*fit_holding_unidentifiable(problem, candidate))
     if loss is None and not estimate_noise:
-        return found
+        return problem, fit
     warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
-    fits = [found.fit]
+    posed, fits = problem, [fit]
     for _ in range(MAX_REFITS):
-        if found.fit.solution.status.code in (Code.DIVERGED, Code.INTERRUPTED):
+        if fit.status.code in (Code.DIVERGED, Code.INTERRUPTED):
             break
-        before, found = found, _refit(found, loss, warm, estimate_noise=estimate_noise)
-        fits.append(found.fit)
-        if _is_stationary(before, found):
+        before, (posed, fit) = (posed, fit), _refit(posed, fit, loss, warm, estimate_noise=estimate_noise)
+        fits.append(fit)
+        if _is_stationary(before, (posed, fit)):
             break
-    return _summarise(replace(found, problem=replace(found.problem, method=problem.method)), fits, loss)
+    posed = replace(posed, method=problem.method)
+    return posed, _summarise(posed, fits, loss)
 
 
-def white_chi_square(found: Refit) -> float:
+def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
     """What the squared residuals of a fit would sum up to, in noise variances, were they white at their own level.
 
     A wrong basin leaves more, for what varies slowly does not count (`noise_level`). With weights of a loss, nothing.
     """
-    problem, runs, total = found.problem, _trajectories(found), 0.0
+    total = 0.0
     if problem.weights:
         return total
-    for e in problem.experiments:
-        levels = _estimate_noise(problem, e, runs[e.name]).noise
+    for e, run in zip(problem.experiments, fit.trajectories, strict=True):
+        levels = _estimate_noise(problem, e, run).noise
         for channel in outputs_in_log(problem.system, e):
             samples = int(np.isfinite(e.trajectory[channel]).sum())
             total += samples * (levels[channel] / e.noise[channel]) ** 2
     return total
 
 
-def _summarise(found: Refit, fits: Sequence[Fit], loss: Loss | None) -> Refit:
-    """The last fit with the effort of all, and a status that judges the bulk of the samples, not the outliers."""
-    solution = found.fit.solution
-    effort = {n: sum(fit.solution.stats[n] for fit in fits) for n in ("iterations", "seconds")}
-    status = solution.status
-    if loss is not None and status.converged and found.fit.jumps is None:
-        status = Status(status.code, _describe_outliers(found, len(fits)))
-    solution = replace(solution, stats={**solution.stats, **effort, "refits": len(fits) - 1.0}, status=status)
-    return replace(found, fit=replace(found.fit, solution=solution))
+def _summarise(problem: EstimationProblem, fits: Sequence[Fit], loss: Loss | None) -> Fit:
+    """The last fit with the effort of all, and a status that counts the bulk of the samples, not the outliers."""
+    fit = fits[-1]
+    effort = {n: sum(each.stats[n] for each in fits) for n in ("iterations", "seconds")}
+    status = fit.status
+    if loss is not None and status.converged and fit.jumps is None:
+        status = Status(status.code, _describe_outliers(problem, fit, len(fits)))
+    return replace(fit, stats={**fit.stats, **effort, "refits": len(fits) - 1.0}, status=status)
 
 
-def _describe_outliers(found: Refit, fits: int) -> str:
+def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> str:
     """In words: outliers, and what the model leaves beyond the noise in the other samples."""
     worst, level, beyond, count = "", 1.0, 0, 0
-    runs = _trajectories(found)
-    for e in found.problem.experiments:
-        residuals = _residuals_in_noise(found.problem, e, runs[e.name])
+    for e, run in zip(problem.experiments, fit.trajectories, strict=True):
+        residuals = _residuals_in_noise(problem, e, run)
         scales = _channel_scales(residuals)
         beyond += int(np.sum(np.abs(residuals) > OUTLIER_THRESHOLD * scales))
         count += int(np.isfinite(residuals).sum())
         if scales.max() > level:
-            level, channel = float(scales.max()), outputs_in_log(found.problem.system, e)[int(np.argmax(scales))]
+            level, channel = float(scales.max()), outputs_in_log(problem.system, e)[int(np.argmax(scales))]
             worst = f"{channel} of {e.name}"
     message = (
         f"{fits - 1} refits, {beyond} of {count} samples are outliers, beyond {OUTLIER_THRESHOLD:g} standard deviations"
@@ -201,25 +184,21 @@ def _describe_outliers(found: Refit, fits: int) -> str:
     )
 
 
-def _refit(found: Refit, loss: Loss | None, method: LeastSquares, *, estimate_noise: bool) -> Refit:
-    problem, runs = found.problem, _trajectories(found)
+def _refit(
+    problem: EstimationProblem, fit: Fit, loss: Loss | None, method: LeastSquares, *, estimate_noise: bool
+) -> tuple[EstimationProblem, Fit]:
+    """The next fit, from where the last one ended, with the weights and noise levels that its residuals ask for."""
+    runs = dict(zip((e.name for e in problem.experiments), fit.trajectories, strict=True))
     if estimate_noise:
-        problem = replace(
-            problem, experiments=tuple(_estimate_noise(problem, e, runs[e.name]) for e in problem.experiments)
-        )
+        logs = tuple(_estimate_noise(problem, e, runs[e.name]) for e in problem.experiments)
+        problem = replace(problem, experiments=logs)
     residuals = {e.name: _residuals_in_noise(problem, e, runs[e.name]) for e in problem.experiments}
     scales = {n: _channel_scales(r) for n, r in residuals.items()}
     weights = {} if loss is None else {n: np.fmax(loss.weight(r / scales[n]), MIN_WEIGHT) for n, r in residuals.items()}
     problem = replace(problem, weights={n: np.nan_to_num(w, nan=1.0) for n, w in weights.items()}, method=method)
-    own = found.fit.solution.parameters
-    start = Start(runs, {n: own.value(n) for n in own.free_names}, "refit")
-    fit = solve_least_squares(problem.transcription(start), method)
-    return Refit(problem, fit, 1.0 if loss is None else _sandwich_factor(loss, residuals, scales, weights))
-
-
-def _trajectories(found: Refit) -> Mapping[str, Trajectory]:
-    logs = (e.name for e in found.problem.experiments)
-    return dict(zip(logs, found.fit.solution.trajectories, strict=True))
+    found = solve_least_squares(problem.transcription(problem.start_from(fit)), method)
+    inflation = 1.0 if loss is None else _sandwich_factor(loss, residuals, scales, weights)
+    return problem, replace(found, variance_inflation=inflation)
 
 
 def _residuals_in_noise(problem: EstimationProblem, experiment: Experiment, run: Trajectory) -> Array:
@@ -254,15 +233,15 @@ def _sandwich_factor(
     return float(np.mean((w * r) ** 2) * np.mean(w) / (np.mean(loss.slope(r / s)) ** 2 * np.mean(w * r**2)))
 
 
-def _is_stationary(before: Refit, after: Refit) -> bool:
-    old, new = before.fit.solution.parameters, after.fit.solution.parameters
-    free = new.free_names
-    moved = np.array([new.value(n) - old.value(n) for n in free])
-    if after.fit.covariance is None:
+def _is_stationary(before: tuple[EstimationProblem, Fit], after: tuple[EstimationProblem, Fit]) -> bool:
+    """Whether a refit has moved neither an estimate nor a noise level."""
+    (old_problem, old), (problem, fit) = before, after
+    if fit.covariance is None:
         return False
-    deviation = np.sqrt(np.diag(after.fit.covariance))
+    moved = np.array([fit.parameters.value(n) - old.parameters.value(n) for n in fit.parameters.free_names])
+    deviation = np.sqrt(np.diag(fit.covariance))
     steps = np.abs(moved[deviation > 0]) / deviation[deviation > 0]
-    logs = zip(before.problem.experiments, after.problem.experiments, strict=True)
+    logs = zip(old_problem.experiments, problem.experiments, strict=True)
     levels = [abs(math.log(b.noise[n] / a.noise[n])) for a, b in logs for n in b.noise]
     return bool(
         np.max(steps, initial=0.0) < ESTIMATE_CHANGE_TOLERANCE and max(levels, default=0.0) < NOISE_CHANGE_TOLERANCE

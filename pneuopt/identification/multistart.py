@@ -1,30 +1,99 @@
-"""Which starts an identification tries, and in which order: where the first fails, all are carried a few iterations.
+"""`fit_from_starts`: the best fit that the model's own starts lead to; what the logs cannot identify is held meanwhile.
 
-What a start finder could only guess (`Start.tried`, as the Stribeck velocity) is held meanwhile, so that the states and
-the other parameters settle to each guess; from there the right basin is near, and its cost tells it from the others.
+The first start is tried alone. Where it fails, every guess that a start finder could only make (`trial_parameters`, as
+the Stribeck velocity) is held for a few iterations, until the states and the other parameters have settled to it; the
+starts then follow by the cost they reached.
+
+A parameter that the data do not determine is held at its given value. A weak prior (a decade about that value) would
+leave it there, too; holding it needs no weight for the prior beside that of the data, and the prior's spread is counted
+in the covariance of the others (`Fit.prior_covariance`).
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.dynamics.system import names
-from pneuopt.identification.problem import EstimationProblem
-from pneuopt.quantities.status import Code
+from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
+from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
+from pneuopt.identification.unidentifiable import refuses_held_values
+from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import Fit, solve_least_squares
 
-GUESS_STAGES = 3  # of the search; tighter gaps would force a wrong guess on the log
-GUESS_BOUND_WIDTH = (
-    1e-9  # relative width of the bounds that hold a guess: the compiled equations stay those of the search
-)
+GUESS_STAGES = 3  # stages of a search with guesses held; tighter gaps would force a wrong guess on the log
+# relative width of the bounds that hold a guess; equal bounds would compile other equations than those of the search
+GUESS_BOUND_WIDTH = 1e-9
+# squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
+# tried, while a wrong basin of soft bristles has left 1.1
+ACCEPTED_CHI_SQUARE_RATIO = 1.05
+SAME_COST_RATIO = 1.001  # costs of two fits up to which both are the same optimum; lower, and rounding tells them apart
+
+Candidate = tuple[EstimationProblem, Fit, str]
 
 
-def multistart(problem: EstimationProblem, confirms: Callable[[], bool] = lambda: False) -> Iterator[Start]:
+def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, estimate_noise: bool = False) -> Candidate:
+    """Fit from the first start that converges at the noise's level; else take the best of all that were tried.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    loss : Loss, optional
+    estimate_noise : bool
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With the values held, the weights and the noise levels that the fit ended with.
+    fit : Fit
+        A wrong basin can converge, too, but leaves residuals above the noise; so more starts are tried until two of
+        them agree on the least cost.
+    label : str
+        Of its start.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If it comes before the first fit; after that the best fit so far is returned, marked.
+    """
+    fits: list[Candidate] = []
+    interrupted, tightest = False, problem.method.stages[-1].gap
+    try:
+        for start in starts_by_cost(problem, lambda: _has_state_noise(fits[0][1])):
+            held, fit = fit_holding_unidentifiable(problem, start)
+            held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
+            if _explains_to_noise(held, fit) and not held.held:
+                return held, fit, start.label
+            fits.append((held, fit, start.label))
+            fits.sort(key=lambda each: _rank(each[1], tightest))
+            interrupted = fit.status.code is Code.INTERRUPTED
+            if interrupted or (len(fits) > 1 and _are_alike(fits[0][1], fits[1][1])):
+                break
+    except KeyboardInterrupt:
+        if not fits:
+            raise
+        interrupted = True
+    held, fit, label = fits[0]
+    return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
+
+
+def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: bool) -> Status:
+    """The status of the best fit of several starts."""
+    status = fit.status
+    if interrupted and (starts > 1 or status.code is not Code.INTERRUPTED):
+        status = Status(Code.INTERRUPTED, f"the best of {starts} starts so far; run again for an answer")
+    elif not status.converged and starts > 1:
+        status = Status(status.code, f"none of {starts} starts will do; in the best, {status.message}")
+    if len(problem.experiments) > 1:
+        status = Status(status.code, f"{status.message}; compare_logs tells whether the logs are of one drive")
+    return status
+
+
+def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = lambda: False) -> Iterator[Start]:
     """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
 
     Parameters
     ----------
-    problem : Problem
+    problem : EstimationProblem
     confirms : callable
         Asked after the first start: whether it led to an optimum that only needs confirmation (of a model that misses
         the log, say). The others are then taken as they are; settling all would cost more.
@@ -53,13 +122,91 @@ def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[float, 
     bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
     fit = solve_least_squares(held, replace(problem.method, stages=problem.method.stages[:GUESS_STAGES]))
-    if fit.solution.status.code is Code.INTERRUPTED:
+    if fit.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
-    return fit.solution.stats["cost"], _continue_start(problem, candidate, fit, guesses)
+    start = problem.start_from(fit, f"{candidate.label}, settled")
+    return fit.stats["cost"], replace(start, parameters={**start.parameters, **guesses})
 
 
-def _continue_start(problem: EstimationProblem, candidate: Start, fit: Fit, guesses: dict[str, float]) -> Start:
-    """The start that goes on where a fit ended."""
-    found, states = fit.solution.parameters, names(problem.system.states)
-    runs = {e.name: t.select(states) for e, t in zip(problem.experiments, fit.solution.trajectories, strict=True)}
-    return Start(runs, {**{n: found.value(n) for n in found.free_names}, **guesses}, f"{candidate.label}, settled")
+def fit_holding_unidentifiable(problem: EstimationProblem, start: Start) -> tuple[EstimationProblem, Fit]:
+    """Fit from one start; while the data do not determine a parameter, hold that one and fit again.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    start : Start
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With what is held: at the given values, or, if the logs refuse those, where the search had left them.
+    fit : Fit
+        The first one, where holding does not converge, or would leave no parameter to estimate.
+    """
+    first = solve_least_squares(problem.transcription(start), problem.method)
+    if not first.unidentifiable or first.status.code is Code.INTERRUPTED:
+        return problem, first
+    for is_given in (True, False) if not first.status.converged else (True,):
+        held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
+        is_settled = fit.status.converged and not fit.unidentifiable
+        if fit.status.code is Code.INTERRUPTED or (is_settled and not refuses_held_values(fit, first, len(held.held))):
+            return held, fit
+    return problem, first
+
+
+def _hold_unidentifiable(
+    problem: EstimationProblem, label: str, first: Fit, *, is_given: bool
+) -> tuple[EstimationProblem, Fit]:
+    """Hold one undetermined parameter after the other, at its given value or where the first fit has left it."""
+    held, fit, given = problem, first, problem.unknowns()
+    warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
+    source = given if is_given else first.parameters
+    while fit.unidentifiable and len(held.held) + len(fit.unidentifiable) < len(given.free_names):
+        held = replace(held, held={**held.held, **{n: source.value(n) for n in fit.unidentifiable}})
+        before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
+        fit = replace(fit, stats={**fit.stats, **_total_effort(before, fit)})
+        if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
+            break
+    return held, fit
+
+
+def _total_effort(*fits: Fit) -> dict[str, float]:
+    return {n: sum(fit.stats[n] for fit in fits) for n in ("iterations", "seconds")}
+
+
+def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether no other start can do better.
+
+    Where the log states too little noise, the white part of the residuals is what is left of it.
+    """
+    if not fit.status.converged or fit.jumps is not None:
+        return False
+    return (
+        fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
+        or fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * white_chi_square(problem, fit)
+    )
+
+
+def _has_state_noise(fit: Fit) -> bool:
+    """Whether it is the optimum of a model that the log's states do not quite follow."""
+    return fit.status.converged and fit.jumps is not None
+
+
+def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
+    """The order of fits: by cost, but noise of the states explains too much to be compared with a fit without.
+
+    And so do the loose gaps, wider than the last stage's, in which an interruption may leave a search.
+    """
+    cost = fit.stats["cost"]
+    if fit.status.code is Code.INTERRUPTED and fit.stats["gap_deviation"] > tightest:
+        return 3, cost
+    if fit.jumps is not None:
+        return 1, cost
+    return 0 if 2 * cost <= MAX_CHI_SQUARE_RATIO * fit.count else 2, cost
+
+
+def _are_alike(best: Fit, second: Fit) -> bool:
+    """Whether both converged, at the same cost."""
+    converged = best.status.converged and second.status.converged
+    same = (best.jumps is None) == (second.jumps is None)
+    return converged and same and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]

@@ -12,13 +12,16 @@ from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import System, names
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.logged_loop import LoggedLoop
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.shooting.least_squares import Fit, LeastSquares
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
+
+REFIT_STAGES = 3  # last stages of a method: a refit starts near its answer; more cost time, fewer may not converge
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,7 @@ class EstimationProblem:
     weights : mapping of str to ndarray, each of shape (n, n_measured_outputs)
         By log: of each sample's squared residual; absent ones are 1.
     held : mapping of str to float
-        Free parameters that the logs do not tell, and where they stay.
+        Free parameters that the logs cannot identify, and where they stay.
     """
 
     system: Fittable
@@ -48,6 +51,19 @@ class EstimationProblem:
         """The model's own starts from all logs together."""
         logs = {e.name: Log(e.trajectory, apply_conditions(self.parameters, e)) for e in self.experiments}
         return self.system.starts(logs)
+
+    def start_from(self, fit: Fit | IdentificationResult, label: str = "fit") -> Start:
+        """The start that goes on where a fit of these logs ended; what it leaves open begins at its given value."""
+        if isinstance(fit, IdentificationResult):
+            runs, found = (
+                tuple(fit.trajectories.values()),
+                {str(n): float(v) for n, v in fit.estimates["value"].items()},
+            )
+        else:
+            runs, found = fit.trajectories, {n: fit.parameters.value(n) for n in fit.parameters.free_names}
+        given = self.unknowns()
+        values = {n: v if math.isfinite(v) else given.value(n) for n, v in found.items()}
+        return Start(dict(zip((e.name for e in self.experiments), runs, strict=True)), values, label)
 
     def unknowns(self) -> ParameterSet:
         """The problem's parameters: the system's, each log's conditions, each log's own copies."""

@@ -2,21 +2,20 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from scipy.stats import chi2
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.hooks import Start
-from pneuopt.dynamics.system import System, names
+from pneuopt.dynamics.system import System
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
 
 if TYPE_CHECKING:
@@ -27,35 +26,6 @@ ROOT_TOLERANCE = 0.003  # of the level's root, to which an end is located
 MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits
 MAX_LOG_PROBE = 0.3  # e-folds, at most, over which the curvature at the estimate is measured
 REFIT_ITERATIONS = 40  # of a refit
-
-
-class ProfileSource(Protocol):
-    """What a profile needs of an identification's result."""
-
-    @property
-    def parameters(self) -> ParameterSet:
-        """All parameters, the free ones as found."""
-        ...
-
-    @property
-    def estimates(self) -> "pd.DataFrame":
-        """A row a free parameter: value and stderr."""
-        ...
-
-    @property
-    def fit(self) -> "pd.DataFrame":
-        """A row a log and channel, its noise among the columns."""
-        ...
-
-    @property
-    def trajectories(self) -> Mapping[str, Trajectory]:
-        """Fitted states of each log."""
-        ...
-
-    @property
-    def stats(self) -> Mapping[str, float]:
-        """Of the search, and the residuals' level and correlation."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +82,7 @@ class Profile:
 def profile(
     system: System | ClosedLoop,
     experiments: Sequence[Experiment],
-    result: ProfileSource,
+    result: IdentificationResult,
     name: str,
     *,
     level: float = 0.95,
@@ -158,7 +128,7 @@ def profile(
     return trace_profile(problem, result, name, level)
 
 
-def trace_profile(problem: EstimationProblem, result: ProfileSource, name: str, level: float = 0.95) -> Profile:
+def trace_profile(problem: EstimationProblem, result: IdentificationResult, name: str, level: float = 0.95) -> Profile:
     """`profile`, of a problem already posed."""
     if problem.method.progress is not None:
         problem.method.progress(f"how far {name} can move")
@@ -179,18 +149,16 @@ class _ProfilePoint(NamedTuple):
 
     @property
     def cost(self) -> float:
-        return self.fit.solution.stats["cost"]
+        return self.fit.stats["cost"]
 
 
 class _Refits:
     """Fits with one parameter held, each started from the nearest one."""
 
-    def __init__(self, problem: EstimationProblem, result: ProfileSource, name: str) -> None:
+    def __init__(self, problem: EstimationProblem, result: IdentificationResult, name: str) -> None:
         self.problem, self.name = problem, name
-        given, found = problem.unknowns(), {str(n): float(v) for n, v in result.estimates["value"].items()}
-        values = {n: v if math.isfinite(v) else given.value(n) for n, v in found.items()}
-        self.start = Start(_select_states(names(problem.system.states), result.trajectories), values, "fit")
-        self.parameter = replace(problem.unknowns()[name], value=values[name])
+        self.start = problem.start_from(result)
+        self.parameter = replace(problem.unknowns()[name], value=self.start.parameters[name])
         last, steps = Stage(result.stats["gap_deviation"], REFIT_ITERATIONS, refine=4), int(result.stats["substeps"])
         self.method = replace(problem.method, stages=(last,), substeps=max(1, steps // 4), progress=None)
         self.spread = self._search_deviation(float(result.estimates["stderr"][name]))
@@ -217,10 +185,7 @@ class _Refits:
         """The fit with the parameter held there."""
         start = self.start
         if self.points:
-            nearest = min(self.points, key=lambda known: abs(known.z - z)).fit.solution
-            runs = dict(zip((e.name for e in self.problem.experiments), nearest.trajectories, strict=True))
-            values = {n: nearest.parameters.value(n) for n in start.parameters}
-            start = Start(_select_states(names(self.problem.system.states), runs), values)
+            start = self.problem.start_from(min(self.points, key=lambda known: abs(known.z - z)).fit)
         posed = self.problem.transcription(start)
         held = replace(self.parameter, value=self.value(z), lower=self.value(z), upper=self.value(z))
         posed = replace(posed, parameters=posed.parameters | ParameterSet({self.name: held}))
@@ -239,7 +204,7 @@ class _Refits:
 
         rows = []
         for point in sorted(self.points, key=lambda known: known.z):
-            others = {n: point.fit.solution.parameters.value(n) for n in self.start.parameters if n != self.name}
+            others = {n: point.fit.parameters.value(n) for n in self.start.parameters if n != self.name}
             rows.append({"value": self.value(point.z), "deviance": self.deviance_root(point) ** 2, **others})
         return pd.DataFrame(rows)
 
@@ -259,11 +224,6 @@ class _Refits:
         rise = sum(self.refit_at(z).cost - middle for z in around)
         found = rise * (self.spread / step) ** 2
         return min(max(found, 0.1 * noise), noise) if math.isfinite(found) else noise
-
-
-def _select_states(own: Sequence[str], runs: Mapping[str, Trajectory]) -> Mapping[str, Trajectory]:
-    """What a start takes of fitted runs."""
-    return {log: Trajectory(run.t, {n: run[n] for n in own}) for log, run in runs.items()}
 
 
 def _bracket(refits: _Refits, side: int, target: float) -> None:

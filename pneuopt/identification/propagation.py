@@ -3,39 +3,16 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.statistics import confidence_interval
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.parameters import ParameterSet
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 ParameterValues = Mapping[str, float]
 DELTA_METHOD_STEP = 1e-3  # standard deviations over which a slope is taken
-
-
-class EstimateSource(Protocol):
-    """What a derived figure needs of an identification's result."""
-
-    @property
-    def parameters(self) -> ParameterSet:
-        """All parameters, the free ones as found."""
-        ...
-
-    @property
-    def estimates(self) -> "pd.DataFrame":
-        """A row a free parameter, its value among the columns."""
-        ...
-
-    @property
-    def covariance(self) -> "pd.DataFrame":
-        """Of the estimates; NaN for what has no interval."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -54,7 +31,7 @@ class PropagatedValue:
     ci_high: float
 
 
-def propagate_error(result: EstimateSource, function: Callable[[ParameterValues], float]) -> PropagatedValue:
+def propagate_error(result: IdentificationResult, function: Callable[[ParameterValues], float]) -> PropagatedValue:
     """A function of the parameters, with its interval by the delta method.
 
     Parameters
@@ -65,7 +42,7 @@ def propagate_error(result: EstimateSource, function: Callable[[ParameterValues]
 
     Returns
     -------
-    Derived
+    PropagatedValue
         ``stderr = sqrt(g C g')`` with g the slope at the estimates (central differences) and C their covariance: right
         where the function is nearly linear within the intervals.
 
@@ -73,7 +50,7 @@ def propagate_error(result: EstimateSource, function: Callable[[ParameterValues]
     --------
     >>> from types import SimpleNamespace
     >>> import pandas as pd
-    >>> from pneuopt.quantities.parameters import Parameter
+    >>> from pneuopt.quantities.parameters import Parameter, ParameterSet
     >>> names = ["static", "coulomb"]
     >>> fit = SimpleNamespace(
     ...     parameters=ParameterSet({n: Parameter(v, "N") for n, v in zip(names, (60.0, 40.0))}),
@@ -90,7 +67,7 @@ def propagate_error(result: EstimateSource, function: Callable[[ParameterValues]
 
 
 def propagate_deviations(
-    result: EstimateSource, function: Callable[[ParameterValues], ArrayLike]
+    result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]
 ) -> tuple[Array, Array]:
     """Several figures at once, and the standard deviation of each; a curve over a grid, say.
 

@@ -9,14 +9,17 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
-from pneuopt.identification.identifiability import (
-    Verdict,
-    join_names,
-    verdict_from_covariance,
-    verdict_from_sensitivities,
-)
+from pneuopt.identification.identifiability import verdict_from_covariance, verdict_from_sensitivities
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiles import Profile, trace_profile
+from pneuopt.identification.result import (
+    AT_BOUND_NOTE,
+    UNIDENTIFIABLE_NOTE,
+    IdentificationResult,
+    Verdict,
+    join_names,
+)
+from pneuopt.identification.unidentifiable import MAX_LINEAR_DEVIATION, add_profiles, add_unidentifiable
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.equations import segment_gaps
@@ -25,9 +28,6 @@ from pneuopt.shooting.segments import segment, start_nodes
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pneuopt.identification.identify import IdentificationResult
-
-MAX_LINEAR_DEVIATION = 0.15  # relative standard deviation beyond which the likelihood of a log parameter is no parabola
 PROFILE_DRAG_DEVIATIONS = (
     3.0  # standard deviations that another parameter moves along a profile, beyond which it is profiled, too
 )
@@ -39,12 +39,11 @@ SMOOTHING_PARAMETER, NARROW_SMOOTHING, SMOOTHING_REDUCTION = (
     1e-4,
     0.1,
 )  # [m/s], narrower takes ever finer steps
-AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "not told"
 
 
 def review_fit(
-    problem: EstimationProblem, result: "IdentificationResult", untold: Sequence[str] = ()
-) -> "IdentificationResult":
+    problem: EstimationProblem, result: IdentificationResult, untold: Sequence[str] = ()
+) -> IdentificationResult:
     """Mark what the fit says without knowing it.
 
     Parameters
@@ -62,7 +61,7 @@ def review_fit(
         status. Doubtful intervals are replaced by those of the profile likelihood; a parameter that has an open end
         there, or that the motion cannot show, has no standard deviation. Ctrl-C leaves the rest unchecked.
     """
-    start = Start(result.trajectories, {str(n): float(v) for n, v in result.estimates["value"].items()}, "fit")
+    start = problem.start_from(result)
     if not result.status.converged:
         verdict = _verdict_at(problem, start, result)
         status = (
@@ -82,11 +81,10 @@ def review_fit(
     profiles = _profiles(problem, result)
     trusted = result.stats["chi_square_ratio"] <= MAX_CHI_SQUARE_RATIO
     verdict = verdict_from_covariance(problem, start, _blank_covariance(result.covariance, untold), trusted=trusted)
-    verdict = verdict.with_profiles(profiles)
+    verdict = add_profiles(verdict, profiles)
     if untold:
-        verdict = verdict.with_unidentifiable(
-            untold, _verdict_at(problem, start, result), _names_at_given_value(problem)
-        )
+        seen = _verdict_at(problem, start, result)
+        verdict = add_unidentifiable(verdict, untold, seen, _names_at_given_value(problem))
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
     message = (
@@ -119,14 +117,14 @@ def _names_at_given_value(problem: EstimationProblem) -> tuple[str, ...]:
     return tuple(n for n, v in problem.held.items() if v == given.value(n))
 
 
-def _verdict_at(problem: EstimationProblem, start: Start, result: "IdentificationResult") -> Verdict:
+def _verdict_at(problem: EstimationProblem, start: Start, result: IdentificationResult) -> Verdict:
     """The verdict where a search gave up, from the sensitivities there."""
     return verdict_from_sensitivities(
         problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["correlation_time"])
     )
 
 
-def _profiles(problem: EstimationProblem, result: "IdentificationResult") -> dict[str, Profile]:
+def _profiles(problem: EstimationProblem, result: IdentificationResult) -> dict[str, Profile]:
     """Profiles of what is doubtful, and of what that drags along."""
     found: dict[str, Profile] = {}
     rows = result.estimates

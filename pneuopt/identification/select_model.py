@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.system import System, names
-from pneuopt.identification.identify import IdentificationResult, identify, validate
-from pneuopt.identification.review import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE
+from pneuopt.identification.identify import identify, validate
+from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require

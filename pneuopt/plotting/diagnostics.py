@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.statistics import correlation, ljung_box
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment
@@ -15,7 +16,6 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -24,15 +24,6 @@ MAX_PLOT_CHANNELS = 4
 MAX_PLOT_POINTS = 4000
 MAX_NUMBERED_PARAMETERS = 12  # parameters whose correlations have room for a figure
 NORMAL_QUANTILE_95 = 1.96  # standard deviations, 95 %
-
-
-class CovarianceResult(Protocol):
-    """What `plot_correlation` needs of an identification's result."""
-
-    @property
-    def covariance(self) -> "pd.DataFrame":
-        """Of the estimates."""
-        ...
 
 
 def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> "Figure":
@@ -70,7 +61,7 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
     return figure
 
 
-def plot_correlation(result: CovarianceResult) -> "Figure":
+def plot_correlation(result: IdentificationResult) -> "Figure":
     """How the estimates hang together: a cell a pair, 1 or -1 where only a combination of both is known.
 
     Parameters

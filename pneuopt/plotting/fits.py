@@ -1,10 +1,11 @@
 """Fits and predictions beside their logs."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment
 from pneuopt.plotting.canvas import (
@@ -18,11 +19,9 @@ from pneuopt.plotting.canvas import (
     note_omissions,
 )
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -30,31 +29,7 @@ Pairs = Sequence[tuple[Trajectory, Trajectory]]
 MAX_PLOT_POINTS = 4000  # of a measured line or cloud
 
 
-class PlottableFit(Protocol):
-    """What a figure needs of an identification's result."""
-
-    @property
-    def parameters(self) -> ParameterSet:
-        """All parameters, the free ones as found."""
-        ...
-
-    @property
-    def trajectories(self) -> Mapping[str, Trajectory]:
-        """Fitted states and outputs of each log."""
-        ...
-
-    @property
-    def estimates(self) -> "pd.DataFrame":
-        """A row a free parameter."""
-        ...
-
-    @property
-    def covariance(self) -> "pd.DataFrame":
-        """Of the estimates."""
-        ...
-
-
-def plot_fit(result: PlottableFit, experiments: Sequence[Experiment]) -> "Figure":
+def plot_fit(result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":
     """Measured beside fitted, and the residuals, a column a log.
 
     Parameters

@@ -9,9 +9,10 @@ import numpy as np
 
 from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.identification.propagation import propagate_deviations
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment, differentiate
 from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
-from pneuopt.plotting.fits import MAX_PLOT_POINTS, PlottableFit
+from pneuopt.plotting.fits import MAX_PLOT_POINTS
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -26,7 +27,7 @@ SLOPE_SAMPLES = 20  # of a local derivative
 LOAD_MASS = "load.mass"
 
 
-def plot_friction(system: System, result: PlottableFit, experiments: Sequence[Experiment]) -> "Figure":
+def plot_friction(system: System, result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":
     """The friction force that the logs imply against speed, with the fitted curve and its 95 % band on top.
 
     For a `MotionDrive` the force as measured, offset and pressure and all. For a drive with a mass what pushes it (the
@@ -101,7 +102,9 @@ def _rig_points(experiment: Experiment) -> tuple[Array, Array]:
     return experiment.trajectory["speed"], experiment.trajectory["force"]
 
 
-def _drive_points(system: System, result: PlottableFit, experiment: Experiment, name: str) -> tuple[Array, Array]:
+def _drive_points(
+    system: System, result: IdentificationResult, experiment: Experiment, name: str
+) -> tuple[Array, Array]:
     """Speed, and what pushes the mass without accelerating it."""
     log, run = experiment.trajectory, result.trajectories[name]
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
@@ -117,7 +120,7 @@ def _drive_points(system: System, result: PlottableFit, experiment: Experiment, 
     return speed, np.where(reverses > 0, np.nan, force)
 
 
-def _draw_curve(axes: "Axes", system: System, result: PlottableFit, grid: Array) -> None:
+def _draw_curve(axes: "Axes", system: System, result: IdentificationResult, grid: Array) -> None:
     """The fitted curve, and how far the estimates' covariance lets it move; no band where it does not say."""
     shared = [n for n in result.covariance.index if n in result.parameters]
     usual = {

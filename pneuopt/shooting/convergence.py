@@ -9,15 +9,12 @@ from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.arrow import ReducedEquations, positive_definite_inverse
 from pneuopt.shooting.equations import NormalEquations, describe_misfit
-from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.scaling import UNIDENTIFIABLE_PRIOR_RATIO, ParameterScaling
 
 MAX_GAP_SHARE = 0.05  # of the cost: the gaps' residuals above it mean that they take up what the model cannot
 MAX_CHI_SQUARE_RATIO = (
     1.2  # squared residuals a sample, in noise variances, up to which a fit is as good as the noise allows
 )
-UNIDENTIFIABLE_PRIOR_RATIO = (
-    1 / 3
-)  # standard deviation, over a weak prior's, from which that says a tenth of what data and it say together
 NO_POSITIONS = np.zeros(0, dtype=np.intp)
 
 

@@ -6,6 +6,7 @@ record's length. The gaps are tightened in stages, so that a bad start is never 
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -13,13 +14,14 @@ import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array, Mask
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, ConvergenceTest, assess_convergence
 from pneuopt.shooting.equations import NormalEquations, normal_equations, second_order_correction, weigh_gaps
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, segment, stable_substeps, start_nodes
-from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Transcription
 
 INITIAL_DAMPING = 1e-3  # with loose gaps
@@ -93,11 +95,17 @@ class LeastSquares:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A solution with what its last factor says about the parameters.
+    """What a least squares found: the states over time, the parameters, and how well the data determine them.
 
     Attributes
     ----------
-    solution : Solution
+    trajectories : tuple of Trajectory
+        States and outputs, one a phase.
+    parameters : ParameterSet
+        The problem's parameters with the free ones solved for.
+    status : Status
+    stats : mapping of str to float
+        Iterations, seconds, final cost, largest gap, ...
     covariance : ndarray, shape (k, k), or None
         Of the free parameters in their own units, at unit noise scale; None where the data do not determine them.
     chi_square : float
@@ -109,12 +117,18 @@ class Fit:
     jumps : ndarray, shape (m, n_states), or None
         Where the gaps had to stand for noise of the states: the gap behind each linked segment, in nominal sizes.
     unidentifiable : tuple of str
-        The parameters that the data do not tell here; hold them, and ask again.
+        The parameters that the data do not determine here; hold them, and fit again.
     prior_covariance : ndarray, shape (k, k), or None
-        What a weak prior of those held adds to the covariance (`Equations.borrowed`); None where nothing is held.
+        What a weak prior of those held adds to the covariance (`NormalEquations.prior_covariance`); None where nothing
+        is held.
+    variance_inflation : float
+        By how much the estimates' variance exceeds what weighted squares say (robust losses).
     """
 
-    solution: Solution
+    trajectories: tuple[Trajectory, ...]
+    parameters: ParameterSet
+    status: Status
+    stats: Mapping[str, float]
     covariance: Array | None
     chi_square: float
     count: int
@@ -122,6 +136,7 @@ class Fit:
     jumps: Array | None = None
     unidentifiable: tuple[str, ...] = ()
     prior_covariance: Array | None = None
+    variance_inflation: float = 1.0
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:
@@ -377,17 +392,24 @@ class _LevenbergMarquardt:
         }
         at_bound, held = self.scaling.at_bound(current.z) & ~self.scaling.held, self.scaling.held
         keep = self.scaling.has_effect(equations) & ~at_bound & ~held
-        covariance, borrowed, silent = None, None, tuple[str, ...]()
+        covariance, prior, unidentifiable = None, None, tuple[str, ...]()
         if math.isfinite(equations.cost):
             covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
-            borrowed = (
-                equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
-            )
-            silent = tuple(free[i] for i in self._assess(current).unidentifiable)
-        found = transcription.parameters.with_values(values)
-        solution = Solution(self.segments.trajectories(run), found, status, stats)
-        jumps = equations.gaps[self.segments.linked] if self.noisy_gaps else None
-        return Fit(solution, covariance, equations.chi_square, equations.count, at_bound, jumps, silent, borrowed)
+            prior = equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
+            unidentifiable = tuple(free[i] for i in self._assess(current).unidentifiable)
+        return Fit(
+            self.segments.trajectories(run),
+            transcription.parameters.with_values(values),
+            status,
+            stats,
+            covariance,
+            equations.chi_square,
+            equations.count,
+            at_bound,
+            equations.gaps[self.segments.linked] if self.noisy_gaps else None,
+            unidentifiable,
+            prior,
+        )
 
     def _integration_error(self, run: RolloutResult) -> float:
         """Largest change of an output when the steps are halved [noise standard deviations]."""

@@ -1,7 +1,6 @@
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_status, write_fit
 from pneuopt.files.toml import read_toml
-from pneuopt.identification.identifiability import Verdict
+from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
@@ -45,13 +44,18 @@ smoothing = { value = "1 mm/s", source = "EMPS paper" }
 """
 
 
-@dataclass(frozen=True)
-class Fit:
-    parameters: ParameterSet
-    estimates: pd.DataFrame = field(default_factory=pd.DataFrame)
-    status: Status = field(default_factory=lambda: Status(Code.CONVERGED, "gaps 1e-9"))
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    verdict: Verdict | None = None
+def fit_of(
+    parameters: ParameterSet,
+    estimates: pd.DataFrame | None = None,
+    status: Status | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    verdict: Verdict | None = None,
+) -> IdentificationResult:
+    """A result with nothing but what a file shows of it."""
+    table = pd.DataFrame()
+    status = status or Status(Code.CONVERGED, "gaps 1e-9")
+    known = table if estimates is None else estimates
+    return IdentificationResult(parameters, known, table, table, {}, status, {}, provenance or {}, verdict)
 
 
 def written(folder: Path, text: str, name: str = "drive.toml") -> Path:
@@ -167,7 +171,7 @@ def test_a_fit_keeps_the_users_text_and_adds_the_results(tmp_path: Path) -> None
         index=["load.mass", "friction.viscous"],
     ).assign(unit=["kg", "N*s/m"])
     provenance = {"versions": {"pneuopt": "0.1"}, "sha256": {"run_01": "ab"}, "seconds": np.float64(1.5), "none": None}
-    write_fit(tmp_path / "fit.toml", source, Fit(found, estimates, provenance=provenance))
+    write_fit(tmp_path / "fit.toml", source, fit_of(found, estimates, provenance=provenance))
     text = (tmp_path / "fit.toml").read_text(encoding="utf-8")
     for kept in (
         "# my axis, 2024",
@@ -191,7 +195,7 @@ def test_a_fit_keeps_the_users_text_and_adds_the_results(tmp_path: Path) -> None
 def test_a_fit_adds_what_the_file_left_out(tmp_path: Path) -> None:
     source = written(tmp_path, AXIS.partition("[load]")[0] + '[friction]\nmodel = "coulomb"\n\n# the end\n')
     found = read_drive(source)[1].freed("load.mass").with_values({"load.mass": 7.0, "friction.coulomb": 12.0})
-    write_fit(tmp_path / "fit.toml", source, Fit(found, provenance={"logs": ["a", None, np.int64(2)]}))
+    write_fit(tmp_path / "fit.toml", source, fit_of(found, provenance={"logs": ["a", None, np.int64(2)]}))
     assert read_drive(tmp_path / "fit.toml")[1] == found
     assert read_toml(tmp_path / "fit.toml").unwrap()["provenance"] == {"logs": ["a", 2]}
 
@@ -200,11 +204,11 @@ def test_a_fit_of_a_fit_replaces_the_results(tmp_path: Path) -> None:
     source = written(tmp_path, AXIS)
     rig = read_drive(source)[1]
     bad = Status(Code.ITERATION_LIMIT, "gap of position 3e-3; raise max_iterations")
-    write_fit(tmp_path / "fit.toml", source, Fit(rig.with_values({"load.mass": 90.0}), status=bad))
+    write_fit(tmp_path / "fit.toml", source, fit_of(rig.with_values({"load.mass": 90.0}), status=bad))
     assert read_status(tmp_path / "fit.toml") == bad
     assert read_drive(tmp_path / "fit.toml")[1].value("load.mass") == 90.0
     better = rig.with_values({"load.mass": 91.0}).fixed("load.mass")
-    write_fit(tmp_path / "fit.toml", tmp_path / "fit.toml", Fit(better))
+    write_fit(tmp_path / "fit.toml", tmp_path / "fit.toml", fit_of(better))
     assert read_status(tmp_path / "fit.toml") == Status(Code.CONVERGED, "gaps 1e-9")
     assert read_drive(tmp_path / "fit.toml")[1] == better
     assert read_status(source) is None
@@ -231,7 +235,7 @@ def test_any_fit_reads_back(
     values = {"load.mass": mass, "load.force": force, "friction.smoothing": smoothing, "friction.static": abs(force)}
     found = rig.with_values(values)
     found = found.freed("friction.*") if free else found
-    write_fit(folder / "fit.toml", folder / "drive.toml", Fit(found))
+    write_fit(folder / "fit.toml", folder / "drive.toml", fit_of(found))
     again = read_drive(folder / "fit.toml")[1]
     assert again.free_names == found.free_names
     for name, parameter in found.items():
@@ -242,7 +246,7 @@ def test_any_fit_reads_back(
 def test_a_value_at_its_bound_reads_back(tmp_path: Path) -> None:
     source = written(tmp_path, AXIS.replace("50 kg", "53.333333333333336 kg"))
     found = read_drive(source)[1].with_values({"load.mass": 53.333333333333336})
-    write_fit(tmp_path / "fit.toml", source, Fit(found))
+    write_fit(tmp_path / "fit.toml", source, fit_of(found))
     assert read_drive(tmp_path / "fit.toml")[1] == found
 
 
@@ -283,7 +287,7 @@ def test_reads_a_pneumatic_drive(tmp_path: Path) -> None:
     }  # fmt: skip
     assert {n: rig.value(n) for n in expected} == expected
     assert rig.free_names == ("friction.coulomb",)
-    write_fit(tmp_path / "fit.toml", tmp_path / "drive.toml", Fit(rig.with_values({"valve.leak": 0.01})))
+    write_fit(tmp_path / "fit.toml", tmp_path / "drive.toml", fit_of(rig.with_values({"valve.leak": 0.01})))
     assert read_drive(tmp_path / "fit.toml")[1] == rig.with_values({"valve.leak": 0.01})
 
 
@@ -374,7 +378,7 @@ def test_a_nominal_flow_is_a_conductance_at_the_critical_ratio(tmp_path: Path) -
     written(tmp_path, text)
     for name, value in {"valve.critical_ratio": 0.4, "valve.conductance": 3e-8, "valve.leak": 0.01}.items():
         fit = rig.with_values({name: value})
-        write_fit(tmp_path / "fit.toml", tmp_path / "drive.toml", Fit(fit))
+        write_fit(tmp_path / "fit.toml", tmp_path / "drive.toml", fit_of(fit))
         again = read_drive(tmp_path / "fit.toml")[1]
         assert [again.value(n) for n in fit] == pytest.approx([fit.value(n) for n in fit], rel=1e-8)
         assert again["valve.conductance"].free

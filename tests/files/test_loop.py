@@ -1,9 +1,6 @@
 """The loop in a tuning.toml: forms, delay, dead band, encoder, feedforward."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pytest
@@ -17,8 +14,8 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.result import TuningResult
 
 PLANT = SecondOrder().system()
 STANDARD = """[pid]
@@ -40,14 +37,6 @@ horizon = "1 s"
 """
 
 
-@dataclass(frozen=True)
-class Tuned:
-    parameters: ParameterSet
-    certified: pd.DataFrame = field(default_factory=lambda: pd.DataFrame({"0 to 0.1": {"SettlingTime": 0.25}}))
-    status: Status = field(default_factory=lambda: Status(Code.CONVERGED, "certified"))
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-
-
 def written(folder: Path, text: str) -> Path:
     path = folder / "tuning.toml"
     path.write_text(text, encoding="utf-8")
@@ -62,7 +51,8 @@ def test_a_form_is_tuned_in_its_own_gains(tmp_path: Path) -> None:
     assert given.free_names == ("pid.Ti", "feedforward.gain")
     assert (given["pid.Ti"].lower, given["pid.Ti"].upper, given.value("pid.dead_band")) == (0.05, 2.0, 2e-3)
     assert vars(tuning.loop.parallel_form(given)) == pytest.approx({"Kp": 2.0, "Ki": 4.0, "Kd": 0.5, "Tf": 0.025})
-    result = Tuned(given.with_values({"pid.Ti": 0.25, "feedforward.gain": 2.5}))
+    table, found = pd.DataFrame(), given.with_values({"pid.Ti": 0.25, "feedforward.gain": 2.5})
+    result = TuningResult(found, table, table, table, table, (), Status(Code.CONVERGED), {}, {})
     write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", result)
     again = read_tuning(tmp_path / "tuned.toml", PLANT).parameters
     assert [again.value(n) for n in given.free_names] == [0.25, 2.5]

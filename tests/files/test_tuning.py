@@ -1,7 +1,5 @@
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -40,6 +38,7 @@ from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.result import TuningResult
 
 PLANT = SecondOrder().system()
 TUNING = """# my loop, 2024
@@ -80,14 +79,11 @@ peak_control = "4500 mV"
 """
 
 
-@dataclass(frozen=True)
-class Tuned:
-    parameters: ParameterSet
-    certified: pd.DataFrame = field(
-        default_factory=lambda: pd.DataFrame({"0 to 0.2": {"SettlingTime": np.float64(0.25)}})
-    )
-    status: Status = field(default_factory=lambda: Status(Code.CONVERGED, "certified"))
-    provenance: Mapping[str, Any] = field(default_factory=lambda: {"pneuopt": "0.1"})
+def tuned(parameters: ParameterSet, status: Status | None = None) -> TuningResult:
+    """A result with nothing but what a file shows of it."""
+    table, certified = pd.DataFrame(), pd.DataFrame({"0 to 0.2": {"SettlingTime": np.float64(0.25)}})
+    status = status or Status(Code.CONVERGED, "certified")
+    return TuningResult(parameters, certified, certified, table, table, (), status, {}, {"pneuopt": "0.1"})
 
 
 def written(folder: Path, text: str, name: str = "tuning.toml") -> Path:
@@ -245,7 +241,7 @@ def read_all(folder: Path, tuned: Mapping[str, float]) -> tuple[Tuning, Paramete
 
 def test_a_tuned_file_keeps_the_users_text_and_adds_the_results(tmp_path: Path) -> None:
     given, found = read_all(tmp_path, {"pid.Kp": 12.34, "pid.Ki": 56.78, "dither.amplitude": 0.5})
-    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", Tuned(PLANT.parameters | found))
+    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", tuned(PLANT.parameters | found))
     text = (tmp_path / "tuned.toml").read_text(encoding="utf-8")
     for kept in (
         "# my loop, 2024",
@@ -267,8 +263,8 @@ def test_a_tuned_file_keeps_the_users_text_and_adds_the_results(tmp_path: Path) 
 
 def test_a_failed_tuning_keeps_the_old_gains_and_no_old_certificate(tmp_path: Path) -> None:
     _, found = read_all(tmp_path, {"pid.Kp": 12.34})
-    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", Tuned(found))
-    failed = Tuned(found.with_values({"pid.Kp": 50.0}), status=Status(Code.NOT_CERTIFIED, "grazes the band"))
+    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", tuned(found))
+    failed = tuned(found.with_values({"pid.Kp": 50.0}), status=Status(Code.NOT_CERTIFIED, "grazes the band"))
     write_tuned(tmp_path / "again.toml", tmp_path / "tuned.toml", failed)
     assert read_tuning(tmp_path / "again.toml", PLANT).parameters.value("pid.Kp") == 12.34
     said = read_toml(tmp_path / "again.toml").unwrap()
@@ -282,7 +278,7 @@ def test_a_failed_tuning_keeps_the_old_gains_and_no_old_certificate(tmp_path: Pa
 def test_any_gains_read_back(tmp_path_factory: pytest.TempPathFactory, Kp: float, Ki: float, amplitude: float) -> None:
     folder = tmp_path_factory.mktemp("tuned")
     _, found = read_all(folder, {"pid.Kp": Kp, "pid.Ki": Ki, "dither.amplitude": amplitude})
-    write_tuned(folder / "tuned.toml", folder / "tuning.toml", Tuned(found))
+    write_tuned(folder / "tuned.toml", folder / "tuning.toml", tuned(found))
     again = read_tuning(folder / "tuned.toml", PLANT).parameters
     assert again.free_names == found.free_names
     for name, parameter in found.items():

@@ -8,7 +8,8 @@ import pytest
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification.identifiability import identifiability
-from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.identify import identify
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck

@@ -11,7 +11,8 @@ from scipy.stats import binom
 
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import Symbols, System, define, discretise, names, parameter_vector
-from pneuopt.identification.identify import IdentificationResult, identify, predict, validate
+from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck

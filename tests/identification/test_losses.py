@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.identify import identify
 from pneuopt.identification.losses import Huber, Loss, SoftL1
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb

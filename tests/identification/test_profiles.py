@@ -5,8 +5,9 @@ import pytest
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System
-from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.identify import identify
 from pneuopt.identification.profiles import profile
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck

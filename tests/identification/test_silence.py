@@ -10,8 +10,9 @@ from numpy.testing import assert_allclose
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.files.toml import read_toml
-from pneuopt.identification.identify import IdentificationResult, identify
+from pneuopt.identification.identify import identify
 from pneuopt.identification.profiles import profile
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import LuGre, Stribeck

@@ -1,6 +1,5 @@
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import margins
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment, split
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre
@@ -35,6 +35,7 @@ from pneuopt.plotting import (
 )
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
@@ -52,16 +53,15 @@ def table(covariance: Mapping[str, float]) -> pd.DataFrame:
     return pd.DataFrame(np.diag(list(covariance.values())), index=list(covariance), columns=list(covariance))
 
 
-@dataclass(frozen=True)
-class Fit:
-    parameters: ParameterSet
-    trajectories: Mapping[str, Trajectory]
-    covariance: pd.DataFrame = field(default_factory=lambda: table({}))
-
-    @property
-    def estimates(self) -> pd.DataFrame:
-        values = [self.parameters.value(str(n)) for n in self.covariance.index]
-        return pd.DataFrame({"value": values}, index=self.covariance.index, dtype=float)
+def fit_of(
+    parameters: ParameterSet, trajectories: Mapping[str, Trajectory], covariance: pd.DataFrame | None = None
+) -> IdentificationResult:
+    """A result with nothing but what a figure shows of it."""
+    covariance = table({}) if covariance is None else covariance
+    values = [parameters.value(n) if n in parameters else np.nan for n in covariance.index]
+    estimates = pd.DataFrame({"value": values}, index=covariance.index, dtype=float)
+    status = Status(Code.CONVERGED)
+    return IdentificationResult(parameters, estimates, covariance, pd.DataFrame(), trajectories, status, {}, {})
 
 
 def fitted(seed: int = 0) -> tuple[Experiment, Trajectory]:
@@ -87,7 +87,7 @@ def lag(gain: float) -> Linearisation:
 
 def test_a_fit_stands_beside_its_log_with_units() -> None:
     pairs = [fitted(seed) for seed in range(2)]
-    figure = plot_fit(Fit(TRUTH, {e.name: run for e, run in pairs}), [e for e, _ in pairs])
+    figure = plot_fit(fit_of(TRUTH, {e.name: run for e, run in pairs}), [e for e, _ in pairs])
     assert len(figure.axes) == 4
     assert [texts(a) for a in figure.axes[:2]] == ["|position [mm]|run_0", "||run_1"]
     assert figure.axes[3].get_xlabel() == "time [s]"
@@ -114,7 +114,7 @@ def test_windows_of_a_log_share_its_axes_and_many_logs_are_spread() -> None:
 
 def test_the_friction_map_is_that_of_the_equations() -> None:
     experiment, run = fitted()
-    figure = plot_friction(DRIVE.system(), Fit(TRUTH, {"run_0": run}), [experiment])
+    figure = plot_friction(DRIVE.system(), fit_of(TRUTH, {"run_0": run}), [experiment])
     speed, force = line(figure.axes[0], "fitted")
     smoothing = TRUTH.value("friction.smoothing")
     assert np.allclose(force, 25 * np.tanh(speed / smoothing) + 40 * speed)
@@ -134,7 +134,7 @@ def test_the_friction_map_of_a_pneumatic_drive_with_bristles_is_the_stribeck_cur
     run = simulate(system, inputs, drive.parameters, initial={"position": 0.1})
     logged = run.select(["position", "pressure_a", "pressure_b"])
     log = Experiment(logged.with_columns({"valve_voltage": inputs["valve_voltage"]}))
-    (axes,) = plot_friction(system, Fit(drive.parameters, {"log 1": run}), [log]).axes
+    (axes,) = plot_friction(system, fit_of(drive.parameters, {"log 1": run}), [log]).axes
     v, force = line(axes, "fitted")
     Fc, Fs, vs, B = (
         drive.parameters.value(f"friction.{n}") for n in ("coulomb", "static", "stribeck_velocity", "viscous")
@@ -149,7 +149,7 @@ def test_the_friction_map_of_a_pneumatic_drive_with_bristles_is_the_stribeck_cur
 
 def test_the_friction_maps_band_is_that_of_the_estimates() -> None:
     experiment, run = fitted()
-    result = Fit(TRUTH, {"run_0": run}, table({"friction.coulomb": 4.0, "friction.viscous": 25.0}))
+    result = fit_of(TRUTH, {"run_0": run}, table({"friction.coulomb": 4.0, "friction.viscous": 25.0}))
     axes = plot_friction(DRIVE.system(), result, [experiment]).axes[0]
     (band,) = axes.collections
     speed, force = line(axes, "fitted")
@@ -159,7 +159,7 @@ def test_the_friction_maps_band_is_that_of_the_estimates() -> None:
         spread = np.sqrt(4.0 * np.tanh(v / TRUTH.value("friction.smoothing")) ** 2 + 25.0 * v**2)
         assert at.max() - at.min() == pytest.approx(2 * 1.96 * spread, rel=1e-3)
     assert np.isfinite(force).all()
-    blind = Fit(TRUTH, {"run_0": run}, table({"friction.coulomb": np.nan, "friction.viscous": 25.0}))
+    blind = fit_of(TRUTH, {"run_0": run}, table({"friction.coulomb": np.nan, "friction.viscous": 25.0}))
     assert len(plot_friction(DRIVE.system(), blind, [experiment]).axes[0].collections) == 0
 
 
@@ -189,11 +189,11 @@ def test_residuals_show_what_is_left_in_them() -> None:
 def test_correlations_are_cells_and_never_a_rounded_one() -> None:
     names = ["load.force", "friction.coulomb_asymmetry", "load.mass"]
     covariance = pd.DataFrame([[1, 0.99998, 0], [0.99998, 1, 0], [0, 0, np.nan]], index=names, columns=names)
-    axes = plot_correlation(Fit(TRUTH, {}, covariance)).axes[0]
+    axes = plot_correlation(fit_of(TRUTH, {}, covariance)).axes[0]
     assert [q.get_text() for q in axes.get_xticklabels()] == names[:2]
     assert sorted(q.get_text() for q in axes.texts) == ["0.9999", "0.9999", "1.00", "1.00"]
     with pytest.raises(InputError, match="no estimate has a standard deviation"):
-        plot_correlation(Fit(TRUTH, {}, covariance * np.nan))
+        plot_correlation(fit_of(TRUTH, {}, covariance * np.nan))
 
 
 def test_a_rig_shows_its_measured_force() -> None:
@@ -203,14 +203,14 @@ def test_a_rig_shows_its_measured_force() -> None:
     measured = 12 * np.sign(speed)
     experiment = Experiment(Trajectory(t, {"speed": speed, "force": measured}))
     figure = plot_friction(
-        rig.system(), Fit(rig.parameters, {"": Trajectory(t, {"force": measured + 1})}), [experiment]
+        rig.system(), fit_of(rig.parameters, {"": Trajectory(t, {"force": measured + 1})}), [experiment]
     )
     assert np.array_equal(line(figure.axes[0], "from the logs")[1], measured)
     assert np.array_equal(line(figure.axes[0], "fitted")[1], measured + 1)
     assert figure.axes[0].get_ylabel() == "force [N]"
     assert not has_friction_map(FirstOrder().system())
     with pytest.raises(InputError, match="a friction map is drawn for"):
-        plot_friction(FirstOrder().system(), Fit(rig.parameters, {}), [experiment])
+        plot_friction(FirstOrder().system(), fit_of(rig.parameters, {}), [experiment])
 
 
 def test_steps_show_band_reference_and_command() -> None:

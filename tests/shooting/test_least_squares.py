@@ -85,14 +85,14 @@ def single_shooting(problem: Transcription) -> OptimizeResult:
 
 
 def found(fit: Fit) -> Array:
-    return np.array([fit.solution.parameters.value(n) for n in TRUTH])
+    return np.array([fit.parameters.value(n) for n in TRUTH])
 
 
 def test_three_solvers_find_one_optimum() -> None:
     """Lifted (soft gaps), full-space (IPOPT, hard) and SciPy's single shooting, on the same numbers."""
     problem = two_logs()
     lifted, full, single = solve_least_squares(problem), solve_full_space(problem), single_shooting(problem)
-    assert lifted.solution.status.converged, lifted.solution.status
+    assert lifted.status.converged, lifted.status
     hard = np.array([full.parameters.value(n) for n in TRUTH])
     assert_allclose(hard, single.x[:4], rtol=1e-6)
     # gaps of 1e-5 nominal sizes stay open a little: the price is a small part of a standard deviation
@@ -132,7 +132,7 @@ def test_the_covariance_is_single_shootings(seed: int) -> None:
 def test_the_segments_length_does_not_change_the_answer(time: float) -> None:
     nodes = 200 if math.isinf(time) else round(time / H)
     fit = solve_least_squares(two_logs(nodes=nodes))
-    assert fit.solution.status.converged
+    assert fit.status.converged
     assert_allclose(found(fit), found(solve_least_squares(two_logs())), rtol=1e-5)
 
 
@@ -140,8 +140,8 @@ def test_a_known_start_state_is_kept() -> None:
     problem = two_logs()
     starts = tuple(replace(p, start=np.array([0.05, 0.0])) for p in problem.phases)
     fit = solve_least_squares(replace(problem, phases=starts))
-    assert fit.solution.status.converged
-    for run in fit.solution.trajectories:
+    assert fit.status.converged
+    for run in fit.trajectories:
         assert (run["position"][0], run["speed"][0]) == pytest.approx((0.05, 0.0), abs=1e-6)
     free = solve_least_squares(problem)
     assert fit.covariance is not None
@@ -154,8 +154,8 @@ def test_a_bound_stops_it_and_is_marked(bounds: tuple[float, float], value: floa
     problem = two_logs()
     parameters = problem.parameters.with_values({"stiffness": value}).with_bounds({"stiffness": bounds})
     fit = solve_least_squares(replace(problem, parameters=parameters))
-    assert fit.solution.status.converged, fit.solution.status
-    assert fit.solution.parameters.value("stiffness") == value
+    assert fit.status.converged, fit.status
+    assert fit.parameters.value("stiffness") == value
     assert fit.at_bound.tolist() == [True, False, False, False]
     assert fit.covariance is not None
     assert np.isnan(fit.covariance[0]).all()
@@ -166,8 +166,8 @@ def test_a_bound_stops_it_and_is_marked(bounds: tuple[float, float], value: floa
 
 def test_two_parameters_that_only_appear_as_a_product_are_named() -> None:
     fit = solve_least_squares(two_logs(extra=True))
-    assert fit.solution.status.code is Code.NOT_CONVERGED
-    assert "do not determine damping and factor" in fit.solution.status.message
+    assert fit.status.code is Code.NOT_CONVERGED
+    assert "do not determine damping and factor" in fit.status.message
     assert fit.covariance is None
 
 
@@ -175,10 +175,10 @@ def test_a_parameter_without_effect_is_named() -> None:
     problem = two_logs(extra=True)
     parameters = problem.parameters.fixed("factor").freed("idle")
     fit = solve_least_squares(replace(problem, parameters=parameters))
-    assert fit.solution.status.code is Code.NOT_CONVERGED
-    assert "do not feel idle" in fit.solution.status.message
+    assert fit.status.code is Code.NOT_CONVERGED
+    assert "do not feel idle" in fit.status.message
     assert fit.covariance is not None
-    position = list(fit.solution.parameters.free_names).index("idle")
+    position = list(fit.parameters.free_names).index("idle")
     assert np.isnan(fit.covariance[position]).all()
     assert np.isfinite(np.diag(fit.covariance)).sum() == 4
 
@@ -187,8 +187,8 @@ def test_without_free_parameters_the_states_are_fitted() -> None:
     problem = two_logs()
     fixed = problem.parameters.with_values(TRUTH).fixed("*")
     fit = solve_least_squares(replace(problem, parameters=fixed))
-    assert fit.solution.status.converged
-    assert fit.solution.trajectories[0]["position"][0] == pytest.approx(0.05, abs=5 * NOISE)
+    assert fit.status.converged
+    assert fit.trajectories[0]["position"][0] == pytest.approx(0.05, abs=5 * NOISE)
     assert fit.chi_square < 1.3 * fit.count
 
 
@@ -197,8 +197,8 @@ def test_a_model_that_cannot_follow_does_not_converge() -> None:
     problem = two_logs(nodes=2)
     wrong = problem.parameters.fixed("stiffness").with_values({"stiffness": 150.0})
     fit = solve_least_squares(replace(problem, parameters=wrong), LeastSquares(stages=(Stage(1e-2, 60),)))
-    assert fit.solution.status.code is Code.NOT_CONVERGED
-    assert "gaps between segments carry" in fit.solution.status.message
+    assert fit.status.code is Code.NOT_CONVERGED
+    assert "gaps between segments carry" in fit.status.message
 
 
 def shaken(size: float, seed: int = 0) -> Transcription:
@@ -227,8 +227,8 @@ def ahead(stiffness: float, damping: float, x: Array, u: Array, steps: int = 2) 
 
 def all_residuals(problem: Transcription, fit: Fit, unknowns: Array) -> Array:
     """Data and gaps as the solver poses them; unknowns are the parameters, then the nodes."""
-    steps, pieces, at = int(fit.solution.stats["substeps"]), [], 4
-    sigma = fit.solution.stats["gap_deviation"] * np.array([0.1 * 0.01, 0.5])  # the position's rate is known
+    steps, pieces, at = int(fit.stats["substeps"]), [], 4
+    sigma = fit.stats["gap_deviation"] * np.array([0.1 * 0.01, 0.5])  # the position's rate is known
     for i, (phase, residual) in enumerate(zip(problem.phases, problem.residuals, strict=True)):
         nodes = unknowns[at : at + 2 * len(phase.nodes)].reshape(-1, 2)
         force, at = phase.inputs[:, 0] + unknowns[2 + i], at + nodes.size
@@ -246,14 +246,14 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
     """An optimum, though not of hard gaps: SciPy finds nothing better. It says so; its intervals hold the truth."""
     problem = shaken(2e-3)
     fit = solve_least_squares(problem)
-    assert fit.solution.status.converged
-    assert "does not explain the log to its noise" in fit.solution.status.message
-    assert "speed jumps by" in fit.solution.status.message
-    runs = zip(problem.phases, fit.solution.trajectories, strict=True)
+    assert fit.status.converged
+    assert "does not explain the log to its noise" in fit.status.message
+    assert "speed jumps by" in fit.status.message
+    runs = zip(problem.phases, fit.trajectories, strict=True)
     nodes = [run.matrix(("position", "speed"))[phase.nodes].ravel() for phase, run in runs]
     here = np.concatenate([found(fit), *nodes])
     cost = 0.5 * np.sum(all_residuals(problem, fit, here) ** 2)
-    assert cost == pytest.approx(fit.solution.stats["cost"], rel=1e-9)
+    assert cost == pytest.approx(fit.stats["cost"], rel=1e-9)
     best: OptimizeResult = least_squares(partial(all_residuals, problem, fit), here, xtol=1e-13, ftol=1e-13, gtol=1e-10)
     assert fit.covariance is not None
     spread = np.sqrt(np.diag(fit.covariance))
@@ -267,25 +267,25 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
 def test_residuals_beyond_the_noise_are_told() -> None:
     problem = two_logs()
     proud = tuple(replace(r, noise=r.noise / 3) for r in problem.residuals)
-    status = solve_least_squares(replace(problem, residuals=proud)).solution.status
+    status = solve_least_squares(replace(problem, residuals=proud)).status
     assert status.converged
     assert "residuals are 2.9 times the noise of position" in status.message
-    assert "explain" not in solve_least_squares(problem).solution.status.message
+    assert "explain" not in solve_least_squares(problem).status.message
 
 
 def test_too_few_iterations_are_no_convergence() -> None:
     fit = solve_least_squares(two_logs(), LeastSquares(stages=(Stage(1e-5, 1),)))
-    assert fit.solution.status.code is Code.NOT_CONVERGED
-    assert "would still move by" in fit.solution.status.message
+    assert fit.status.code is Code.NOT_CONVERGED
+    assert "would still move by" in fit.status.message
 
 
 def test_a_model_too_stiff_to_search_is_told_at_once() -> None:
     problem = two_logs()
     stiff = problem.parameters.with_bounds({"damping": (0.0, 1e6)}).with_values({"damping": 3e4})
     fit = solve_least_squares(replace(problem, parameters=stiff))
-    assert fit.solution.status.code is Code.NOT_CONVERGED
-    assert "takes 300 integration steps" in fit.solution.status.message
-    assert fit.solution.stats["iterations"] == 0
+    assert fit.status.code is Code.NOT_CONVERGED
+    assert "takes 300 integration steps" in fit.status.message
+    assert fit.stats["iterations"] == 0
 
 
 def test_a_start_that_is_not_finite_is_told() -> None:
@@ -293,8 +293,8 @@ def test_a_start_that_is_not_finite_is_told() -> None:
     guess = np.full((problem.phases[0].n, 2), 1e300)
     phases = (replace(problem.phases[0], guess=guess), problem.phases[1])
     fit = solve_least_squares(replace(problem, phases=phases))
-    assert fit.solution.status.code is Code.DIVERGED
-    assert "not finite at the start" in fit.solution.status.message
+    assert fit.status.code is Code.DIVERGED
+    assert "not finite at the start" in fit.status.message
     assert fit.covariance is None
 
 
@@ -308,18 +308,18 @@ def test_an_interruption_hands_back_the_best_so_far() -> None:
 
     problem = two_logs()
     fit = solve_least_squares(problem, LeastSquares(progress=progress))
-    assert fit.solution.status.code is Code.INTERRUPTED
+    assert fit.status.code is Code.INTERRUPTED
     assert lines[-1].startswith("stage 1/6  iteration 3  cost ")
-    assert f"cost {fit.solution.stats['cost']:.6g} " in lines[-1]
-    assert fit.solution.stats["iterations"] == 3
+    assert f"cost {fit.stats['cost']:.6g} " in lines[-1]
+    assert fit.stats["iterations"] == 3
 
 
 def test_explicit_substeps_are_kept_and_their_error_is_told() -> None:
     problem = two_logs()
     coarse = solve_least_squares(problem, LeastSquares(substeps=1, stages=(Stage(1e-3, 20), Stage(1e-5, 30))))
     fine = solve_least_squares(problem, LeastSquares(substeps=8, stages=(Stage(1e-3, 20), Stage(1e-5, 30))))
-    assert (coarse.solution.stats["substeps"], fine.solution.stats["substeps"]) == (1, 8)
-    errors = [f.solution.stats["integration_error"] for f in (coarse, fine)]
+    assert (coarse.stats["substeps"], fine.stats["substeps"]) == (1, 8)
+    errors = [f.stats["integration_error"] for f in (coarse, fine)]
     assert errors[0] == pytest.approx(4096 * errors[1], rel=0.2)  # of order four
 
 
@@ -330,12 +330,12 @@ def held(problem: Transcription, name: str, value: float) -> Fit:
 
 
 def position(fit: Fit, name: str) -> int:
-    return list(fit.solution.parameters.free_names).index(name)
+    return list(fit.parameters.free_names).index(name)
 
 
 def test_a_good_fit_is_silent_about_nothing() -> None:
     fit = solve_least_squares(two_logs())
-    assert fit.solution.status.converged
+    assert fit.status.converged
     assert fit.unidentifiable == ()
     assert fit.prior_covariance is None
 
@@ -345,7 +345,7 @@ def test_what_is_not_felt_is_silent_and_held_it_adds_nothing() -> None:
     problem = replace(problem, parameters=problem.parameters.fixed("factor").freed("idle"))
     assert solve_least_squares(problem).unidentifiable == ("idle",)
     fit = held(problem, "idle", 1.0)
-    assert fit.solution.status.converged
+    assert fit.status.converged
     assert fit.unidentifiable == ()
     assert not fit.at_bound.any()
     assert fit.prior_covariance is not None
@@ -357,13 +357,13 @@ def test_of_two_that_only_count_together_one_is_silent_and_the_other_borrows_all
     problem = two_logs(extra=True)
     assert set(solve_least_squares(problem).unidentifiable) < {"damping", "factor"}
     fit = held(problem, "factor", factor)
-    assert fit.solution.status.converged
-    assert fit.solution.parameters.value("damping") * factor == pytest.approx(TRUTH["damping"], rel=0.05)
+    assert fit.status.converged
+    assert fit.parameters.value("damping") * factor == pytest.approx(TRUTH["damping"], rel=0.05)
     assert fit.prior_covariance is not None
     assert fit.covariance is not None
     borrowed, own = np.diag(fit.prior_covariance), np.diag(fit.covariance)
     at = position(fit, "damping")
     # damping times factor is known: ten times the factor, as many times less damping
-    assert np.sqrt(borrowed[at]) == pytest.approx(10 * fit.solution.parameters.value("damping"), rel=1e-3)
+    assert np.sqrt(borrowed[at]) == pytest.approx(10 * fit.parameters.value("damping"), rel=1e-3)
     others = [position(fit, n) for n in ("stiffness", "bias[a]", "bias[b]")]
     assert (borrowed[others] < 1e-6 * own[others]).all()
