@@ -37,6 +37,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate, final_operating_point, respond
+from pneuopt.evaluation.response import linearise_open_loop
 from pneuopt.files.tuning import Tuning, write_tuned
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
@@ -44,7 +45,6 @@ from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.space import linearise_open_loop
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.validation import DesignValidation, validate_design
 

@@ -11,7 +11,6 @@ from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.space import Space
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +69,6 @@ class TuningCase:
             raise HardwareError(f"{self._message_prefix}{error}", error.parameter, error.remedy) from None
         except InputError as error:
             raise InputError(f"{self._message_prefix}{error}") from None
-
-    def gain_independent_rest(self, loop: ClosedLoop, space: Space) -> Array | None:
-        """The state before the step where it does not depend on the gains."""
-        other = space.from_unit(np.full(len(space.names), 0.7))
-        first, second = (self.initial(loop, space.parameters_at(point)) for point in (space.start, other))
-        scale = np.array([q.nominal for q in loop.states])
-        return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
 
     @property
     def _message_prefix(self) -> str:

@@ -16,9 +16,9 @@ from pneuopt.dynamics.hooks import Rest
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import METRICS
+from pneuopt.evaluation.response import command_range
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.space import command_range
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,13 +18,13 @@ from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHA
 from pneuopt.evaluation.margins import margins, noise_gain
 from pneuopt.evaluation.means import period_mean
 from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.response import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
 from pneuopt.evaluation.rig import Rig, record
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.tuning.space import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,12 +14,13 @@ from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.margins import frequency_response
 from pneuopt.evaluation.means import TAIL_SHARE
 from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
+from pneuopt.evaluation.response import highest_dither_frequency
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.tuning.space import Space, highest_dither_frequency
+from pneuopt.tuning.space import Space
 
 STATIC_SIGN_FREQUENCY = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read
 BISECTION_STEPS = 10  # of the interval in which the fastest reachable reference is sought

@@ -11,25 +11,16 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.batch_margins import batch_margin_function
-from pneuopt.evaluation.cases import cases
+from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS, larger_is_better, requirement_values
+from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, loop_inputs, readings_a_sample, sample_spacing
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.readings import AIR_METRIC, CONTROL_OUTPUT, ReferenceGrid, has_integral, loop_pieces, read_metrics
-from pneuopt.tuning.space import (
-    MAX_LOOP_SUBSTEPS,
-    SAMPLES_A_DITHER_PERIOD,
-    Space,
-    dither_resolution_rate,
-    fastest_eigenvalue,
-    loop_inputs,
-    readings_a_sample,
-    rk4_substeps,
-    sample_spacing,
-)
+from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
 RUNAWAY_LEVEL = 1e12
 HEADLINES = {name: metric.source is Source.LINEAR_LOOP for name, metric in METRICS.items() if metric.headline}
@@ -80,7 +71,7 @@ class Simulator:
         self._wider: tuple[float, ...] = ()
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
-        self._rest = [case.gain_independent_rest(loop, space) for case in self.cases]
+        self._rest = [_gain_independent_rest(case, loop, space) for case in self.cases]
         self._rollout = Rollout(loop_pieces(loop, with_meter=AIR_METRIC in self.response_metrics))
         self.grids = _grids(loop, references, space.parameters)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
@@ -392,6 +383,14 @@ def is_sound(y: Array, x_end: Array) -> Mask:
     with np.errstate(all="ignore"):
         tame = np.all(np.abs(y) < RUNAWAY_LEVEL, axis=(1, 2))
     return np.asarray(tame & np.isfinite(x_end).all(axis=1))
+
+
+def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> Array | None:
+    """The state before the step where it does not depend on the gains."""
+    other = space.from_unit(np.full(len(space.names), 0.7))
+    first, second = (case.initial(loop, space.parameters_at(point)) for point in (space.start, other))
+    scale = np.array([q.nominal for q in loop.states])
+    return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
 
 
 def _grids(

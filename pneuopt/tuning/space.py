@@ -1,7 +1,6 @@
-"""Candidates of a tuning: where they lie, what they are as printed, and how a response is run and read."""
+"""`Space`: the box in which the candidates of a tuning lie, what they are as printed, and the steps that they need."""
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,26 +8,15 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbance_input
-from pneuopt.dynamics.system import Linearisation
-from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
+from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, command_range, highest_dither_frequency
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.trajectories import Trajectory
 
 RK4_MAX_H_LAMBDA = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
 MAX_LOOP_SUBSTEPS = 100
 MAX_ROUNDING_POINTS = 625  # points: all that differ by two last places or less in four gains
-RESPONSE_SAMPLES = 1000  # samples of a response where the loop has no sample time
-READINGS_A_HORIZON, MIN_READINGS_A_SAMPLE, MAX_READINGS_A_SAMPLE = (
-    1000,
-    2,
-    16,
-)  # of a sampled loop: so many a horizon, and a sample
-SAMPLES_A_DITHER_PERIOD = 20  # of a continuous dither; at six, its average claimed 47 ms on T32 where 63 are certified
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,16 +172,6 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     return Space(full, free)
 
 
-def command_range(p: ParameterSet) -> tuple[float, float, str]:
-    """Between which values the command acts, and what ends it: the controller's limits, or the valve's span."""
-    low, high, whose = -math.inf, math.inf, "the command"
-    if "pid.lower" in p:
-        low, high = p.value("pid.lower"), p.value("pid.upper")
-    if "valve.span" in p and p.value("valve.span") < min(-low, high):
-        low, high, whose = -p.value("valve.span"), p.value("valve.span"), "the valve"
-    return low, high, whose
-
-
 def _check_amplitude(p: ParameterSet) -> None:
     """Refuse a search where dither alone, around no matter what offset, runs into the command's limits."""
     (low, high, whose), most = command_range(p), p["dither.amplitude"].upper
@@ -203,86 +181,6 @@ def _check_amplitude(p: ParameterSet) -> None:
         f"dither.amplitude may reach {most:g} {unit}, but {whose} ends at {low:g} and {high:g} {unit}, which cuts the "
         f"peaks of more than {(high - low) / 2:g} {unit}; lower its upper bound",
     )
-
-
-def measure(
-    loop: ClosedLoop,
-    parameters: ParameterSet,
-    reference: Step,
-    response: Trajectory,
-    band: float,
-    envelope: Envelope = (),
-) -> dict[str, float]:
-    """The metrics of a simulated response, the settling band around the reference.
-
-    What counts is the plant's own signal, whatever a sensor shows the controller of it.
-
-    Parameters
-    ----------
-    response : Trajectory
-        The loop's outputs.
-    """
-    return step_metrics(
-        response.t,
-        response[loop.feedback.name],
-        reference.final,
-        reference.initial,
-        start=reference.at,
-        band=band,
-        band_centre=BandCentre.REFERENCE,
-        dither_period=loop.dither_period(parameters),
-        control=response["control"],
-        sample_time=loop.pid.sample_time,
-        envelope=envelope,
-        scale=None if reference.is_step else reference.nominal_size,
-    )
-
-
-def linearise_open_loop(
-    loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step | None = None
-) -> Linearisation:
-    """The open loop for margins, about a plant state x under a command, and under what disturbs it in the end."""
-    others = {} if reference is None else {disturbance_input(n): v for n, v in reference.disturbance.items()}
-    return add_disturbances(loop, [reference] if reference else []).open_loop(
-        parameters, x, {loop.command.name: command, **others}
-    )
-
-
-def loop_inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
-    """The loop's inputs under a reference; those that the reference does not name are zero."""
-    run = reference.trajectory(step)
-    others = [q.name for q in loop.inputs if q.name not in run]
-    return run.with_columns({n: np.zeros(len(run)) for n in others})
-
-
-def sample_spacing(
-    loop: ClosedLoop, reference: Step, parameters: ParameterSet, samples_a_period: int = SAMPLES_A_DITHER_PERIOD
-) -> float:
-    """Samples' distance [s]: the controller's, or a fine one on which the step's instant lies."""
-    if loop.pid.sample_time is not None:
-        return loop.pid.sample_time
-    rate = highest_dither_frequency(loop, parameters)
-    longest = min(reference.horizon / RESPONSE_SAMPLES, 1 / (samples_a_period * rate) if rate else np.inf)
-    whole = reference.at if reference.at > 0 else reference.horizon
-    return float(whole / math.ceil(whole / longest - 1e-9))
-
-
-def readings_a_sample(loop: ClosedLoop, reference: Step) -> int:
-    """How often a response is read in a sample: between two of them it may leave the band."""
-    h = loop.pid.sample_time
-    if h is None:
-        return 1
-    return min(
-        MAX_READINGS_A_SAMPLE, max(MIN_READINGS_A_SAMPLE, math.ceil(h * READINGS_A_HORIZON / reference.horizon - 1e-9))
-    )
-
-
-def highest_dither_frequency(loop: ClosedLoop, parameters: ParameterSet) -> float:
-    """The highest frequency that the dither may get [Hz]; 0 without dither."""
-    if loop.dither is None:
-        return 0.0
-    frequency = (loop.parameters | parameters)["dither.frequency"]
-    return frequency.upper if frequency.free else frequency.value
 
 
 def dither_resolution_rate(loop: ClosedLoop, parameters: ParameterSet) -> float:

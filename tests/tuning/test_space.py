@@ -9,6 +9,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import Ripple, SettlingTime
+from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
@@ -17,13 +18,7 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import (
-    SAMPLES_A_DITHER_PERIOD,
-    dither_resolution_rate,
-    highest_dither_frequency,
-    sample_spacing,
-    search_space,
-)
+from pneuopt.tuning.space import dither_resolution_rate, search_space
 from pneuopt.tuning.tune import tune
 
 STEP = Step(0.1, horizon=0.4)
@@ -39,13 +34,9 @@ def axis(
     return loop, loop.parameters.with_values(values)
 
 
-def test_samples_follow_the_highest_frequency_that_is_allowed() -> None:
-    loop, p = axis(None)
-    free = p.with_bounds(WIDE).freed(*WIDE)
-    assert (highest_dither_frequency(loop, p), highest_dither_frequency(loop, free)) == (80.0, 200.0)
-    assert sample_spacing(loop, STEP, free) <= 1 / (SAMPLES_A_DITHER_PERIOD * 200.0) < sample_spacing(loop, STEP, p)
-    assert sample_spacing(*axis(1e-3)[:1], STEP, free) == 1e-3
-    assert dither_resolution_rate(loop, free) == 0.0
+def test_steps_resolve_an_analogue_dither_between_two_samples() -> None:
+    free = axis(None)[1].with_bounds(WIDE).freed(*WIDE)
+    assert dither_resolution_rate(axis(None)[0], free) == 0.0
     assert dither_resolution_rate(axis(1e-3, analogue=True)[0], free) >= SAMPLES_A_DITHER_PERIOD * 200.0
 
 

@@ -288,7 +288,7 @@ def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
 
     method = Screening(members=12, generations=3, refinements=0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Responses, "robust", counting)
+        patch.setattr(Responses, "with_margins", counting)
         found = run_screening(simulator, references, space, spec, method, space.start, lambda _: None)
     assert found.is_complete
     assert found.count == 12 * 4 * 4
