@@ -29,11 +29,20 @@ def write_text(path: Path, columns: Columns) -> None:
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
 
 
+def write_parquet(path: Path, columns: Columns) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays = {name: pa.array([None if np.isnan(v) else v for v in values]) for name, values in columns.items()}
+    pq.write_table(pa.table(arrays), path)
+
+
 WRITERS: dict[str, Callable[[Path, Columns], None]] = {
     ".csv": write_text,
     ".txt": write_text,
     ".tsv": write_text,
     ".dat": write_text,
+    ".parquet": write_parquet,
 }
 FIRST_ROWS = dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), 2)
 """The row number of a format's first sample, where it is not 1."""
