@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from pneuopt.logs import csv, parquet
+from pneuopt.logs import csv, mat, parquet
 from pneuopt.logs.table import Table
 from pneuopt.quantities.errors import LogError, require
 
@@ -13,6 +13,7 @@ READERS: Mapping[str, Callable[[Path], Table]] = {
     ".tsv": csv.read_table,
     ".dat": csv.read_table,
     ".parquet": parquet.read_table,
+    ".mat": mat.read_table,
 }
 """The suffix of a file, in lower case, to the function that reads it."""
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from pneuopt.logs.experiments import Experiment, read_log
 from pneuopt.logs.readers import READERS
@@ -37,12 +38,17 @@ def write_parquet(path: Path, columns: Columns) -> None:
     pq.write_table(pa.table(arrays), path)
 
 
+def write_mat(path: Path, columns: Columns) -> None:
+    savemat(path, {name: np.array(values)[:, None] for name, values in columns.items()}, appendmat=False)
+
+
 WRITERS: dict[str, Callable[[Path, Columns], None]] = {
     ".csv": write_text,
     ".txt": write_text,
     ".tsv": write_text,
     ".dat": write_text,
     ".parquet": write_parquet,
+    ".mat": write_mat,
 }
 FIRST_ROWS = dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), 2)
 """The row number of a format's first sample, where it is not 1."""
