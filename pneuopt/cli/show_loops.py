@@ -18,7 +18,7 @@ from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, percent_factor, user_limit
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
-from pneuopt.studies.sweep import INTERRUPTED_CASE
+from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.tuning.validation import DesignValidation
 
 if TYPE_CHECKING:

@@ -42,7 +42,8 @@ from pneuopt.plotting import plot_front, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.units import write_value
-from pneuopt.studies.sweep import INTERRUPTED_CASE, grid, sweep
+from pneuopt.studies.outcome import INTERRUPTED_CASE
+from pneuopt.studies.sweep import grid, sweep
 from pneuopt.tuning.pareto import pareto_front
 
 if TYPE_CHECKING:

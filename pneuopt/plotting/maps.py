@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pneuopt.plotting.canvas import BLUE, MAX_PLOT_COLUMNS, RED, axes_grid, note_omissions
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.studies.sweep import INTERRUPTED_CASE
+from pneuopt.studies.outcome import INTERRUPTED_CASE
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -28,7 +28,8 @@ from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies.sweep import INTERRUPTED_CASE, grid, sweep
+from pneuopt.studies.outcome import INTERRUPTED_CASE
+from pneuopt.studies.sweep import grid, sweep
 
 RIG = ParameterSet(
     {
@@ -49,6 +50,8 @@ def troubled(p):
         raise ValueError("two\\nlines")
     if mass == 3.0:
         os._exit(7)
+    if mass == 8.0:
+        os._exit(0)
     if mass == 4.0:
         return [1, 2]
     if mass == 5.0:
@@ -137,13 +140,14 @@ def test_processes_give_what_a_loop_gives_in_the_order_of_the_cases(functions: M
 
 
 def test_whatever_happens_to_a_case_stays_in_its_row(functions: ModuleType) -> None:
-    table = sweep(functions.troubled, RIG, masses(1, 2, 3, 4, 5, 6, 7)).set_index("case")
+    table = sweep(functions.troubled, RIG, masses(1, 2, 3, 4, 5, 6, 7, 8)).set_index("case")
     assert table["mass"].dropna().to_dict() == {"1 kg": 1, "6 kg": 6, "7 kg": 7}
     assert (table["process"].dropna() != os.getpid()).all()
     error = table["error"].to_dict()
     assert [error[f"{k} kg"] for k in (1, 6, 7)] == ["", "", ""]
     assert error["2 kg"].startswith("ValueError: two lines (study_functions.py, line ")
     assert error["3 kg"] == "its process died (exit code 7)"
+    assert error["8 kg"] == "its process died (exit code 0)"
     assert error["4 kg"] == "InputError: value is list; return numbers or text, by name"
     assert error["5 kg"].startswith("SystemExit: enough")
 
