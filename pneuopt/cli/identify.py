@@ -59,7 +59,8 @@ def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: fl
     """Identify from logs; returns the exit status."""
     outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation")
     model, parameters = _read_free_drive(drive)
-    system, experiments = model.system(), _read_experiments(logs, window)
+    system = model.system()
+    experiments = _read_experiments(logs, window, system)
     for sentence in identifiability(system, experiments, parameters).sentences:
         warn(f"before the fit: {sentence}")
     with progress("identifying", quiet=quiet) as report_progress:
@@ -96,7 +97,7 @@ def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: floa
     with progress("selecting", quiet=quiet) as report_progress:
         chosen = select_model(
             systems,
-            _read_experiments(logs, window),
+            _read_experiments(logs, window, model.system()),
             known,
             free=[*free, *FRICTION_PARAMETERS],
             method=LeastSquares(progress=report_progress),
@@ -110,7 +111,8 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
     """Predict a log in open loop; returns the exit status."""
     outputs.check([fit, log, log.with_suffix(".toml")])
     model, parameters = read_drive(fit)
-    system, experiment = model.system(), read_log(log)
+    system = model.system()
+    experiment = read_log(log, plant=system)
     warn_of_status(fit)
     table = validate(system, [experiment], parameters)
     show_fit(make_console(), table)
@@ -126,8 +128,8 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
     return finish(outputs, writers, {"fit": records(table), "provenance": file_hashes(fit, log)}, None)
 
 
-def _read_experiments(logs: Sequence[Path], window: float | None) -> list[Experiment]:
-    experiments = [read_log(path) for path in logs]
+def _read_experiments(logs: Sequence[Path], window: float | None, plant: System) -> list[Experiment]:
+    experiments = [read_log(path, plant=plant) for path in logs]
     if window is None:
         return experiments
     require(window > 0, f"--window must be positive, got {window:g} s")

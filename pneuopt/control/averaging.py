@@ -184,6 +184,7 @@ class _DitheredSystem:
             rest_hook=system.rest_hook,
             hardware_check_hook=system.hardware_check_hook,
             validity_limits=system.validity_limits,
+            axis=system.axis,
         )
 
     def imbalance(self, nodes: int) -> ca.Function:

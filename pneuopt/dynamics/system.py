@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,6 +22,25 @@ Symbols = Mapping[str, ca.SX]
 Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
 SymbolicUpdate = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
 FRICTION_DIRECTION = "friction.direction"  # of Karnopp's friction: what a simulation switches
+
+
+class Axis(NamedTuple):
+    """A body that a plant moves against friction: what its states and its mass are called.
+
+    Attributes
+    ----------
+    position, speed : str
+        States.
+    inertia : str
+        The parameter that multiplies the speed's rate: a mass, or a moment of inertia.
+    force : str
+        The unit of what pushes the body.
+    """
+
+    position: str = "position"
+    speed: str = "speed"
+    inertia: str = "load.mass"
+    force: str = "N"
 
 
 @dataclass(frozen=True)
@@ -63,6 +83,8 @@ class System:
         outputs, for nobody logs them.
     excitation : Excitation
         Which motion a log must show for its parameters to be identifiable.
+    axis : Axis, optional
+        What it moves against friction, under the names of its own.
     """
 
     states: tuple[Quantity, ...]
@@ -77,6 +99,7 @@ class System:
     log_warning_hook: LogWarningHook | None = None
     meter: ca.Function | None = None
     excitation: Excitation = field(default_factory=Excitation)
+    axis: Axis | None = None
 
     def __repr__(self) -> str:
         return describe(self)

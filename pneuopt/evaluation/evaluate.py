@@ -187,14 +187,13 @@ def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command
     With this slope friction is in the linearised loop at low frequencies, its own states, bristles, following; a
     negative one makes crawl likely.
     """
-    states, full = [q.name for q in loop.plant.states], loop.parameters | parameters
-    rubs = any(n.startswith("friction.") for n in loop.plant.parameters)
-    if not rubs or "load.mass" not in loop.plant.parameters or "speed" not in states:
+    states, full, axis = [q.name for q in loop.plant.states], loop.parameters | parameters, loop.plant.axis
+    if axis is None or not any(n.startswith("friction.") for n in loop.plant.parameters):
         return {}
     A = loop.plant.linearise(x, {loop.command.name: command}, full).A
-    v, z = states.index("speed"), [k for k, n in enumerate(states) if n.startswith("friction.")]
+    v, z = states.index(axis.speed), [k for k, n in enumerate(states) if n.startswith("friction.")]
     followed = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
-    return {"FrictionSlope": float(-full.value("load.mass") * (A[v, v] - followed))}
+    return {"FrictionSlope": float(-full.value(axis.inertia) * (A[v, v] - followed))}
 
 
 def _margin_metrics(

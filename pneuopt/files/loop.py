@@ -134,11 +134,11 @@ def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | 
     if "lag" in table:
         lag = read_fixed_value(table, "lag", "s", where)
         return construct_at(lambda: SensorLag(lag), where)
-    usual = Encoder()
+    usual = Encoder() if plant.axis is None else Encoder(position=plant.axis.position)
     unit = {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")
     resolution = read_fixed_value(table, "resolution", unit, where) if "resolution" in table else usual.resolution
     filter_time = read_fixed_value(table, "filter", "s", where) if "filter" in table else usual.filter
-    return construct_at(lambda: Encoder(resolution, filter_time), where)
+    return construct_at(lambda: replace(usual, resolution=resolution, filter=filter_time), where)
 
 
 def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:

@@ -28,7 +28,8 @@ def check_logs(system: Fittable, experiments: Sequence[Experiment], parameters: 
     require(len(experiments) > 0, "no experiments: give at least one log", LogError)
     check_names("parameter", parameters, system.parameters)
     system.check(parameters)
-    known = {*names(system.inputs), *names(system.outputs), *SETPOINT_CHANNELS}
+    signals = {*names(system.inputs), *names(system.outputs)}
+    known = {*signals, *SETPOINT_CHANNELS, *(f"{n}_reference" for n in names(system.outputs))}
     taken: set[str] = set()
     out = []
     for number, experiment in enumerate(experiments, 1):
@@ -104,7 +105,7 @@ def _check_channels(system: Fittable, experiment: Experiment, name: str, known: 
         )
     for channel in trajectory:
         remedy = "leave it out (Experiment.select, or the sidecar's [columns])"
-        reads = ", ".join(sorted(known.difference(SETPOINT_CHANNELS)))
+        reads = ", ".join(sorted(n for n in known if not n.endswith("_reference")))
         message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
         require(channel in known, message, LogError)
     outputs = ", ".join(names(system.outputs))

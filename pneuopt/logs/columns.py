@@ -33,7 +33,9 @@ _SYNONYMS = {"t": "time", "velocity": "speed", "displacement": "position", "volt
 _BRACKETED_UNIT = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")
 
 
-def read_channels(table: Table, entries: Mapping[str, Any] | None, where: str) -> dict[str, Array]:
+def read_channels(
+    table: Table, entries: Mapping[str, Any] | None, where: str, channels: Mapping[str, str] = CHANNELS
+) -> dict[str, Array]:
     """Read the channels of a log from its columns.
 
     Parameters
@@ -43,6 +45,8 @@ def read_channels(table: Table, entries: Mapping[str, Any] | None, where: str) -
         Channel to column, as in a sidecar's [columns]; None: the columns' names say it.
     where : str
         Where the entries come from, for messages.
+    channels : mapping of str to str
+        The channels that a column may be, and their SI units.
 
     Returns
     -------
@@ -54,9 +58,12 @@ def read_channels(table: Table, entries: Mapping[str, Any] | None, where: str) -
     LogError, UnitError, UnknownNameError
         If the log cannot be understood beyond doubt.
     """
-    found = _columns_from_names(table) if entries is None else _columns_from_entries(table, entries, where)
+    if entries is None:
+        found = _columns_from_names(table, channels)
+    else:
+        found = _columns_from_entries(table, entries, where, channels)
     require("time" in found, f'{table.path}: no time; name a column "time [s]", or say which in a sidecar', LogError)
-    require(len(found) > 1, f"{table.path}: no channel but time; known: {', '.join(CHANNELS)}", LogError)
+    require(len(found) > 1, f"{table.path}: no channel but time; known: {', '.join(channels)}", LogError)
     numbers = table.read([column.name for column in found.values()])
     _check_finite(table, numbers)
     values = {channel: c.factor * numbers[c.name] + c.offset for channel, c in found.items()}
@@ -72,30 +79,31 @@ class _Column(NamedTuple):
     offset: float
 
 
-def _columns_from_names(table: Table) -> dict[str, _Column]:
+def _columns_from_names(table: Table, channels: Mapping[str, str]) -> dict[str, _Column]:
     """Columns whose name is a channel and its unit; a name that nearly is a channel is an error."""
     found: dict[str, _Column] = {}
     for name in filter(None, table.names):
-        channel, unit = _split_channel(name)
+        channel, unit = _split_channel(name, channels)
         if not channel:
-            _check_misspelling(table, name)
+            _check_misspelling(table, name, channels)
             continue
         where = f"{table.path}: column {name!r}"
         require(channel not in found, f"{where}: {channel!r} has another column; name one in a sidecar", LogError)
+        entry = {"column": name, "unit": unit} if unit else name
         try:
-            found[channel] = _resolve_column(table, channel, {"column": name, "unit": unit} if unit else name, where)
+            found[channel] = _resolve_column(table, channel, entry, where, channels)
         except UnitError as error:
             raise UnitError(f"{error} (or list the columns to use in a sidecar)") from None
     return found
 
 
-def _split_channel(name: str) -> tuple[str, str]:
+def _split_channel(name: str, channels: Mapping[str, str]) -> tuple[str, str]:
     """Split "position [mm]" or "position_mm" into channel and unit; ("", "") if it names no channel."""
     bare, unit = _split_unit(name)
     plain = bare.casefold().replace(" ", "_")
-    if plain in CHANNELS:
+    if plain in channels:
         return plain, unit
-    for channel in sorted(CHANNELS, key=len, reverse=True):
+    for channel in sorted(channels, key=len, reverse=True):
         if plain.startswith(channel + "_") and not unit:
             return channel, bare[len(channel) + 1 :]
     return "", ""
@@ -106,12 +114,12 @@ def _split_unit(name: str) -> tuple[str, str]:
     return (match[1] or match[3], match[2] or match[4] or "") if match else (name, "")
 
 
-def _check_misspelling(table: Table, name: str) -> None:
+def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> None:
     bare, unit = _split_unit(name)
     parts = bare.casefold().replace(" ", "_").split("_")
     for n in range(len(parts), 0 if not unit else len(parts) - 1, -1):
         head = "_".join(parts[:n])
-        near = difflib.get_close_matches(head, CHANNELS, n=1, cutoff=0.85) or [_SYNONYMS.get(head, "")]
+        near = difflib.get_close_matches(head, channels, n=1, cutoff=0.85) or [_SYNONYMS.get(head, "")]
         require(
             not near[0],
             f"{table.path}: column {name!r} looks like the channel {near[0]!r}; write it so, "
@@ -120,12 +128,14 @@ def _check_misspelling(table: Table, name: str) -> None:
         )
 
 
-def _columns_from_entries(table: Table, entries: Mapping[str, Any], where: str) -> dict[str, _Column]:
-    check_names("channel", entries, CHANNELS, where)
-    return {channel: _resolve_column(table, channel, entry, f"{where}.{channel}") for channel, entry in entries.items()}
+def _columns_from_entries(
+    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str]
+) -> dict[str, _Column]:
+    check_names("channel", entries, channels, where)
+    return {name: _resolve_column(table, name, entry, f"{where}.{name}", channels) for name, entry in entries.items()}
 
 
-def _resolve_column(table: Table, channel: str, entry: Any, where: str) -> _Column:
+def _resolve_column(table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str]) -> _Column:
     column = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
     check_names("key", column, ("column", "unit", "centre", "scale"), where)
     require(isinstance(column.get("column"), str), f'{where}: say which column: {{ column = "U valve" }}', LogError)
@@ -135,10 +145,10 @@ def _resolve_column(table: Table, channel: str, entry: Any, where: str) -> _Colu
         name = bare
     if name not in table.names:
         raise UnknownNameError("column", column["column"], filter(None, table.names), where)
-    unit = str(column.get("unit") or unit or _split_channel(name)[1])
-    require(bool(unit), f'{where}: no unit; write "{bare} [{CHANNELS[channel]}]", or unit = "..."', UnitError)
+    unit = str(column.get("unit") or unit or _split_channel(name, channels)[1])
+    require(bool(unit), f'{where}: no unit; write "{bare} [{channels[channel]}]", or unit = "..."', UnitError)
     raw_centre = read_value(column["centre"], unit, where=f"{where}.centre") if "centre" in column else 0.0
-    factor, offset = _column_scaling(unit, column.get("scale"), CHANNELS[channel], where)
+    factor, offset = _column_scaling(unit, column.get("scale"), channels[channel], where)
     return _Column(name, factor, offset - factor * raw_centre)
 
 
@@ -153,8 +163,22 @@ def _column_scaling(unit: str, scale: str | float | None, target: str, where: st
         UnitError,
     )
     bare, bare_target = (re.sub(r"\([ag]\)", "", text) for text in (unit, target))
-    gain = read_value(re.sub(r"\([ag]\)", "", str(scale)), f"({bare_target})/({bare})", where=f"{where}.scale")
+    gain = _read_gain(re.sub(r"\([ag]\)", "", str(scale)), bare, bare_target, f"{where}.scale")
     return gain, si_conversion(bare_target + (level[0] if level else ""), target, where=f"{where}.scale")[1]
+
+
+def _read_gain(scale: str, unit: str, target: str, where: str) -> float:
+    """A sensor's "35 N/V", or its inverse, as data sheets of encoders have it: "8192 count/rev"."""
+    try:
+        return read_value(scale, f"({target})/({unit})", where=where)
+    except UnitError:
+        try:
+            inverse = read_value(scale, f"({unit})/({target})")
+        except UnitError:
+            inverse = 0.0
+        if not inverse:
+            raise
+        return 1 / inverse
 
 
 def _check_finite(table: Table, numbers: Mapping[str, Array]) -> None:

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,11 +14,26 @@ from pneuopt.logs.columns import CHANNELS, read_channels
 from pneuopt.logs.readers import read_table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, check_names, require
+from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import read_si, read_value
 
 COMMAND_CHANNELS = ("valve_voltage", "speed_reference", "position_reference")
 """Channels that a controller holds from sample to sample; the others vary in between."""
+
+
+class Plant(Protocol):
+    """What a log's reader asks of a plant, say a `System`."""
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Signals that drive it."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """Signals that sensors show."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +52,8 @@ class Experiment:
         What tables call it.
     sha256 : str
         Of the file's bytes, for provenance.
+    units : mapping of str to str
+        SI units of channels for which `CHANNELS` says none, or another: an angular speed's "rad/s".
 
     Raises
     ------
@@ -55,6 +72,7 @@ class Experiment:
     conditions: Mapping[str, float] = field(default_factory=dict)
     name: str = ""
     sha256: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         where = self.name or "experiment"
@@ -67,6 +85,10 @@ class Experiment:
             require(math.isfinite(value), f"{where}: condition {parameter!r} must be finite, got {value}")
         object.__setattr__(self, "noise", dict(self.noise))
         object.__setattr__(self, "conditions", dict(self.conditions))
+
+    def unit(self, channel: str) -> str:
+        """The SI unit of a channel; empty where nothing says it."""
+        return self.units.get(channel) or CHANNELS.get(channel, "")
 
     def select(self, names: Iterable[str]) -> "Experiment":
         """Keep the named channels, in that order, by copy."""
@@ -87,6 +109,7 @@ def read_log(
     *,
     columns: Mapping[str, str | Mapping[str, str | float]] | None = None,
     sidecar: str | Path | None = None,
+    plant: Plant | None = None,
 ) -> Experiment:
     """Read a log, and what its sidecar says about it.
 
@@ -97,10 +120,13 @@ def read_log(
         semicolon or tab keep apart, and with decimal point or comma. An empty cell is a missing sample.
     columns : mapping, optional
         Channel to column, in place of the sidecar's [columns]: "t [ms]", or a mapping with `column`, `unit`,
-        `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied). Without either, the header has to say
-        "position [mm]" or "position_mm".
+        `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied, or an encoder's "8192 count/rev"). Without
+        either, the header has to say "position [mm]" or "position_mm".
     sidecar : str or Path, optional
         TOML with [columns], [noise], [conditions]; by default the file of the same name, if there is one.
+    plant : System, optional
+        Its inputs and outputs, and their references, are channels in its units, beside and before the usual ones:
+        torque [N*m] and angle [rad], say.
 
     Returns
     -------
@@ -115,11 +141,14 @@ def read_log(
     sha256 = hashlib.sha256(_read_bytes(path)).hexdigest()
     side, said = _read_sidecar(path, sidecar)
     entries, where = (columns, "columns") if columns is not None else (said.get("columns"), f"{side}: columns")
-    values = read_channels(read_table(path), entries, where)
+    units = {} if plant is None else _plant_channels(plant)
+    channels = {**CHANNELS, **units}
+    values = read_channels(read_table(path), entries, where, channels)
     trajectory = Trajectory(values.pop("time"), values)
     conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in said.get("conditions", {}).items()}
-    noise = _read_noise(said.get("noise", {}), trajectory, f"{side}: noise")
-    return Experiment(trajectory, noise, conditions, path.stem, sha256)
+    noise = _read_noise(said.get("noise", {}), trajectory, f"{side}: noise", channels)
+    own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
+    return Experiment(trajectory, noise, conditions, path.stem, sha256, own)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
@@ -277,7 +306,15 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
     return side, said
 
 
-def _read_noise(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, float]:
+def _plant_channels(plant: Plant) -> dict[str, str]:
+    """The channels that a plant's log may hold: its signals, and the references of its outputs."""
+    references = {f"{q.name}_reference": q.unit for q in plant.outputs}
+    return {**{q.name: q.unit for q in (*plant.inputs, *plant.outputs)}, **references}
+
+
+def _read_noise(
+    entries: Mapping[str, Any], trajectory: Trajectory, where: str, channels: Mapping[str, str]
+) -> dict[str, float]:
     check_names("channel", entries, trajectory, where)
     # A noise is a difference, so a pressure's takes no (a) or (g).
-    return {c: read_value(v, CHANNELS[c].partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}
+    return {c: read_value(v, channels[c].partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from pneuopt.dynamics.system import Symbols, System, define
+from pneuopt.dynamics.system import Axis, Symbols, System, define
 from pneuopt.models.declaration import DriveKind, flag
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
@@ -57,7 +57,8 @@ class ForceDrive:
 
         inputs = (FORCE, *_pressure_inputs(self.friction))
         system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, force_starts)
-        return replace(system, excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION)
+        excitation = self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION
+        return replace(system, excitation=excitation, axis=Axis())
 
 
 @dataclass(frozen=True)

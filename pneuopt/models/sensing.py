@@ -77,6 +77,7 @@ def with_sensors(
         hardware_check_hook=system.hardware_check_hook,
         validity_limits=system.validity_limits,
         excitation=system.excitation,
+        axis=system.axis,
     )
 
 

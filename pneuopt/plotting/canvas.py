@@ -5,8 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.output import write_bytes
+from pneuopt.quantities.trajectories import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,6 +50,18 @@ def check_figure_path(path: str | Path) -> None:
         suffix in FIGURE_SUFFIXES,
         f"{path}: a figure is written as {', '.join('.' + s for s in FIGURE_SUFFIXES)}; name it so",
     )
+
+
+def common_channels(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> list[str]:
+    """Channels that a log and its run both have, the usual ones first."""
+    both = dict.fromkeys(n for run, e in zip(runs, experiments, strict=True) for n in run if n in e.trajectory)
+    return [*(n for n in CHANNELS if n in both), *(n for n in both if n not in CHANNELS)]
+
+
+def plot_unit(experiments: Sequence[Experiment], channel: str) -> tuple[float, str]:
+    """By what a channel's SI values are multiplied in a figure, and the unit that its axis shows."""
+    unit = next((unit for e in experiments if (unit := e.unit(channel))), "")
+    return PLOT_UNITS.get(unit, (1.0, unit))
 
 
 def axes_grid(

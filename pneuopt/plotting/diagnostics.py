@@ -10,7 +10,7 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.statistics import correlation, ljung_box
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment
-from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, PLOT_UNITS, RED, axes_grid, note_omissions
+from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, common_channels, note_omissions, plot_unit
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -42,7 +42,7 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
     """
     require(len(runs) == len(experiments) > 0, f"{len(runs)} runs do not match {len(experiments)} experiments")
     pairs = list(zip(runs, experiments, strict=True))
-    channels = [n for n in CHANNELS if any(n in e.trajectory and n in r for r, e in pairs)]
+    channels = common_channels(runs, experiments)
     require(bool(channels), "the runs and the logs have no channel in common")
     shown = channels[:MAX_PLOT_CHANNELS]
     figure, grid = axes_grid(len(shown), 4, [2.4] * len(shown), width=13.0)
@@ -112,7 +112,7 @@ def _channel_residuals(pairs: Sequence[tuple[Trajectory, Experiment]], channel: 
 
 
 def _draw_over_time(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
-    factor, unit = PLOT_UNITS.get(CHANNELS[channel], (1.0, CHANNELS[channel]))
+    factor, unit = plot_unit([e for _, e in pairs], channel)
     found = _channel_residuals(pairs, channel)
     every = max(1, sum(len(log) for log, _ in found) // MAX_PLOT_POINTS)
     for number, (log, e) in enumerate(found):
@@ -141,7 +141,8 @@ def _draw_autocorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experi
 def _draw_crosscorrelation(axes: "Axes", pairs: Sequence[tuple[Trajectory, Experiment]], channel: str) -> None:
     found = _channel_residuals(pairs, channel)
     outputs = {n for run, _ in pairs for n in run}
-    inputs = [n for n in CHANNELS if n not in outputs and any(n in log for log, _ in found)]
+    logged = dict.fromkeys([*CHANNELS, *(n for log, _ in found for n in log)])
+    inputs = [n for n in logged if n not in outputs and any(n in log for log, _ in found)]
     every = []
     for name, colour in zip(inputs, (BLUE, ORANGE, RED), strict=False):
         rho = _mean_correlogram([_correlogram(e, log[name]) for log, e in found if name in log])

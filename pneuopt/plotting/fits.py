@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment
 from pneuopt.plotting.canvas import (
     BLUE,
     GREY,
     MAX_PLOT_COLUMNS,
     ORANGE,
-    PLOT_UNITS,
     axes_grid,
+    common_channels,
     legend_above,
     note_omissions,
+    plot_unit,
 )
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -64,14 +64,13 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
     require(len(runs) == len(experiments) > 0, f"{len(runs)} runs do not match {len(experiments)} experiments")
     logs = _group_by_log(runs, experiments)
     shown = [list(logs)[k] for k in sorted({round(k) for k in np.linspace(0, len(logs) - 1, MAX_PLOT_COLUMNS)})]
-    channels = [
-        n for n in CHANNELS if any(n in e.trajectory and n in r for r, e in zip(runs, experiments, strict=True))
-    ]
+    channels = common_channels(runs, experiments)
     require(bool(channels), "the runs and the logs have no channel in common")
     figure, grid = axes_grid(2 * len(channels), len(shown), [2.2, 1.0] * len(channels), sharex="col")
     for column, name in enumerate(shown):
         for row, channel in enumerate(channels):
-            _draw_comparison(grid[2 * row][column], grid[2 * row + 1][column], logs[name], channel, label)
+            pair, shown_in = (grid[2 * row][column], grid[2 * row + 1][column]), plot_unit(experiments, channel)
+            _draw_comparison(pair, logs[name], channel, label, shown_in)
         grid[0][column].set_title(name, fontsize=9)
         grid[-1][column].set_xlabel("time [s]")
     for lines in grid:
@@ -91,8 +90,10 @@ def _group_by_log(runs: Sequence[Trajectory], experiments: Sequence[Experiment])
     return logs
 
 
-def _draw_comparison(top: "Axes", bottom: "Axes", pairs: Pairs, channel: str, label: str) -> None:
-    factor, unit = PLOT_UNITS.get(CHANNELS[channel], (1.0, CHANNELS[channel]))
+def _draw_comparison(
+    axes: tuple["Axes", "Axes"], pairs: Pairs, channel: str, label: str, shown_in: tuple[float, str]
+) -> None:
+    (top, bottom), (factor, unit) = axes, shown_in
     for number, (measured, run) in enumerate(pairs):
         if channel not in measured or channel not in run:
             continue

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.dynamics.system import Axis, System, names, parameter_vector
 from pneuopt.identification.propagation import propagate_deviations
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment, differentiate
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 NORMAL_QUANTILE_95 = 1.96  # standard deviations, 95 %
 SLOPE_SAMPLES = 20  # of a local derivative
-LOAD_MASS = "load.mass"
 
 
 def plot_friction(system: System, result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":
@@ -52,7 +51,7 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
         If the system is neither (`has_friction_map`).
     """
     require(has_friction_map(system), "a friction map is drawn for a drive with a mass, or for a MotionDrive")
-    imposed = not system.states
+    imposed, axis = not system.states, system.axis or Axis()
     figure, ((axes,),) = axes_grid(1, 1, [4.2], width=7.0)
     clouds = [
         _rig_points(e) if imposed else _drive_points(system, result, e, name)
@@ -68,16 +67,20 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
         _draw_curve(axes, system, result, _speed_grid(speed))
     low, high = np.nanpercentile(force, [0.5, 99.5])
     axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-    axes.set(xlabel="speed [m/s]", ylabel="force [N]" if imposed else "friction force [N]")
+    speed_unit = next(q.unit for q in (*system.states, *system.inputs) if q.name == axis.speed)
+    pushes = "force" if axis.force == "N" else "torque"
+    axes.set(
+        xlabel=f"speed [{speed_unit}]",
+        ylabel=f"{pushes} [{axis.force}]" if imposed else f"friction {pushes} [{axis.force}]",
+    )
     legend_above(figure, axes)
     return figure
 
 
 def has_friction_map(system: System) -> bool:
     """Whether `plot_friction` can draw it: speed in and force out, or a mass that moves."""
-    states, inputs = names(system.states), names(system.inputs)
-    imposed = not states and "speed" in inputs and names(system.outputs) == ("force",)
-    return imposed or ({"position", "speed"} <= set(states) and LOAD_MASS in system.parameters)
+    imposed = not system.states and "speed" in names(system.inputs) and names(system.outputs) == ("force",)
+    return imposed or system.axis is not None
 
 
 def friction_force(system: System, run: Trajectory, parameters: ParameterSet) -> Array:
@@ -91,11 +94,16 @@ def friction_force(system: System, run: Trajectory, parameters: ParameterSet) ->
         Its states and inputs.
     parameters : ParameterSet
     """
-    seen = {n: run[n] for n in names(system.states)}
-    idle = {n: np.zeros(len(run)) for n in seen if n == "speed" or n.startswith("friction.")}
+    seen, axis = {n: run[n] for n in names(system.states)}, _moving_axis(system)
+    idle = {n: np.zeros(len(run)) for n in seen if n == axis.speed or n.startswith("friction.")}
     inputs = {n: run[n] for n in names(system.inputs)}
-    moves, free = (_state_rates(system, parameters, x, inputs)["speed"] for x in (seen, {**seen, **idle}))
-    return np.asarray(parameters.value(LOAD_MASS) * (free - moves))
+    moves, free = (_state_rates(system, parameters, x, inputs)[axis.speed] for x in (seen, {**seen, **idle}))
+    return np.asarray(parameters.value(axis.inertia) * (free - moves))
+
+
+def _moving_axis(system: System) -> Axis:
+    assert system.axis is not None, "has_friction_map comes first"
+    return system.axis
 
 
 def _rig_points(experiment: Experiment) -> tuple[Array, Array]:
@@ -106,16 +114,16 @@ def _drive_points(
     system: System, result: IdentificationResult, experiment: Experiment, name: str
 ) -> tuple[Array, Array]:
     """Speed, and what pushes the mass without accelerating it."""
-    log, run = experiment.trajectory, result.trajectories[name]
+    log, run, axis = experiment.trajectory, result.trajectories[name], _moving_axis(system)
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
     own = {n.partition("[")[0]: v for n, v in found.items() if n.endswith(f"[{name}]")}
     known = {n: v for n, v in experiment.conditions.items() if n in result.parameters}
     parameters = result.parameters.with_values({**own, **known})
-    speed = log["speed"] if "speed" in log else _smooth_derivative(log.t, log["position"])
+    speed = log[axis.speed] if axis.speed in log else _smooth_derivative(log.t, log[axis.position])
     seen = {n: log[n] if n in log else run[n] for n in names(system.states)}
-    idle = {n: np.zeros(len(log)) for n in seen if n == "speed" or n.startswith("friction.")}
-    pushed = _state_rates(system, parameters, {**seen, **idle}, {q: log[q] for q in names(system.inputs)})["speed"]
-    force = parameters.value(LOAD_MASS) * (pushed - _smooth_derivative(log.t, speed))
+    idle = {n: np.zeros(len(log)) for n in seen if n == axis.speed or n.startswith("friction.")}
+    pushed = _state_rates(system, parameters, {**seen, **idle}, {q: log[q] for q in names(system.inputs)})[axis.speed]
+    force = parameters.value(axis.inertia) * (pushed - _smooth_derivative(log.t, speed))
     reverses = np.convolve(np.abs(np.diff(np.sign(speed), prepend=np.nan)) > 0, np.ones(2 * SLOPE_SAMPLES), "same")
     return speed, np.where(reverses > 0, np.nan, force)
 
@@ -144,16 +152,16 @@ def _steady_friction(system: System, parameters: ParameterSet, usual: Mapping[st
 
     A bristle's rate is linear in its deflection: two points tell where it is zero.
     """
-    inputs = {n: np.zeros(len(speeds)) for n in names(system.inputs)}
-    still = {n: np.full(len(speeds), 0.0 if n == "speed" else value) for n, value in usual.items()}
+    inputs, axis = {n: np.zeros(len(speeds)) for n in names(system.inputs)}, _moving_axis(system)
+    still = {n: np.full(len(speeds), 0.0 if n == axis.speed else value) for n, value in usual.items()}
     bristles = {s.name: s.nominal for s in system.states if s.name.startswith("friction.")}
     still |= {n: np.zeros(len(speeds)) for n in bristles}
-    moving, bent = {**still, "speed": speeds}, {n: np.full(len(speeds), size) for n, size in bristles.items()}
+    moving, bent = {**still, axis.speed: speeds}, {n: np.full(len(speeds), size) for n, size in bristles.items()}
     straight = _state_rates(system, parameters, moving, inputs)
     other = _state_rates(system, parameters, {**moving, **bent}, inputs)
     ends = {n: size * straight[n] / (straight[n] - other[n]) for n, size in bristles.items()}
-    rest, steady = (_state_rates(system, parameters, x, inputs)["speed"] for x in (still, {**moving, **ends}))
-    return np.asarray(parameters.value(LOAD_MASS) * (rest - steady))
+    rest, steady = (_state_rates(system, parameters, x, inputs)[axis.speed] for x in (still, {**moving, **ends}))
+    return np.asarray(parameters.value(axis.inertia) * (rest - steady))
 
 
 def _state_rates(

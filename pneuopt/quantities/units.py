@@ -69,7 +69,7 @@ volt_second = volt * second = Vs
 """
 _COMMON_UNITS = """
 m mm um cm km in s ms us min h kg g t N kN Nm V mV A mA K degC Hz kHz rad deg rad/s rpm m/s mm/s m/s^2 m^2 m^3 mm^2
-cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count newton volt meter Pa kPa MPa bar mbar psi
+cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count kg*m^2 N*m rev N*m*s/rad newton volt meter Pa kPa MPa bar mbar psi
 Pa(a) Pa(g) kPa(a) kPa(g) MPa(a) MPa(g) bar(a) bar(g) mbar(a) mbar(g) psi(a) psi(g)
 """
 _NUMBER_WITH_UNIT = re.compile(

@@ -10,7 +10,7 @@ import numpy as np
 
 from pneuopt.dynamics.excitation import Excitation, SeparatingRun
 from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest
-from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
+from pneuopt.dynamics.system import Axis, Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, gauge_pressures, rename_quantity, without_prefix
 from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.linear import VALVE_VOLTAGE
@@ -187,6 +187,7 @@ class PneumaticDrive:
             validity_limits=cylinder_guards(self.cylinder.stops),
             log_warning_hook=doubts,
             excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION | _FLOW_EXCITATION,
+            axis=Axis(),
         )
         return replace(known, meter=self._meter_function())
 
