@@ -68,8 +68,8 @@ from pneuopt.models.friction import (
     PressureDependent,
     Stribeck,
     Viscous,
-    friction_ladder,
 )
+from pneuopt.models.friction_laws import friction_ladder
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load

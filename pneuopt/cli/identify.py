@@ -28,7 +28,7 @@ from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiments import Experiment, read_log, split
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS
-from pneuopt.models.friction import friction_ladder
+from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,
@@ -44,15 +44,6 @@ from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-FRICTION_PARAMETERS = (
-    "friction.coulomb",
-    "friction.viscous",
-    "friction.static",
-    "friction.stribeck_velocity",
-    "friction.*_asymmetry",
-    "friction.bristle_*",
-)
 
 
 def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool) -> int:
@@ -99,7 +90,7 @@ def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: floa
             systems,
             _read_experiments(logs, window, model.system()),
             known,
-            free=[*free, *FRICTION_PARAMETERS],
+            free=[*free, *usual_unknowns()],
             method=LeastSquares(progress=report_progress),
         )
     show_selection(make_console(), chosen)

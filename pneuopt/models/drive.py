@@ -1,17 +1,19 @@
 """Drives wired from parts: `ForceDrive` (pushed by a known force), `MotionDrive` (moved, its friction measured)."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import casadi as ca
 
 from pneuopt.dynamics.system import Axis, Symbols, System, define
 from pneuopt.models.declaration import DriveKind, flag
-from pneuopt.models.friction import FrictionModel
+from pneuopt.models.friction import FrictionModel, law_inputs
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.needs import LOAD_EXCITATION, RIG_EXCITATION
 from pneuopt.models.starts.friction import force_starts, motion_starts
+from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 STANDARD_ATMOSPHERE = 101325.0  # [Pa] standard atmosphere, ISO 2533
@@ -48,15 +50,15 @@ class ForceDrive:
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             v, y = x["speed"], x["position"]
-            force = self.friction.force(
-                v, without_prefix(x, "friction"), gauge_pressures(self.friction, u, p), without_prefix(p, "friction")
-            )
+            inputs = law_inputs(self.friction, u, p)
+            force = self.friction.force(v, without_prefix(x, "friction"), inputs, without_prefix(p, "friction"))
             acceleration = self.load.acceleration(u["force"] - force.value, y, without_prefix(p, "load"))
             rates = {f"friction.{n}": rate for n, rate in force.rates.items()}
             return {"position": v, "speed": acceleration, **rates}, {"position": y, "speed": v}
 
         inputs = (FORCE, *_pressure_inputs(self.friction))
-        system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, force_starts)
+        starts = partial(force_starts, self.friction)
+        system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, starts)
         excitation = self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION
         return replace(system, excitation=excitation, axis=Axis())
 
@@ -79,6 +81,10 @@ class MotionDrive:
     friction: FrictionModel
     chamber: bool = True
 
+    def __post_init__(self) -> None:
+        message = f"{self.friction} depends on the force, which this drive measures; take a ForceDrive"
+        require(FORCE.name not in (q.name for q in self.friction.inputs), message, ModelError)
+
     @property
     def parameters(self) -> ParameterSet:
         """rig.*, friction.*, and ambient.pressure where a pressure acts."""
@@ -97,7 +103,7 @@ class MotionDrive:
             force = self.friction.force(
                 u["speed"],
                 without_prefix(x, "friction"),
-                gauge_pressures(self.friction, u, p),
+                law_inputs(self.friction, u, p),
                 without_prefix(p, "friction"),
             )
             push = p["rig.force_offset"] + force.value
@@ -108,7 +114,8 @@ class MotionDrive:
         pressures = _pressure_inputs(self.friction)
         if self.chamber and "pressure_a" not in (q.name for q in pressures):
             pressures = (_PRESSURE_A, *pressures)
-        system = define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, motion_starts)
+        starts = partial(motion_starts, self.friction)
+        system = define(inner, (SPEED, *pressures), (FORCE,), self.parameters, rhs, starts)
         return replace(system, excitation=self.friction.excitation.with_prefix("friction") | RIG_EXCITATION)
 
 
@@ -134,17 +141,12 @@ _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 
 
 def _ambient_parameters(friction: FrictionModel) -> ParameterSet:
-    return AMBIENT_PARAMETERS if friction.inputs else ParameterSet()
+    return AMBIENT_PARAMETERS if _pressure_inputs(friction) else ParameterSet()
 
 
 def _pressure_inputs(friction: FrictionModel) -> tuple[Quantity, ...]:
     """The absolute pressures that a pressure-dependent friction needs as inputs."""
-    return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs)
-
-
-def gauge_pressures(friction: FrictionModel, u: Symbols, p: Symbols) -> Symbols:
-    """The gauge pressures that a friction model asks for, from the absolute ones."""
-    return {q.name: u[q.name] - p["ambient.pressure"] for q in friction.inputs}
+    return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs if q.unit == "Pa(g)")
 
 
 def without_prefix(values: Symbols, prefix: str) -> Symbols:

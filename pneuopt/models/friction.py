@@ -4,13 +4,16 @@ Signs: the force opposes positive speed when positive. Every map is smooth; `smo
 Coulomb force turns round. Such a map creeps under a load F < F_c, at ``v = smoothing * atanh(F/F_c)``; LuGre holds it.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
+import numpy as np
 
 from pneuopt.dynamics.excitation import Excitation
 from pneuopt.dynamics.system import Symbols
+from pneuopt.models.friction_start import Bristles, FrictionSamples, FrictionStart
 from pneuopt.models.needs import (
     ASYMMETRY_EXCITATION,
     BRISTLE_EXCITATION,
@@ -18,10 +21,15 @@ from pneuopt.models.needs import (
     STRIBECK_EXCITATION,
     VISCOUS_EXCITATION,
 )
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-STICKING_SPEED = 1e-6  # [m/s] rounds |v| in LuGre; larger values creep visibly (PHYSICS section 3)
+STICKING_SPEED = 1e-6  # [m/s] rounds |v| in LuGre: larger values creep visibly, smaller ones take finer steps
+STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the order that succeeded most often
+MIN_COULOMB_SHARE = 0.05  # of the median force, the least Coulomb level that a start has; at zero a search sticks
+BRISTLE_STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] that a start may have: softer bends for mm, stiffer needs steps below 1 us
+CHAMBER_PRESSURES = ("pressure_a", "pressure_b")
 
 
 class Force(NamedTuple):
@@ -40,7 +48,7 @@ class Force(NamedTuple):
 
 
 class FrictionModel(Protocol):
-    """What a drive needs of a friction model; one level, no inheritance."""
+    """What drives, starts, files and advice need of a friction law; one level, no inheritance."""
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -49,7 +57,7 @@ class FrictionModel(Protocol):
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """Gauge pressures, where friction depends on them."""
+        """What friction depends on beside the speed: gauge pressures [Pa(g)], the force that drives the load [N]."""
         ...
 
     @property
@@ -60,6 +68,11 @@ class FrictionModel(Protocol):
     @property
     def excitation(self) -> Excitation:
         """Which motion a log must show for each parameter to be identifiable; parameters by their own names."""
+        ...
+
+    @property
+    def start(self) -> FrictionStart:
+        """How an identification of its parameters starts from logs."""
         ...
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
@@ -79,6 +92,11 @@ class Viscous:
     def parameters(self) -> ParameterSet:
         """Its one number: viscous [N*s/m]."""
         return ParameterSet({"viscous": _VISCOUS_PARAMETER})
+
+    @property
+    def start(self) -> FrictionStart:
+        """Proportional to the speed."""
+        return FrictionStart(lambda s: {"viscous": s.speed}, ("viscous",), floors={"viscous": 0.0})
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
@@ -100,6 +118,12 @@ class Coulomb:
             {"coulomb": _COULOMB_PARAMETER, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER}
         )
 
+    @property
+    def start(self) -> FrictionStart:
+        """A level that follows the direction, and a slope."""
+        unknowns = ("coulomb", "viscous")
+        return FrictionStart(lambda s: {"coulomb": s.side, "viscous": s.speed}, unknowns, floors=_FLOORS)
+
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
         return Force(p["coulomb"] * smooth_sign(v, p) + p["viscous"] * v, {})
@@ -117,6 +141,12 @@ class Stribeck:
     def parameters(self) -> ParameterSet:
         """Numbers: coulomb, static [N], stribeck_velocity [m/s], viscous [N*s/m], smoothing [m/s]."""
         return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER})
+
+    @property
+    def start(self) -> FrictionStart:
+        """Linear in all but the Stribeck velocity."""
+        unknowns = ("coulomb", "viscous", "static", "stribeck_velocity")
+        return FrictionStart(_stribeck_columns, unknowns, _FLOORS, {"static": "coulomb"}, _STRIBECK_SCAN)
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
@@ -150,6 +180,13 @@ class LuGre:
             "damping_velocity": Parameter(0.05, "m/s", lower=1e-4, upper=1e3, log=True),
         }
         return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, **bristles})
+
+    @property
+    def start(self) -> FrictionStart:
+        """Sliding, a Stribeck curve; while the bristles only bend, a spring."""
+        sliding = Stribeck().start
+        bristles = Bristles("bristle_stiffness", "coulomb", BRISTLE_STIFFNESS_RANGE, _bristle_deflection)
+        return replace(sliding, unknowns=(*sliding.unknowns, "bristle_stiffness", "bristle_damping"), bristles=bristles)
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
         """See the class."""
@@ -192,6 +229,13 @@ class Asymmetric:
         """Both directions, and what the base needs."""
         return ASYMMETRY_EXCITATION | self.base.excitation
 
+    @property
+    def start(self) -> FrictionStart:
+        """That of the base: the directions start alike."""
+        base = self.base.start
+        asymmetries = tuple(n for n in ("coulomb_asymmetry", "viscous_asymmetry") if n in self.parameters)
+        return replace(base, unknowns=(*base.unknowns, *asymmetries))
+
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""
         side = smooth_sign(v, p, "asymmetry_width")
@@ -204,11 +248,11 @@ class Asymmetric:
 class PressureDependent:
     """A base model whose Coulomb and static levels rise with both chambers' gauge pressures: + c_a p_a + c_b p_b.
 
-    Source: PHYSICS section 3; coefficients of 0.5-3e-5 m^2 are plausible for seals of 25-40 mm.
+    Coefficients of 0.5-3e-5 m^2 are plausible for seals of 25-40 mm.
     """
 
     base: FrictionModel
-    chambers: tuple[str, ...] = ("pressure_a", "pressure_b")
+    chambers: tuple[str, ...] = CHAMBER_PRESSURES
 
     def __post_init__(self) -> None:
         message = (
@@ -237,6 +281,16 @@ class PressureDependent:
         """What the base needs."""
         return self.base.excitation
 
+    @property
+    def start(self) -> FrictionStart:
+        """Levels are linear in the pressures."""
+        base, own = self.base.start, tuple(f"coulomb_{name}" for name in self.chambers)
+
+        def columns(s: FrictionSamples) -> dict[str, Array]:
+            return base.columns(s) | {n: s.side * s.inputs[c] for n, c in zip(own, self.chambers, strict=True)}
+
+        return replace(base, columns=columns, unknowns=(*base.unknowns, *own))
+
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""
         rise = sum((p[f"coulomb_{name}"] * u[name] for name in self.chambers), start=ca.SX(0))
@@ -244,15 +298,10 @@ class PressureDependent:
         return self.base.force(v, z, u, {**p, **raised})
 
 
-def friction_ladder() -> dict[str, FrictionModel]:
-    """From the simplest to the richest, by name: candidates for `select_model`."""
+def law_inputs(law: FrictionModel, signals: Mapping[str, Any], p: Mapping[str, Any]) -> dict[str, Any]:
+    """What a law asks for, from a drive's signals, symbols or arrays; absolute pressures become gauge pressures."""
     return {
-        "viscous": Viscous(),
-        "coulomb": Coulomb(),
-        "asymmetric coulomb": Asymmetric(Coulomb()),
-        "stribeck": Stribeck(),
-        "asymmetric stribeck": Asymmetric(Stribeck()),
-        "lugre": LuGre(),
+        q.name: signals[q.name] - p["ambient.pressure"] if q.unit == "Pa(g)" else signals[q.name] for q in law.inputs
     }
 
 
@@ -290,6 +339,20 @@ def stribeck_curve(v: ca.SX, coulomb: ca.SX, static: ca.SX, stribeck_velocity: c
     return coulomb + (static - coulomb) * ca.exp(-((v / stribeck_velocity) ** 2))
 
 
+def _stribeck_columns(s: FrictionSamples) -> dict[str, Array]:
+    peak = np.exp(-((s.level_speed / s.values["stribeck_velocity"]) ** 2))
+    return {"coulomb": s.side, "static": s.side * peak, "viscous": s.speed}
+
+
+def _bristle_deflection(force: Array, speed: Array, values: Mapping[str, float]) -> dict[str, Array]:
+    """The deflection that gives the force, up to that at which static friction gives way."""
+    limit = values["static"] / values["bristle_stiffness"]
+    deflection = (force - values["viscous"] * speed) / values["bristle_stiffness"]
+    return {"bristle": np.clip(deflection, -limit, limit)}
+
+
+_FLOORS = {"coulomb": MIN_COULOMB_SHARE, "viscous": 0.0}
+_STRIBECK_SCAN = {"stribeck_velocity": STRIBECK_VELOCITIES}
 _VISCOUS_PARAMETER = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5)
 _COULOMB_PARAMETER = Parameter(30.0, "N", lower=0.0, upper=1e5)
 _SMOOTHING_PARAMETER = Parameter(1e-3, "m/s", lower=1e-6, upper=1.0, log=True)

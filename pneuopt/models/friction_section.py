@@ -3,26 +3,25 @@
 from collections.abc import Mapping
 
 from pneuopt.models.declaration import Key, Structure, choice, flag
-from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck, Viscous
+from pneuopt.models.friction import FrictionModel
+from pneuopt.models.friction_laws import FRICTION_LAWS, FRICTION_WRAPPERS
 from pneuopt.quantities.errors import check_names
 
+_CHOICE = Key("true, false or a list", (bool, list), False)
 FRICTION_KEYS: Mapping[str, Key] = {
-    "model": choice({"viscous": Viscous, "coulomb": Coulomb, "stribeck": Stribeck, "lugre": LuGre}),
-    "asymmetric": flag(False),
-    "pressure_dependent": Key("true, false or a list", (bool, list), False),
+    "model": choice(FRICTION_LAWS),
+    **{name: _CHOICE if wrapper.options else flag(False) for name, wrapper in FRICTION_WRAPPERS.items()},
 }
-CHAMBER_PRESSURES = ("pressure_a", "pressure_b")
 
 
 def read_friction(said: Structure) -> FrictionModel:
     """The friction that [friction] describes."""
     options = said.options("friction")
     law: FrictionModel = options["model"]()
-    if options["asymmetric"]:
-        law = Asymmetric(law)
-    dependent = options["pressure_dependent"]
-    if not dependent:
-        return law
-    chambers = CHAMBER_PRESSURES if dependent is True else tuple(dependent)
-    check_names("chamber", chambers, CHAMBER_PRESSURES, said.place("friction", "pressure_dependent"))
-    return PressureDependent(law, chambers)
+    for name, wrapper in FRICTION_WRAPPERS.items():
+        if isinstance(options[name], list) and options[name]:
+            check_names(wrapper.option, options[name], wrapper.options, said.place("friction", name))
+            law = wrapper.wrap(law, tuple(options[name]))
+        elif options[name]:
+            law = wrapper.wrap(law)
+    return law

@@ -11,6 +11,7 @@ import casadi as ca
 from pneuopt.dynamics.excitation import Excitation
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.friction import Force, FrictionModel
+from pneuopt.models.friction_start import FrictionStart
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
@@ -64,6 +65,11 @@ class Karnopp:
     def excitation(self) -> Excitation:
         """What the base needs."""
         return self.base.excitation
+
+    @property
+    def start(self) -> FrictionStart:
+        """That of the base."""
+        return self.base.start
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """See the class."""

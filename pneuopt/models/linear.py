@@ -105,7 +105,7 @@ class SecondOrder:
     def __post_init__(self) -> None:
         require(
             self.friction is None or not self.friction.inputs,
-            f"{type(self.friction).__name__} needs pressures, which this plant has not; choose another friction",
+            f"{type(self.friction).__name__} needs pressures or a force, which this plant has not; choose another",
             ModelError,
         )
 

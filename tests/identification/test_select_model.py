@@ -7,7 +7,8 @@ from pneuopt.dynamics.system import System
 from pneuopt.identification.select_model import ModelSelection, select_model
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
-from pneuopt.models.friction import FrictionModel, friction_ladder
+from pneuopt.models.friction import FrictionModel
+from pneuopt.models.friction_laws import friction_ladder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet

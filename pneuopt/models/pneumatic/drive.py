@@ -11,8 +11,8 @@ import numpy as np
 from pneuopt.dynamics.excitation import Excitation, SeparatingRun
 from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest
 from pneuopt.dynamics.system import Axis, Symbols, System, define, names, parameter_vector, stack, symbols
-from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, gauge_pressures, rename_quantity, without_prefix
-from pneuopt.models.friction import FrictionModel, Stribeck
+from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity, without_prefix
+from pneuopt.models.friction import FrictionModel, Stribeck, law_inputs
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import Load
 from pneuopt.models.needs import LOAD_EXCITATION
@@ -178,7 +178,7 @@ class PneumaticDrive:
     @cached_property
     def _system(self) -> System:
         outputs = (POSITION, SPEED, *CHAMBER_PRESSURES)
-        starts = PneumaticStarts(self.system, _air_force)
+        starts = PneumaticStarts(self.system, self.friction, _air_force)
         system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._find_rest)
         doubts = partial(_log_warnings, PressureZeroCheck(starts.prepare_logs))
         known = replace(
@@ -193,11 +193,11 @@ class PneumaticDrive:
 
     def _rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG002 - no time in it
         y, v, a, b = (x[n] for n in ("position", "speed", "pressure_a", "pressure_b"))
-        friction = self.friction.force(
-            v, without_prefix(x, "friction"), gauge_pressures(self.friction, x, p), without_prefix(p, "friction")
-        )
+        push = _air_force(p, a, b)
+        inputs = law_inputs(self.friction, {**x, "force": push}, p)
+        friction = self.friction.force(v, without_prefix(x, "friction"), inputs, without_prefix(p, "friction"))
         stop = self.cylinder.stop_force(y, v, without_prefix(p, "cylinder"))
-        acceleration = self.load.acceleration(_air_force(p, a, b) - friction.value + stop, y, without_prefix(p, "load"))
+        acceleration = self.load.acceleration(push - friction.value + stop, y, without_prefix(p, "load"))
         spool = self.valve.rates(u["valve_voltage"], without_prefix(x, "valve"), without_prefix(p, "valve"))
         rates = {"position": v, "speed": acceleration, **self._chamber_rates(x, u, p)}
         rates |= {f"valve.{n}": rate for n, rate in spool.items()}

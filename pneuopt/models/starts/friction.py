@@ -1,9 +1,10 @@
 """Where an identification of friction starts, without a guess from the user: equation error on the filtered log.
 
-Given the Stribeck velocity, a drive's force is linear in its other parameters; so for each of a few velocities one
-bounded linear least squares gives a candidate, in milliseconds (NUMERICS section 3, steps 1 and 2).
+Given the few parameters that a law scans (a Stribeck velocity), a drive's force is linear in the others; so for each of
+a few values one bounded linear least squares gives a candidate, in milliseconds. The law declares all this (`start`).
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,26 +14,28 @@ from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
 from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.models.friction import FrictionModel, law_inputs
+from pneuopt.models.friction_start import FrictionSamples, FrictionStart
 from pneuopt.models.load import GRAVITY
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the order that succeeded most often
 FILTER_TIME = 0.031  # [s] window of the Savitzky-Golay filter, order 3
 SLIDING_SPEED = 4e-3  # [m/s] slower samples say nothing of sliding friction
-BRISTLE_STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] of bristles, in steps 2 and 3 of the recipe
 RIDGE_WEIGHT = 1e-2  # on columns of unit length: sliding one way only, Coulomb friction and a constant force are one
-MIN_STATIC_EXCESS = 0.03  # of static friction over Coulomb's, as a fraction of it (step 2)
+MIN_LEVEL_EXCESS = 0.03  # of a level over the one it stands above (static, Coulomb's), as a fraction of it; below it
+# a search starts without a Stribeck curve and finds none
+DEFAULT_SMOOTHING = 1e-3  # [m/s] over which the sign of the speed turns, for laws without a smoothing of their own
 MAX_VALVE_SAMPLES = 2000  # samples of a log, about, by which a valve is judged
 PRESLIDING_DEFLECTIONS = 3.0  # bristle deflections since the last reversal, within which bristles still bend
 SLOW_SPEED = 1e-2  # [m/s] below it friction comes near its static level, and bristles still bend
-STATIC_QUANTILE = 0.995  # quantile of the force in slow samples that counts as static friction (step 2)
-STATIC_WEIGHT = 0.003  # squared weight of that, in sliding samples (step 2)
+STATIC_QUANTILE = 0.995  # quantile of the force in slow samples that counts as static friction
+STATIC_WEIGHT = 0.003  # squared weight of that, in sliding samples; more, and one stuck sample bends the whole curve
 
 
-def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
+def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
     """Candidates for a `ForceDrive`: states from the filtered logs, parameters from M a + F_f(v) + F_L = F.
 
     Raises
@@ -45,10 +48,10 @@ def force_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
         position, speed, acceleration = filter_motion(measured)
         columns, states = load_columns(parameters, position, acceleration), {"position": position, "speed": speed}
         rows[name] = RegressionRows(measured, parameters, speed, measured["force"], columns, states)
-    return friction_candidates(rows)
+    return friction_candidates(friction, rows)
 
 
-def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
+def motion_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
     """Candidates for a `MotionDrive`: parameters from the measured force at the imposed speed and pressure."""
     rows = {}
     for name, (measured, parameters) in logs.items():
@@ -58,7 +61,7 @@ def motion_starts(logs: Mapping[str, Log]) -> Sequence[Start]:
             force = force - push
             rig["rig.area_bias"] = push
         rows[name] = RegressionRows(measured, parameters, measured["speed"], force, rig, {})
-    return friction_candidates(rows)
+    return friction_candidates(friction, rows)
 
 
 def load_columns(parameters: ParameterSet, position: Array, acceleration: Array) -> dict[str, Array]:
@@ -105,34 +108,38 @@ class RegressionRows:
     states: Mapping[str, Array]
 
 
-def friction_candidates(logs: Mapping[str, RegressionRows]) -> Sequence[Start]:
-    """One start for each Stribeck velocity tried, from the rows of all logs."""
+def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> Sequence[Start]:
+    """One start for each value tried of the parameters that the law scans, from the rows of all logs."""
     parameters = next(iter(logs.values())).parameters
-    searched = "friction.stribeck_velocity" in parameters.free_names
-    given = parameters.value("friction.stribeck_velocity") if "friction.stribeck_velocity" in parameters else np.inf
-    if searched:
-        bounds = parameters["friction.stribeck_velocity"]
-        tried = np.clip(STRIBECK_VELOCITIES, bounds.lower, bounds.upper).tolist()
-    starts = []
-    for velocity in dict.fromkeys(tried) if searched else (given,):
-        values, _ = _regress(logs, parameters, velocity)
-        own = {n: rows.parameters for n, rows in logs.items()}
-        guess = per_log_values("friction.stribeck_velocity", velocity, own) if searched else {}
+    own, starts = {n: rows.parameters for n, rows in logs.items()}, []
+    for tried in _scanned_values(friction.start, parameters):
+        values, _ = _regress(friction, logs, parameters, tried)
+        guess: dict[str, float] = {}
+        for name, value in tried.items():
+            guess |= per_log_values(f"friction.{name}", value, own)
         values |= guess
-        label = f"stribeck velocity {velocity:g} m/s" if searched else "equation error"
-        bristles = _bristle_deflections(logs, values)
+        words = [f"{n.replace('_', ' ')} {v:g} {parameters[f'friction.{n}'].unit}" for n, v in tried.items()]
+        bristles = _bristle_deflections(friction, logs, values)
         states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
-        starts.append(Start(states, values, label, tuple(guess)))
+        starts.append(Start(states, values, ", ".join(words) or "equation error", tuple(guess)))
     return starts
 
 
-def force_misfit(logs: Mapping[str, RegressionRows]) -> float:
+def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:
     """Mean size of the force that no friction explains, of all that the sliding samples show [N]."""
     thinned = {name: _thin_rows(rows) for name, rows in logs.items()}
     parameters = next(iter(logs.values())).parameters
     if not all(np.isfinite(rows.force).all() for rows in thinned.values()):
         return math.inf
-    return float(np.mean(np.abs(_regress(thinned, parameters, STRIBECK_VELOCITIES[0])[1])))
+    tried = {name: values[0] for name, values in friction.start.scanned.items()}
+    return float(np.mean(np.abs(_regress(friction, thinned, parameters, tried)[1])))
+
+
+def _scanned_values(start: FrictionStart, parameters: ParameterSet) -> list[dict[str, float]]:
+    """Each set of values to try of the free ones among the scanned parameters, within their bounds."""
+    free = {n: parameters[f"friction.{n}"] for n in start.scanned if f"friction.{n}" in parameters.free_names}
+    tried = [dict.fromkeys(np.clip(start.scanned[n], p.lower, p.upper).tolist()) for n, p in free.items()]
+    return [dict(zip(free, values, strict=True)) for values in itertools.product(*tried)]
 
 
 def per_log_values(name: str, value: float, logs: Mapping[str, ParameterSet]) -> dict[str, float]:
@@ -156,95 +163,102 @@ def _thin_rows(rows: RegressionRows) -> RegressionRows:
 
 
 def _regress(
-    logs: Mapping[str, RegressionRows], parameters: ParameterSet, velocity: float
+    friction: FrictionModel, logs: Mapping[str, RegressionRows], parameters: ParameterSet, tried: Mapping[str, float]
 ) -> tuple[dict[str, float], Array]:
     """Bounded linear least squares over all logs' sliding samples, with four Cauchy reweights; and what is left [N]."""
-    parts = [_log_columns(name, rows, velocity) for name, rows in logs.items()]
+    parts = [_log_columns(friction, name, rows, tried) for name, rows in logs.items()]
     free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
     A = np.vstack(
         [np.array([columns.get(n, np.zeros(len(y))) for n in free]).reshape(-1, len(y)).T for columns, y in parts]
     )
     y = np.concatenate([y for _, y in parts])
     known = np.isfinite(y)
-    speed = np.abs(np.concatenate([rows.speed for rows in logs.values()]))
-    sliding = known & (speed > SLIDING_SPEED)
-    if "friction.bristle_stiffness" in parameters and sliding.any():
-        level, travelled = (
-            float(np.median(np.abs(y[sliding]))),
-            [_distance_since_reversal(part) for part in logs.values()],
-        )
+    sliding = known & (np.abs(np.concatenate([rows.speed for rows in logs.values()])) > SLIDING_SPEED)
+    if friction.start.bristles is not None and sliding.any():
+        level = float(np.median(np.abs(y[sliding])))
         pull = {name: force for name, (_, force) in zip(logs, parts, strict=True)}
-        stiffness = np.clip(_presliding_slope(logs, pull, 0.6 * level), *BRISTLE_STIFFNESS_RANGE)
-        sliding &= np.concatenate(travelled) > PRESLIDING_DEFLECTIONS * level / stiffness
+        stiffness = np.clip(_presliding_slope(logs, pull, 0.6 * level), *friction.start.bristles.range)
+        travelled = np.concatenate([_distance_since_reversal(part) for part in logs.values()])
+        sliding &= travelled > PRESLIDING_DEFLECTIONS * level / stiffness
     rows = sliding if np.count_nonzero(sliding) > 10 * len(free) else known
     if not free:
         return {}, y[rows]
     bases = {n: parameters[n.split("[")[0]] for n in free}
-    lower, upper = _regression_bounds(bases, float(np.median(np.abs(y[rows]))))
+    lower, upper = _regression_bounds(friction.start, bases, float(np.median(np.abs(y[rows]))))
     weight = math.sqrt(STATIC_WEIGHT * np.count_nonzero(rows))
-    stuck = [(_coefficient_row(columns, free), level) for columns, level in _static_levels(logs, velocity)]
+    stuck = [(_coefficient_row(columns, free), level) for columns, level in _static_levels(friction, logs, tried)]
     given = np.array([row for row, _ in stuck]).reshape(-1, len(free)), np.array([level for _, level in stuck])
     x = _robust_least_squares(A[rows], y[rows], lower, upper, (weight * given[0], weight * given[1]))
-    values = dict(zip(free, x.tolist(), strict=True))
-    for name in [n for n in free if n.startswith("friction.static")]:
-        own = name.replace("static", "coulomb")
-        coulomb = values.get(own, values.get("friction.coulomb", parameters.value("friction.coulomb")))
-        values[name] = coulomb + max(values[name], MIN_STATIC_EXCESS * coulomb)
+    values = _raise_levels(friction.start, dict(zip(free, x.tolist(), strict=True)), parameters)
     return {n: float(np.clip(values[n], p.lower, p.upper)) for n, p in bases.items()}, y[rows] - A[rows] @ x
+
+
+def _raise_levels(start: FrictionStart, values: dict[str, float], parameters: ParameterSet) -> dict[str, float]:
+    """The values with every excess over another level made the level itself."""
+    levels = {f"friction.{n}": f"friction.{base}" for n, base in start.above.items()}
+    out = dict(values)
+    for name in (n for n in values if n.split("[")[0] in levels):
+        own, _, log = name.partition("[")
+        base = levels[own]
+        usual = values.get(base, parameters.value(base))
+        below = values.get(f"{base}[{log}", usual) if log else usual
+        out[name] = below + max(values[name], MIN_LEVEL_EXCESS * below)
+    return out
 
 
 def _coefficient_row(columns: Mapping[str, float], free: Sequence[str]) -> Array:
     return np.array([columns.get(n, 0.0) for n in free])
 
 
-def _static_levels(logs: Mapping[str, RegressionRows], velocity: float) -> list[tuple[dict[str, float], float]]:
+def _static_levels(
+    friction: FrictionModel, logs: Mapping[str, RegressionRows], tried: Mapping[str, float]
+) -> list[tuple[dict[str, float], float]]:
     """For each log a slow sample in which friction is about to give way: it is static there, whatever the speed."""
-    out = []
+    out, levels = [], {f"friction.{n}" for n in friction.start.above}
     for name, rows in logs.items():
-        _, pull = _log_columns(name, rows, velocity)
+        _, pull = _log_columns(friction, name, rows, tried)
         slow = np.flatnonzero((np.abs(rows.speed) < SLOW_SPEED) & np.isfinite(pull))
-        columns, level = _log_columns(name, rows, velocity, np.sign(pull))
-        if slow.size and any(n.startswith("friction.static") for n in columns):
+        columns, level = _log_columns(friction, name, rows, tried, np.sign(pull))
+        if slow.size and any(n.split("[")[0] in levels for n in columns):
             at = slow[np.argsort(np.abs(level[slow]))[math.ceil(STATIC_QUANTILE * (slow.size - 1))]]
             out.append(({n: float(c[at]) for n, c in columns.items()}, float(level[at])))
     return out
 
 
 def _log_columns(
-    name: str, rows: RegressionRows, velocity: float, stuck: Array | None = None
+    friction: FrictionModel, name: str, rows: RegressionRows, tried: Mapping[str, float], stuck: Array | None = None
 ) -> tuple[dict[str, Array], Array]:
     """A log's free columns ("name[log]" if its own), and its force less what is known; `stuck`: see below."""
     p = rows.parameters
-    columns = {n: c for n, c in {**rows.columns, **_friction_columns(rows, velocity, stuck)}.items() if n in p}
+    columns = {n: c for n, c in {**rows.columns, **_friction_columns(friction, rows, tried, stuck)}.items() if n in p}
     known = {n: p.value(n) for n in columns}
-    if "friction.static" in columns:
-        known["friction.static"] -= p.value("friction.coulomb")
-        if p["friction.coulomb"].free and not p["friction.static"].free:
-            # the level is known, so what is above Coulomb's shrinks as Coulomb's grows
-            known["friction.static"] = p.value("friction.static")
-            columns["friction.coulomb"] = columns["friction.coulomb"] - columns["friction.static"]
+    for level, base in ((f"friction.{n}", f"friction.{below}") for n, below in friction.start.above.items()):
+        known[level] -= p.value(base)
+        if p[base].free and not p[level].free:
+            # the level is known, so what is above the other shrinks as the other grows
+            known[level] = p.value(level)
+            columns[base] = columns[base] - columns[level]
     target = rows.force - sum(
         (known[n] * c for n, c in columns.items() if not p[n].free), start=np.zeros(len(rows.force))
     )
     return {f"{n}[{name}]" if p[n].per_log else n: c for n, c in columns.items() if p[n].free}, target
 
 
-def _friction_columns(rows: RegressionRows, velocity: float, stuck: Array | None = None) -> dict[str, Array]:
-    """What multiplies each friction parameter in the force; static friction counts as the part above Coulomb's.
+def _friction_columns(
+    friction: FrictionModel, rows: RegressionRows, tried: Mapping[str, float], stuck: Array | None = None
+) -> dict[str, Array]:
+    """What multiplies each friction parameter in the force.
 
     If stuck (1 or -1: the side to which a sample is pulled) friction has its static level, whatever the filtered speed.
     """
-    parameters, speed = rows.parameters, rows.speed
-    smoothing = parameters.value("friction.smoothing") if "friction.smoothing" in parameters else 1e-3
-    side, peak = np.tanh(speed / smoothing), np.exp(-((speed / velocity) ** 2))
+    p, speed = rows.parameters, rows.speed
+    own = {n: p.value(f"friction.{n}") for n in friction.parameters} | dict(tried)
+    signals = {**{n: rows.measured[n] for n in rows.measured}, "force": rows.force}
+    inputs = law_inputs(friction, signals, {n: p.value(n) for n in p if n.startswith("ambient.")})
+    samples = FrictionSamples(speed, np.tanh(speed / own.get("smoothing", DEFAULT_SMOOTHING)), speed, inputs, own)
     if stuck is not None:
-        side, peak = stuck, np.ones_like(speed)
-    columns = {"friction.coulomb": side, "friction.static": side * peak, "friction.viscous": speed}
-    for chamber in ("pressure_a", "pressure_b"):
-        if f"friction.coulomb_{chamber}" in parameters:
-            gauge = rows.measured[chamber] - parameters.value("ambient.pressure")
-            columns[f"friction.coulomb_{chamber}"] = side * gauge
-    return columns
+        samples = replace(samples, side=stuck, level_speed=np.zeros_like(speed))
+    return {f"friction.{n}": c for n, c in friction.start.columns(samples).items()}
 
 
 def _robust_least_squares(
@@ -266,37 +280,35 @@ def _robust_least_squares(
     return x
 
 
-def _regression_bounds(bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]:
-    """Of the regression: the parameters' own, and floors that keep friction positive (NUMERICS section 3, step 2)."""
-    floors = {"friction.coulomb": 0.05 * level, "friction.viscous": 0.0}
-    own = {n: n.split("[")[0] for n in bases}
-    given = [0.0 if own[n] == "friction.static" else p.lower for n, p in bases.items()]
+def _regression_bounds(start: FrictionStart, bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]:
+    """Of the regression: the parameters' own, and the law's floors, which keep friction positive."""
+    floors = {f"friction.{n}": share * level for n, share in start.floors.items()}
+    excesses, own = {f"friction.{n}" for n in start.above}, {n: n.split("[")[0] for n in bases}
+    given = [0.0 if own[n] in excesses else p.lower for n, p in bases.items()]
     lower = np.array([max(floors.get(own[n], -np.inf), lo) for n, lo in zip(bases, given, strict=True)])
     upper = np.array([max(p.upper, lo + 1e-9) for p, lo in zip(bases.values(), lower, strict=True)])
     return lower, upper
 
 
-def _bristle_deflections(logs: Mapping[str, RegressionRows], values: dict[str, float]) -> dict[str, dict[str, Array]]:
+def _bristle_deflections(
+    friction: FrictionModel, logs: Mapping[str, RegressionRows], values: dict[str, float]
+) -> dict[str, dict[str, Array]]:
     """The bristle deflection along each log, and their stiffness from presliding motion (changes `values`)."""
-    parameters = next(iter(logs.values())).parameters
-    if "friction.bristle_stiffness" not in parameters:
+    bristles = friction.start.bristles
+    if bristles is None:
         return {}
-
-    def value_of(name: str) -> float:
-        return values.get(name, parameters.value(name))
-
-    friction = {n: _friction_force(n, rows, values) for n, rows in logs.items()}
-    stiffness = parameters["friction.bristle_stiffness"]
+    parameters = next(iter(logs.values())).parameters
+    own = {n: values.get(f"friction.{n}", parameters.value(f"friction.{n}")) for n in friction.parameters}
+    forces = {n: _friction_force(n, rows, values) for n, rows in logs.items()}
+    name = f"friction.{bristles.stiffness}"
+    stiffness = parameters[name]
     if stiffness.free:
-        slope = _presliding_slope(logs, friction, 0.6 * value_of("friction.coulomb"))
-        low, high = max(BRISTLE_STIFFNESS_RANGE[0], stiffness.lower), min(BRISTLE_STIFFNESS_RANGE[1], stiffness.upper)
-        found = float(np.clip(slope, low, high))
-        values |= per_log_values("friction.bristle_stiffness", found, {n: rows.parameters for n, rows in logs.items()})
-    else:
-        found = stiffness.value
-    limit = value_of("friction.static") / found
-    deflections = {n: (friction[n] - value_of("friction.viscous") * rows.speed) / found for n, rows in logs.items()}
-    return {n: {"friction.bristle": np.clip(z, -limit, limit)} for n, z in deflections.items()}
+        slope = _presliding_slope(logs, forces, 0.6 * own[bristles.level])
+        low, high = max(bristles.range[0], stiffness.lower), min(bristles.range[1], stiffness.upper)
+        own[bristles.stiffness] = float(np.clip(slope, low, high))
+        values |= per_log_values(name, own[bristles.stiffness], {n: rows.parameters for n, rows in logs.items()})
+    deflections = {n: bristles.deflections(forces[n], rows.speed, own) for n, rows in logs.items()}
+    return {n: {f"friction.{state}": z for state, z in found.items()} for n, found in deflections.items()}
 
 
 def _presliding_slope(logs: Mapping[str, RegressionRows], friction: Mapping[str, Array], level: float) -> float:

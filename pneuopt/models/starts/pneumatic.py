@@ -17,6 +17,7 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import System
+from pneuopt.models.friction import FrictionModel
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
 from pneuopt.models.starts.following import PRESSURE_NAMES, AirSimulator
 from pneuopt.models.starts.friction import (
@@ -61,18 +62,20 @@ class PneumaticStarts:
     ----------
     system : callable
         Returns the drive's System (not held: it holds this).
+    friction : FrictionModel
     air_force : callable
         From the parameters' mapping and both pressures [Pa] to the force of the air on the piston [N].
     """
 
     system: Callable[[], System]
+    friction: FrictionModel
     air_force: AirForce
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates: one valve, friction for each of the Stribeck velocities tried."""
         runs = self.prepare_logs(logs)
-        valve = _estimate_valve(runs)
-        starts = friction_candidates({name: run.force_balance(valve) for name, run in runs.items()})
+        valve = _estimate_valve(self.friction, runs)
+        starts = friction_candidates(self.friction, {name: run.force_balance(valve) for name, run in runs.items()})
         own: dict[str, float] = {}
         for name, value in valve.items():
             own |= per_log_values(name, value, {n: log.parameters for n, log in logs.items()})
@@ -171,7 +174,7 @@ class PneumaticLog:
         ]
 
 
-def _estimate_valve(runs: Mapping[str, PneumaticLog]) -> dict[str, float]:
+def _estimate_valve(friction: FrictionModel, runs: Mapping[str, PneumaticLog]) -> dict[str, float]:
     """What is free of conductance, leak, critical ratio and dead zone."""
     parameters = next(iter(runs.values())).parameters
     free = [
@@ -190,7 +193,7 @@ def _estimate_valve(runs: Mapping[str, PneumaticLog]) -> dict[str, float]:
     needed = max(run.min_conductance() for run in runs.values())
     tried = {VALVE_CONDUCTANCE: tuple(needed * CONDUCTANCE_FACTORS), VALVE_LEAK: LEAK_GRID}
     tried = {n: tried.get(n, (parameters.value(n),)) for n in free}
-    return _search_values(tried, parameters, lambda values: _force_misfits(runs, values))
+    return _search_values(tried, parameters, lambda values: _force_misfits(friction, runs, values))
 
 
 def _search_values(
@@ -246,7 +249,9 @@ def _affine_basis(conductance: float, leak: float, conductance_free: bool, leak_
     return np.array([conductance, conductance * leak]), np.empty((2, 0))
 
 
-def _force_misfits(runs: Mapping[str, PneumaticLog], valves: Sequence[ValveValues]) -> list[float]:
+def _force_misfits(
+    friction: FrictionModel, runs: Mapping[str, PneumaticLog], valves: Sequence[ValveValues]
+) -> list[float]:
     """How badly the forces balance with each of several valves [N]."""
     balances = {name: run.force_balances(valves) for name, run in runs.items()}
-    return [force_misfit({name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]
+    return [force_misfit(friction, {name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]

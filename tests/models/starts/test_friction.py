@@ -191,9 +191,11 @@ def test_the_misfit_is_what_no_friction_explains() -> None:
     columns = load_columns(given, np.zeros(4000), 0.7 * np.cos(7 * t))
     right = 33 * np.tanh(speed / 1e-3) + 50 * speed + given.value("load.mass") * columns["load.mass"]
     rows = RegressionRows(Trajectory(t, {"speed": speed}), given, speed, right, columns, {})
-    assert force_misfit({"run": rows}) < 1.0
-    assert force_misfit({"run": replace(rows, force=right + wrong)}) == pytest.approx(np.mean(np.abs(wrong)), rel=0.1)
-    assert force_misfit({"run": replace(rows, force=np.full(4000, np.nan))}) == np.inf
+    assert force_misfit(Coulomb(), {"run": rows}) < 1.0
+    assert force_misfit(Coulomb(), {"run": replace(rows, force=right + wrong)}) == pytest.approx(
+        np.mean(np.abs(wrong)), rel=0.1
+    )
+    assert force_misfit(Coulomb(), {"run": replace(rows, force=np.full(4000, np.nan))}) == np.inf
 
 
 def test_static_friction_shows_where_the_drive_gives_way() -> None:
