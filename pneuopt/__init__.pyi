@@ -24,10 +24,10 @@ from pneuopt.dynamics.stick_slip import EventKind
 from pneuopt.dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
 from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.instruments import Actuator, Sensor
 from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from pneuopt.evaluation.margins import Margins, frequency_response, margins
 from pneuopt.evaluation.metrics import BandCentre, step_metrics
+from pneuopt.evaluation.record import Recording, record
 from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
@@ -47,7 +47,7 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.evaluation.rig import Recording, Rig, record
+from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.files.tuning import read_tuning, write_tuned

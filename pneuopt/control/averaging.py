@@ -14,14 +14,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.control.dither import Waveform
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-DITHER_AMPLITUDE, DITHER_OFFSET, DITHER_FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
 AMPLITUDE_FRACTIONS = np.geomspace(1e-3, 1.0, 13)  # fractions of the amplitude, where the whole is too much at once
 MAX_NEWTON_ITERATIONS, NEWTON_TOLERANCE, MIN_NEWTON_STEP = 50, 1e-9, 1e-3
 

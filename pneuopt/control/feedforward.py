@@ -5,10 +5,10 @@ from math import inf
 
 import casadi as ca
 
-from pneuopt.control.pid import unit_ratio
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.units import unit_ratio
 
 MIN_FEEDFORWARD_TIME = 1e-6  # [s]
 

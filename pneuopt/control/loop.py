@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from operator import or_
-from typing import Any, TypeVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -36,9 +36,7 @@ from pneuopt.dynamics.system import (
 )
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity
-
-T = TypeVar("T")
+from pneuopt.quantities.parameters import ParameterSet, Quantity, with_prefix, without_prefix
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,17 +167,17 @@ class ClosedLoop:
         (lead, added), seen, y = self._feedforward_terms(x, u, p), Signals(), self._plant_rates(t, x, u, p, ca.SX(0))[1]
         if self.sensor:
             seen = self.sensor.update(
-                _without_prefix("sensor", x), y, self._sensor_feedback, _without_prefix("sensor", p)
+                without_prefix(x, "sensor"), y, self._sensor_feedback, without_prefix(p, "sensor")
             )
         measured = seen.get("reading", y[self.feedback.name])
         own = self.pid.update(
-            _without_prefix("pid", x),
+            without_prefix(x, "pid"),
             u["reference"],
             measured,
             self._dither_command(t, p) + added,
-            _without_prefix("pid", p),
+            without_prefix(p, "pid"),
         )
-        after = stack({**x, **_with_prefix("sensor", seen), **_with_prefix("pid", own), **lead})
+        after = stack({**x, **with_prefix(seen, "sensor"), **with_prefix(own, "pid"), **lead})
         return ca.Function("update", [t, *map(stack, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
 
     def discrete(self, substeps: int = 1) -> DiscreteSystem:
@@ -220,7 +218,7 @@ class ClosedLoop:
             time = value["feedforward.time"]
             require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
         Tf = float(self.gains(list(value.values()))[3])
-        self.pid.check({**_without_prefix("pid", value), "Tf": Tf}, self.command.unit)
+        self.pid.check({**without_prefix(value, "pid"), "Tf": Tf}, self.command.unit)
 
     def parameter_vector(self, parameters: ParameterSet) -> Array:
         """The vector p of `parameters` in the loop's order; a missing one keeps the loop's default."""
@@ -230,7 +228,7 @@ class ClosedLoop:
     def gains(self) -> ca.Function:
         """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form, which is what runs, from the parameters of any `Form`."""
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        return ca.Function("gains", [stack(p)], [ca.vertcat(*parallel_gains(self.pid.form, _without_prefix("pid", p)))])
+        return ca.Function("gains", [stack(p)], [ca.vertcat(*parallel_gains(self.pid.form, without_prefix(p, "pid")))])
 
     def parallel_form(self, parameters: ParameterSet) -> ParallelForm:
         """The gains in the parallel form, from the parameters of any `Form`."""
@@ -238,7 +236,7 @@ class ClosedLoop:
 
     def sensor_lag(self, p: Array) -> Any:
         """The sensor's time constant in the loop linearised [s]; p of shape (n_parameters,) or (n_parameters, m)."""
-        value = _without_prefix("sensor", dict(zip(self.parameters, p, strict=True)))
+        value = without_prefix(dict(zip(self.parameters, p, strict=True)), "sensor")
         return self.sensor.time_constant(self._sensor_feedback, value) if self.sensor else 0.0
 
     @property
@@ -301,9 +299,9 @@ class ClosedLoop:
             require(x.shape == shape, f"x_plant has shape {x.shape}, the plant's state has {shape}")
         check_initial_command(command, value, self.command.unit)
         y = dict(zip(names(self.plant.outputs), self._plant_outputs(0, x, p).full().ravel().tolist(), strict=True))
-        sensor = self.sensor.start(y, self._sensor_feedback, _without_prefix("sensor", value)) if self.sensor else []
+        sensor = self.sensor.start(y, self._sensor_feedback, without_prefix(value, "sensor")) if self.sensor else []
         seen = sensor[0] if sensor else y[self.feedback.name]
-        own = self.pid.start(reference, seen, command, {**_without_prefix("pid", value), "Kp": float(self.gains(p)[0])})
+        own = self.pid.start(reference, seen, command, {**without_prefix(value, "pid"), "Kp": float(self.gains(p)[0])})
         return np.concatenate([x, sensor, own, [reference] if self.feedforward else []])
 
     def linear_plant(
@@ -341,21 +339,21 @@ class ClosedLoop:
         lead, added = self._feedforward_terms(x, u, p)
         seen = x["sensor.reading"] if self.sensor else self._plant_rates(t, x, u, p, ca.SX(0))[1][self.feedback.name]
         rates, command = self.pid.rates(
-            _without_prefix("pid", x),
+            without_prefix(x, "pid"),
             u["reference"],
             seen,
             self._dither_command(t, p) + added,
-            _without_prefix("pid", p),
+            without_prefix(p, "pid"),
         )
         xdot, y = self._plant_rates(t, x, u, p, command)
-        own = _with_prefix("pid", rates) | lead | self._sensor_rates(x, y, p)
+        own = with_prefix(rates, "pid") | lead | self._sensor_rates(x, y, p)
         return xdot | own, y | {"control": command}
 
     def _hold_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         command = x["pid.command"]
         if self.dither and self.dither.analogue:
             command = self.pid.clip(
-                command + self.dither.wave(t, _without_prefix("dither", p)), _without_prefix("pid", p)
+                command + self.dither.wave(t, without_prefix(p, "dither")), without_prefix(p, "pid")
             )
         xdot, y = self._plant_rates(t, x, u, p, command)
         own = {n: ca.SX(0) for n in x if n.startswith(("pid.", "feedforward."))} | self._sensor_rates(x, y, p)
@@ -365,7 +363,7 @@ class ClosedLoop:
         """What the controller itself adds."""
         if self.dither is None:
             return ca.SX(0)
-        own = _without_prefix("dither", p)
+        own = without_prefix(p, "dither")
         sampled_apart = self.dither.analogue and self.pid.sample_time is not None
         return own["offset"] if sampled_apart else own["offset"] + self.dither.wave(t, own)
 
@@ -374,19 +372,17 @@ class ClosedLoop:
         if self.feedforward is None:
             return {}, ca.SX(0)
         own, h = (
-            (_without_prefix("feedforward", x), u["reference"], _without_prefix("feedforward", p)),
+            (without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward")),
             self.pid.sample_time,
         )
         moved, added = self.feedforward.rates(*own) if h is None else self.feedforward.update(*own, h)
-        return _with_prefix("feedforward", moved), added
+        return with_prefix(moved, "feedforward"), added
 
     def _sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
         if self.sensor is None:
             return {}
-        return _with_prefix(
-            "sensor",
-            self.sensor.rates(_without_prefix("sensor", x), y, self._sensor_feedback, _without_prefix("sensor", p)),
-        )
+        own = without_prefix(x, "sensor"), y, self._sensor_feedback, without_prefix(p, "sensor")
+        return with_prefix(self.sensor.rates(*own), "sensor")
 
     def _plant_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
         return evaluate_plant(self.plant, self.command.name, t, x, u, p, command)
@@ -401,11 +397,3 @@ class ClosedLoop:
         t, x, u = ca.SX.sym("t"), symbols(self.plant.states), {q.name: ca.SX(0) for q in self.plant.inputs}
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
         return ca.Function("shown", [t, stack(x), stack(p)], [stack(self._plant_rates(t, x, u, p, ca.SX(0))[1])])
-
-
-def _without_prefix(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
-    return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
-
-
-def _with_prefix(prefix: str, values: Mapping[str, T]) -> dict[str, T]:
-    return {f"{prefix}.{n}": v for n, v in values.items()}

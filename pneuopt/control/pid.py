@@ -3,7 +3,6 @@
 The parallel form is what runs, whatever form its gains are given in (`forms`).
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
@@ -12,8 +11,9 @@ import casadi as ca
 
 from pneuopt.control.forms import ZERO_N_MESSAGE, ZERO_TI_MESSAGE, Form, parallel_gains
 from pneuopt.dynamics.system import Symbols
-from pneuopt.quantities.errors import UnitError, require
+from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.units import difference_unit, unit_ratio
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,8 @@ class PID:
         known = {
             "Kp": Parameter(1.0, gain),
             "K": Parameter(1.0, gain),
-            "Ki": Parameter(0.0, unit_ratio(output_unit, f"{_difference_unit(input_unit)}*s")),
-            "Kd": Parameter(0.0, unit_ratio(f"{_difference_unit(output_unit)}*s", input_unit)),
+            "Ki": Parameter(0.0, unit_ratio(output_unit, f"{difference_unit(input_unit)}*s")),
+            "Kd": Parameter(0.0, unit_ratio(f"{difference_unit(output_unit)}*s", input_unit)),
             "Tf": Parameter(0.01, "s", lower=0.0 if h else shortest),
             "Ti": Parameter(inf, "s", lower=0.0),
             "Td": Parameter(0.0, "s", lower=0.0),
@@ -108,7 +108,7 @@ class PID:
         }
         core = {n: known[n] for n in self.form.gains}
         core |= {n: Parameter(1.0, "1", lower=0.0) for n in ("b", "c")}
-        core |= {"dead_band": Parameter(0.0, _difference_unit(input_unit), lower=0.0)} if self.dead_band else {}
+        core |= {"dead_band": Parameter(0.0, difference_unit(input_unit), lower=0.0)} if self.dead_band else {}
         saturation = {
             "Tt": Parameter(max(0.1, 10 * h), "s", lower=shortest),
             "lower": Parameter(-inf, output_unit),
@@ -222,44 +222,3 @@ class PID:
         if not self.dead_band:
             return error
         return error - ca.fmin(ca.fmax(error, -p["dead_band"]), p["dead_band"])
-
-
-def unit_ratio(numerator: str, denominator: str) -> str:
-    """Divide two unit texts and simplify; a level such as "Pa(a)" counts as a difference.
-
-    Examples
-    --------
-    >>> [unit_ratio(*pair) for pair in (("V", "m/s"), ("V*s", "m/s"), ("V", "m/s*s"), ("N", "N"), ("1", "Pa(g)"))]
-    ['V*s/m', 'V*s^2/m', 'V/m', '1', '1/Pa']
-    """
-    powers = _unit_powers(_difference_unit(numerator))
-    for name, power in _unit_powers(_difference_unit(denominator)).items():
-        powers[name] = powers.get(name, 0) - power
-    above = [_unit_factor(n, k) for n, k in powers.items() if k > 0]
-    below = [_unit_factor(n, -k) for n, k in powers.items() if k < 0]
-    divisor = "*".join(below) if len(below) < 2 else f"({'*'.join(below)})"
-    return ("*".join(above) or "1") + (f"/{divisor}" if below else "")
-
-
-def _difference_unit(unit: str) -> str:
-    return re.sub(r"\([ag]\)", "", unit)
-
-
-def _unit_factor(name: str, power: int) -> str:
-    return name if power == 1 else f"{name}^{power}"
-
-
-def _unit_powers(unit: str) -> dict[str, int]:
-    powers: dict[str, int] = {}
-    rest = "*" + unit.replace(" ", "")
-    while rest:
-        match = re.match(r"([*/])(?:\(([^()]*)\)|([^\W\d_]+|%|1)(?:\^(-?\d+))?)", rest)
-        if match is None:
-            raise UnitError(f"cannot read the unit {unit!r}; write it like 'V*s/m' or 'm^3/(s*Pa)'")
-        sign = 1 if match[1] == "*" else -1
-        factors = _unit_powers(match[2]) if match[2] else {match[3]: int(match[4] or 1)}
-        for name, power in factors.items():
-            if name != "1":
-                powers[name] = powers.get(name, 0) + sign * power
-        rest = rest[match.end() :]
-    return powers

@@ -7,10 +7,10 @@ from typing import Any
 
 import casadi as ca
 
-from pneuopt.control.pid import unit_ratio
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.units import unit_ratio
 
 MIN_SENSOR_LAG = 1e-6  # [s]
 

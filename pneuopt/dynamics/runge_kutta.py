@@ -4,6 +4,10 @@ from collections.abc import Callable
 
 import casadi as ca
 
+# |lambda h| of a search's steps, dimensionless. RK4 is unstable above 2.78, and rates change within a search; below, a
+# stiff plant takes more steps than it needs.
+RK4_MAX_H_LAMBDA = 2.0
+
 
 def rk4(rate: Callable[[ca.SX, ca.SX], ca.SX], t: ca.SX, h: ca.SX, x: ca.SX) -> ca.SX:
     """One step of ``dx/dt = rate(t, x)``; stable for h < 2.78/|lambda|.

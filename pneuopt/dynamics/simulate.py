@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.dynamics.compiled.rollout import compile_function
-from pneuopt.dynamics.guards import Contact
+from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.runnable import Runnable
 from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration

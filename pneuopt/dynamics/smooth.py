@@ -10,7 +10,7 @@ import numpy as np
 from scipy import integrate
 
 from pneuopt.dynamics.compiled.rollout import compile_function
-from pneuopt.dynamics.guards import Contact
+from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.system import System, names
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError

@@ -10,8 +10,7 @@ import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.excitation import Excitation
-from pneuopt.dynamics.guards import HardwareCheckHook, ValidityLimit
-from pneuopt.dynamics.hooks import Log, LogWarningHook, RestHook, Start, StartHook
+from pneuopt.dynamics.hooks import HardwareCheckHook, Log, LogWarningHook, RestHook, Start, StartHook, ValidityLimit
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, check_names, require
@@ -21,7 +20,7 @@ from pneuopt.quantities.trajectories import Trajectory
 Symbols = Mapping[str, ca.SX]
 Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
 SymbolicUpdate = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
-FRICTION_DIRECTION = "friction.direction"  # of Karnopp's friction: what a simulation switches
+FRICTION_DIRECTION = "friction.direction"  # parameter of Karnopp's friction: the sign of the motion, set by `simulate`
 
 
 class Axis(NamedTuple):
@@ -68,19 +67,19 @@ class System:
         Every parameter with its default; their order is that of the vector p.
     ode : casadi.Function
         ``(t, x, u, p) -> (xdot, y)`` in SI units, built from SX.
-    start_hook : StartFinder, optional
-        How this model starts from a log.
-    rest_hook : RestFinder, optional
-        How this model comes to rest.
-    hardware_check_hook : Checker, optional
-        Which of its numbers are impossible.
-    validity_limits : tuple of Guard
-        What a simulation of it watches.
-    log_warning_hook : Doubter, optional
-        What it can tell against logs.
+    start_hook : StartHook, optional
+        How an identification of this model starts from logs.
+    rest_hook : RestHook, optional
+        Where the plant rests, and which inputs keep it there.
+    hardware_check_hook : HardwareCheckHook, optional
+        Which parameter values no hardware can have.
+    validity_limits : tuple of ValidityLimit
+        Limits that a simulation watches: an end stop, a vacuum.
+    log_warning_hook : LogWarningHook, optional
+        What is wrong with logs, as far as the model can see it.
     meter : casadi.Function, optional
-        ``(t, x, u, p) -> (air, spool)``: mass flow from the supply [kg/s], the spool's position [half travels]; no
-        outputs, for nobody logs them.
+        ``(t, x, u, p) -> (air, spool)``: mass flow from the supply [kg/s], the spool's position [half travels]; they
+        are no outputs, as no log holds them.
     excitation : Excitation
         Which motion a log must show for its parameters to be identifiable.
     axis : Axis, optional
@@ -128,19 +127,19 @@ class System:
         Parameters
         ----------
         logs : mapping of str to Log
-            By the log's name; which parameters are free is the same in all.
+            By the log's name; the same parameters are free in all of them.
 
         Returns
         -------
         sequence of Start
-            The most plausible first; without a finder, the measured outputs of a state's name and the given values.
+            The most plausible first. Without a `start_hook`: logged states as measured, others zero.
         """
         if self.start_hook is not None:
             return self.start_hook(logs)
         return [Start({name: self._states_from_log(log.measured) for name, log in logs.items()}, {}, "as given")]
 
     def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:
-        """What speaks against the logs, a sentence each; of a model without a doubter, nothing."""
+        """What is wrong with the logs, a sentence each; without a `log_warning_hook`, nothing."""
         return self.log_warning_hook(logs) if self.log_warning_hook is not None else ()
 
     @property
@@ -172,8 +171,9 @@ class System:
         """See `Fittable`; of a plant every initial state is to be found."""
 
     def _states_from_log(self, measured: Trajectory) -> Trajectory:
-        columns = {s.name: _interpolate_missing(measured, s.name) for s in self.states}
-        return Trajectory(measured.t, columns)
+        logged = [n for n in names(self.states) if n in measured and np.isfinite(measured[n]).any()]
+        zeros = {n: np.zeros(len(measured)) for n in names(self.states)}
+        return Trajectory(measured.t, zeros | {n: measured.fill_gaps(n) for n in logged})
 
     def equilibrium(self, u: Mapping[str, float], p: ParameterSet, guess: Mapping[str, float] | None = None) -> Array:
         """Solve ``xdot(x, u, p) = 0`` by Newton from `guess` (zeros where absent), by least-norm steps.
@@ -334,8 +334,7 @@ def define(
     parameters : ParameterSet
     rhs : callable
         ``rhs(t, x, u, p) -> (xdot, y)``: t an SX, the others mappings from name to SX.
-    start_hook : StartFinder, optional
-    rest_hook : RestFinder, optional
+    start_hook, rest_hook : StartHook, RestHook, optional
 
     Returns
     -------
@@ -413,13 +412,6 @@ def describe(system: System | DiscreteSystem) -> str:
         lines += [f"  {kind}: " + (", ".join(f"{q.name} [{q.unit}]" for q in getattr(system, kind)) or "none")]
     lines += ["  parameters:"] + ["    " + line for line in repr(system.parameters).splitlines()]
     return "\n".join(lines)
-
-
-def _interpolate_missing(measured: Trajectory, name: str) -> Array:
-    """The channel with its missing samples interpolated; zeros where it was not logged."""
-    column = measured[name] if name in measured else np.full(len(measured), np.nan)
-    known = np.isfinite(column)
-    return np.interp(measured.t, measured.t[known], column[known]) if known.any() else np.zeros(len(measured))
 
 
 def _check_unique_names(kind: str, quantities: Sequence[Quantity]) -> None:

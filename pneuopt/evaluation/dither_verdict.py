@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.averaging import ripple
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.hooks import Rest
@@ -23,7 +24,6 @@ from pneuopt.quantities.parameters import ParameterSet
 if TYPE_CHECKING:
     import pandas as pd
 
-DITHER_AMPLITUDE, DITHER_OFFSET, DITHER_FREQUENCY = "dither.amplitude", "dither.offset", "dither.frequency"
 NEGLIGIBLE_AMPLITUDE = 1e-9  # of the amplitude is none, but averages and end values are read over the same periods
 MIN_LOOSENING_FORCE = (
     0.5  # of the static friction: a force below half of it frees nothing in company of a working pressure

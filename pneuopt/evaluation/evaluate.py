@@ -14,12 +14,13 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.air import response_air_consumption
 from pneuopt.evaluation.cases import TuningCase, cases
+from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
 from pneuopt.evaluation.margins import margins, noise_gain
-from pneuopt.evaluation.means import period_mean
 from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.record import record
 from pneuopt.evaluation.response import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
-from pneuopt.evaluation.rig import Rig, record
+from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
@@ -87,7 +88,7 @@ def evaluate(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
-    >>> from pneuopt.evaluation.instruments import Sensor
+    >>> from pneuopt.evaluation.rig import Sensor
     >>> from pneuopt.models.drive import ForceDrive
     >>> from pneuopt.models.friction import Viscous
     >>> loop = ClosedLoop(ForceDrive(Viscous()).system(), PID(sample_time=1e-3))

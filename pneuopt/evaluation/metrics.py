@@ -8,7 +8,7 @@ from math import nan
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.evaluation.means import TAIL_SHARE, end_mean, period_mean, tail
+from pneuopt.evaluation.dither_mean import TAIL_SHARE, end_mean, period_mean, tail
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 

@@ -1,32 +1,96 @@
-"""`record`: what a real rig would log, with everything in it that the models for identification and tuning leave out.
-
-Between two samples the plant is integrated as in `simulate`, event by event with Karnopp's friction. Beyond that a rig
-has a valve that lags behind its command in position (hysteresis) and ignores small ones, sensors with lag, noise and
-finite resolution, and a controller that sees only those sensors, and differentiates an encoder to get a speed.
-"""
+"""`Rig`: a plant behind real hardware, its `Sensor`s and its `Actuator`; `record` runs it and gives its log."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import inf
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder
-from pneuopt.dynamics.compiled.rollout import compile_function
-from pneuopt.dynamics.simulate import contacts, initial_state, input_rows, new_integration, warn_contacts
-from pneuopt.dynamics.smooth import Integration
-from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
-from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack
-from pneuopt.evaluation.instruments import Actuator, Sensor
-from pneuopt.logs.columns import CHANNELS
-from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arrays import Array
+from pneuopt.dynamics.system import Symbols, System, define, names, stack
 from pneuopt.quantities.errors import ModelError, check_names, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity
-from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.parameters import Quantity
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What a channel's reading does to the truth: a lag of first order, then white noise, then rounding.
+
+    Parameters
+    ----------
+    lag : float
+        Time constant [s].
+    noise : float
+        Standard deviation [unit of the channel].
+    resolution : float
+        Step of the digital value [unit of the channel]; 0 is none.
+    """
+
+    lag: float = 0.0
+    noise: float = 0.0
+    resolution: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("lag", "noise", "resolution"):
+            value = getattr(self, name)
+            require(0 <= value < inf, f"Sensor: {name} must not be negative, got {value:g}; 0 is none")
+
+    @property
+    def standard_deviation(self) -> float:
+        """Standard deviation of noise and rounding together, the rounding taken as uniform [unit of the channel].
+
+        Examples
+        --------
+        >>> round(Sensor(noise=2e-6, resolution=12e-6).standard_deviation * 1e6, 6)
+        4.0
+        """
+        return float(np.hypot(self.noise, self.resolution / np.sqrt(12)))
+
+    def reading(self, value: float, noise: float) -> float:
+        """The digital value, `noise` being a draw of the standard normal distribution."""
+        noisy = value + self.noise * noise
+        return self.resolution * round(noisy / self.resolution) if self.resolution else noisy
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """What a valve, or an amplifier, makes of a command: hysteresis, then a dead zone.
+
+    Parameters
+    ----------
+    hysteresis : float
+        Width of the loop, as catalogues give it [unit of the command]: a play operator of half that width.
+    dead_zone : float
+        Half width of the commands around zero that do nothing [unit of the command]; beyond it the rest counts. The
+        overlap of a `ProportionalValve` has its own parameter.
+    """
+
+    hysteresis: float = 0.0
+    dead_zone: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("hysteresis", "dead_zone"):
+            value = getattr(self, name)
+            require(0 <= value < inf, f"Actuator: {name} must not be negative, got {value:g}; 0 is none")
+
+    def apply_hysteresis(self, command: float, before: float) -> float:
+        """The play operator: where the spool goes from `before` [unit of the command].
+
+        Examples
+        --------
+        >>> valve = Actuator(hysteresis=0.2)
+        >>> round(valve.apply_hysteresis(1.0, 0.0), 9), valve.apply_hysteresis(0.95, 0.9)
+        (0.9, 0.9)
+        """
+        half = self.hysteresis / 2
+        return min(max(before, command - half), command + half)
+
+    def apply_dead_zone(self, value: float) -> float:
+        """What is left beyond the dead zone [unit of the command]."""
+        return value - min(max(value, -self.dead_zone), self.dead_zone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,228 +186,6 @@ class Rig:
         lagging = (q for n, q in sensors.items() if lags[n] > 0)
         states, outputs = (*plant.states, *lagging), (*plant.outputs, *sensors.values())
         return define(states, plant.inputs, outputs, plant.parameters, rhs)
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """What `record` returns.
-
-    Attributes
-    ----------
-    experiment : Experiment
-        What the rig logs at its samples: commands, references, readings with their noise; "feedback" is what the
-        controller saw.
-    truth : Trajectory
-        States and outputs of the plant at the same instants, "control" behind the actuator, with Karnopp's friction
-        "stuck".
-    events : tuple of Event
-        With Karnopp's friction: when the piston broke away, reversed or stuck.
-    parameters : ParameterSet
-        Those that generated it.
-    """
-
-    experiment: Experiment
-    truth: Trajectory
-    events: tuple[Event, ...]
-    parameters: ParameterSet
-
-
-def record(
-    rig: Rig,
-    inputs: Trajectory,
-    parameters: ParameterSet,
-    *,
-    seed: int = 0,
-    initial: Mapping[str, float] | ArrayLike | None = None,
-    name: str = "rig",
-    rtol: float = 1e-8,
-) -> Recording:
-    """Run a rig and log it.
-
-    Parameters
-    ----------
-    rig : Rig
-    inputs : Trajectory
-        Of a loop "reference", of a plant alone its actuated input; and the plant's other inputs. Each is held from an
-        instant of the log to the next: those of this trajectory for a plant alone, the controller's samples, from
-        ``inputs.t[0]`` on, for a loop.
-    parameters : ParameterSet
-        A missing one keeps the model's default.
-    seed : int
-        Of the noise: the same seed gives the same log.
-    initial : mapping of state to value, or array, optional
-        As for `simulate`, of the plant or of the loop.
-    name : str
-        Of the experiment.
-    rtol : float
-        Tolerance of a step of the integration.
-
-    Returns
-    -------
-    Recording
-
-    Raises
-    ------
-    InputError
-        If an input is missing or NaN, or a state starts outside its physical range.
-    ConvergenceError
-        If the integration stops.
-
-    Examples
-    --------
-    >>> from pneuopt.models.drive import ForceDrive
-    >>> from pneuopt.models.friction import Coulomb
-    >>> from pneuopt.models.karnopp import Karnopp
-    >>> rig = Rig(ForceDrive(Karnopp(Coulomb())).system(), {"position": Sensor(resolution=1e-3)})
-    >>> push = Trajectory([0.0, 0.1, 0.2, 0.3], {"force": [29.0, 65.0, 65.0, 29.0]})
-    >>> run = record(rig, push, rig.plant.parameters)
-    >>> run.experiment.trajectory["position"].round(9).tolist(), [event.t for event in run.events]
-    ([0.0, 0.0, 0.023, 0.066], [0.1])
-    """
-    log_inputs = _resample_inputs(rig, inputs)
-    x, p = initial_state(rig.model, parameters, initial), parameter_vector(rig.plant.parameters, parameters)
-    source = (
-        _SampledController(rig, rig.loop, parameters, log_inputs, x)
-        if rig.loop is not None
-        else _CommandPlayer(rig, log_inputs)
-    )
-    run = new_integration(rig.sensor_system, p, log_inputs.t, rtol, 1e-2 * rtol)
-    readings, control = _run_samples(
-        rig, run, source, log_inputs, x[: len(rig.plant.states)], p, np.random.default_rng(seed)
-    )
-    logged = {n: log_inputs[n] for n in names(rig.plant.inputs) if n != rig.command.name} | source.columns()
-    logged |= dict(zip(rig.channels, readings.T, strict=True))
-    truth = run.trajectory().with_columns({"control": control})
-    warn_contacts(contacts(truth, rig.plant, parameters))
-    spread = {n: s.standard_deviation for n, s in rig.sensors.items() if s.standard_deviation > 0}
-    return Recording(
-        Experiment(Trajectory(log_inputs.t, logged), spread, name=name),
-        truth.select(n for n in truth.names if not n.startswith("sensor.")),
-        run.events if isinstance(run, StickSlipIntegration) else (),
-        parameters,
-    )
-
-
-class _CommandPlayer:
-    """Commands that are given beforehand."""
-
-    def __init__(self, rig: Rig, log_inputs: Trajectory) -> None:
-        self._name, self._commands = rig.command.name, log_inputs[rig.command.name]
-        self.initial_command = float(self._commands[0])
-
-    def act(self, k: int, readings: Mapping[str, float]) -> float:  # noqa: ARG002 - as `_SampledController`
-        """The command at sample k."""
-        return float(self._commands[k])
-
-    def columns(self) -> dict[str, ArrayLike]:
-        """What it logs."""
-        return {self._name: self._commands}
-
-
-class _SampledController:
-    """The loop's own controller, acting on a plant whose one state is what was read."""
-
-    def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, log_inputs: Trajectory, x: Array) -> None:
-        loop.check(parameters)
-        seen = loop.feedback
-        echo = define([seen], [loop.command], [seen], loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y))
-        echoing = replace(loop, plant=echo, sensor=None)
-        self._update, self._p = compile_function(echoing.update), echoing.parameter_vector(parameters)
-        plant, own = x[: len(rig.plant.states)], x[1 - len(echoing.states) :]
-        self._rig, self._loop, self._fed, self._x = rig, loop, log_inputs, own
-        self._command = names(echoing.states).index("pid.command")
-        self.initial_command = float(own[self._command - 1])
-        still = np.zeros(len(rig.plant.inputs))
-        self._first_reading = _plant_outputs(
-            rig, log_inputs.t[0], plant, still, parameter_vector(rig.plant.parameters, parameters)
-        )[seen.name]
-        self._feedback_values, self._commands = list[float](), list[float]()
-        self._position: float | None = None
-
-    def act(self, k: int, readings: Mapping[str, float]) -> float:
-        """The command at sample k."""
-        self._feedback_values.append(self._feedback(readings))
-        now, reference = self._fed.t[k], self._fed["reference"][k]
-        after = self._update(now, np.append(self._feedback_values[-1], self._x), [reference], self._p)[0]
-        self._x = after[1:]
-        self._commands.append(float(after[self._command]))
-        return self._commands[-1]
-
-    def columns(self) -> dict[str, ArrayLike]:
-        """What it logs."""
-        name = self._loop.feedback.name
-        reference = f"{name}_reference" if f"{name}_reference" in CHANNELS else "reference"
-        return {
-            reference: self._fed["reference"],
-            self._loop.command.name: self._commands,
-            "feedback": self._feedback_values,
-        }
-
-    def _feedback(self, readings: Mapping[str, float]) -> float:
-        """What the controller takes for its measured signal."""
-        wanted, source = self._loop.feedback.name, self._rig.feedback
-        if source == wanted:
-            return readings[wanted]
-        counts = Sensor(resolution=self._rig.encoder.resolution)
-        before, self._position = self._position, counts.reading(readings[str(source)], 0.0)
-        if before is None:
-            return self._first_reading
-        h = self._loop.pid.sample_time or 0.0
-        raw = (self._position - before) / h
-        return self._feedback_values[-1] + h / (h + self._rig.encoder.filter) * (raw - self._feedback_values[-1])
-
-
-def _run_samples(
-    rig: Rig,
-    run: Integration,
-    source: _CommandPlayer | _SampledController,
-    log_inputs: Trajectory,
-    x: Array,
-    p: Array,
-    random: np.random.Generator,
-) -> tuple[Array, Array]:
-    """Run from sample to sample; the readings, a row a sample, and what gets through the actuator."""
-    inputs, column = names(rig.plant.inputs), names(rig.plant.inputs).index(rig.command.name)
-    u = np.column_stack([log_inputs[n] if n != rig.command.name else np.zeros(len(log_inputs)) for n in inputs])
-    spool, sensors = source.initial_command, [rig.sensors[n] for n in rig.channels]
-    noise, readings = random.standard_normal((len(log_inputs), len(sensors))), np.zeros((len(log_inputs), len(sensors)))
-    u[0, column] = rig.actuator.apply_dead_zone(spool)
-    run.restart(log_inputs.t[0], _append_sensor_states(rig, log_inputs.t[0], x, u[0], p), u[0])
-    for k, t in enumerate(log_inputs.t):
-        x, shown = run.advance(t), run.outputs()[len(rig.plant.outputs) :]
-        readings[k] = [s.reading(y, z) for s, y, z in zip(sensors, shown, noise[k], strict=True)]
-        command = source.act(k, dict(zip(rig.channels, readings[k], strict=True)))
-        spool = rig.actuator.apply_hysteresis(command, spool)
-        u[k, column] = rig.actuator.apply_dead_zone(spool)
-        run.restart(t, x, u[k])
-        run.record()
-    return readings, u[:, column]
-
-
-def _append_sensor_states(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
-    """The plant's state, and the sensors' at rest with it."""
-    y = _plant_outputs(rig, t, x, u, p)
-    return np.append(x, [y[n] for n in rig.channels if rig.sensors[n].lag > 0])
-
-
-def _plant_outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
-    """The plant's, by name."""
-    return dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel().tolist(), strict=True))
-
-
-def _resample_inputs(rig: Rig, inputs: Trajectory) -> Trajectory:
-    """The inputs of the model at the instants of the log."""
-    rows, t, slack = input_rows(rig.model.inputs, inputs), inputs.t, 1e-9
-    if rig.loop is not None:
-        h = rig.loop.pid.sample_time or 0.0
-        slack = max(1e-6 * h, 4 * float(np.spacing(np.abs(t).max())))
-        t = t[0] + h * np.arange(int((t[-1] - t[0] + slack) / h) + 1)
-    rows = rows[np.searchsorted(inputs.t, t + slack, side="right") - 1]
-    return Trajectory(t, dict(zip(names(rig.model.inputs), rows.T, strict=True)))
-
-
-def _zero_rates(x: Symbols) -> Symbols:
-    return {n: ca.SX(0) for n in x}
 
 
 def _check_loop(loop: ClosedLoop) -> None:

@@ -230,18 +230,13 @@ def _acting_samples(t: Array, sample_time: float, name: str) -> Array:
 def _feedback_along_log(measured: Trajectory, wanted: str, reference: str, name: str) -> Array:
     """The fed-back signal along a log, without holes; a speed or position follows from the other."""
     if wanted in measured:
-        return _interpolate_gaps(measured.t, measured[wanted])
+        return measured.fill_gaps(wanted)
     t, step = measured.t, float(np.median(np.diff(measured.t)))
     if wanted == "speed" and "position" in measured:
         window = min(DIFFERENTIATION_WINDOW, (len(t) - 1) // 2 * 2 + 1)
-        return np.asarray(savgol_filter(_interpolate_gaps(t, measured["position"]), window, 2, deriv=1, delta=step))
+        return np.asarray(savgol_filter(measured.fill_gaps("position"), window, 2, deriv=1, delta=step))
     told = f"{name}: the loop feeds back {wanted!r}; without it, or the motion it follows from, there is no start"
     require(wanted == "position" and "speed" in measured, told, LogError)
-    speed = _interpolate_gaps(t, measured["speed"])
+    speed = measured.fill_gaps("speed")
     travel = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
     return np.asarray(measured[reference][0] + travel)
-
-
-def _interpolate_gaps(t: Array, column: Array) -> Array:
-    known = np.isfinite(column)
-    return np.interp(t, t[known], column[known])

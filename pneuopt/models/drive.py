@@ -14,7 +14,7 @@ from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.needs import LOAD_EXCITATION, RIG_EXCITATION
 from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.errors import ModelError, require
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
 
 STANDARD_ATMOSPHERE = 101325.0  # [Pa] standard atmosphere, ISO 2533
 POSITION = Quantity("position", "m", nominal=0.1)
@@ -147,11 +147,6 @@ def _ambient_parameters(friction: FrictionModel) -> ParameterSet:
 def _pressure_inputs(friction: FrictionModel) -> tuple[Quantity, ...]:
     """The absolute pressures that a pressure-dependent friction needs as inputs."""
     return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs if q.unit == "Pa(g)")
-
-
-def without_prefix(values: Symbols, prefix: str) -> Symbols:
-    """The entries ``prefix.name`` by their own name."""
-    return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
 
 
 def rename_quantity(quantity: Quantity, name: str) -> Quantity:

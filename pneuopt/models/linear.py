@@ -21,7 +21,8 @@ from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape
 from pneuopt.quantities.errors import ModelError, check_names, require
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
+from pneuopt.quantities.units import difference_unit
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
 MAX_PADE_ORDER = 5
@@ -118,7 +119,7 @@ class SecondOrder:
             rates = {y: x["drive"], "drive": w**2 * (gain * u - x[y]) - 2 * zeta * w * x["drive"]}
             if friction is None:
                 return rates
-            force = friction.force(x[y], _friction_entries(x), {}, _friction_entries(p))
+            force = friction.force(x[y], without_prefix(x, "friction"), {}, without_prefix(p, "friction"))
             rates[y] -= gain * w / (2 * zeta) * force.value
             return rates | {f"friction.{n}": rate for n, rate in force.rates.items()}
 
@@ -327,22 +328,17 @@ def _pade_delay(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list
 
 
 def _gain_parameter(source: Quantity, output: Quantity, per: str) -> Parameter:
-    unit = _quotient_unit(output, f"({_difference_unit(source)}{per})" if per else _difference_unit(source))
+    unit = _quotient_unit(output, f"({difference_unit(source.unit)}{per})" if per else difference_unit(source.unit))
     return Parameter(1.0, unit)
 
 
 def _quotient_unit(output: Quantity, unit: str) -> str:
-    return f"{_difference_unit(output)}/{unit if unit.isalnum() or unit.startswith('(') else f'({unit})'}"
-
-
-def _difference_unit(quantity: Quantity) -> str:
-    """Its unit as that of a difference: a pressure level loses its mark."""
-    return quantity.unit.removesuffix("(a)").removesuffix("(g)")
+    return f"{difference_unit(output.unit)}/{unit if unit.isalnum() or unit.startswith('(') else f'({unit})'}"
 
 
 def _in_input_unit(parameters: ParameterSet, source: Quantity) -> ParameterSet:
     """Friction's parameters in the unit of the input instead of newtons; the defaults shrink to a hundredth."""
-    shrunk = {n: _convert_force_unit(q, _difference_unit(source)) for n, q in parameters.items()}
+    shrunk = {n: _convert_force_unit(q, difference_unit(source.unit)) for n, q in parameters.items()}
     return ParameterSet({n: replace(q, value=0.0) if n == "viscous" else q for n, q in shrunk.items()})
 
 
@@ -352,7 +348,3 @@ def _convert_force_unit(parameter: Parameter, unit: str) -> Parameter:
         return parameter
     low, value, high = (0.01 * number for number in (parameter.lower, parameter.value, parameter.upper))
     return replace(parameter, value=value, lower=low, upper=high, unit=re.sub(r"\bN\b", unit, parameter.unit))
-
-
-def _friction_entries(values: Symbols) -> Symbols:
-    return {n.removeprefix("friction."): s for n, s in values.items() if n.startswith("friction.")}

@@ -4,12 +4,14 @@ import fnmatch
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from pneuopt.quantities.errors import InputError, UnknownNameError, check_names, require
 
 if TYPE_CHECKING:
     import pandas as pd
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -196,3 +198,19 @@ def _describe_parameter(parameter: Parameter) -> str:
     bounds = f" in [{parameter.lower:g}, {parameter.upper:g}]" if finite else ""
     source = f"  # {parameter.source}" if parameter.source else ""
     return f"{parameter.value:g} {parameter.unit}{bounds}{' ' + ', '.join(marks) if marks else ''}{source}"
+
+
+def without_prefix(values: Mapping[str, T], prefix: str) -> dict[str, T]:
+    """The entries ``prefix.name`` by their own name.
+
+    Examples
+    --------
+    >>> without_prefix({"pid.Kp": 2.0, "load.mass": 5.0}, "pid")
+    {'Kp': 2.0}
+    """
+    return {n.removeprefix(f"{prefix}."): v for n, v in values.items() if n.startswith(f"{prefix}.")}
+
+
+def with_prefix(values: Mapping[str, T], prefix: str) -> dict[str, T]:
+    """The entries under the name ``prefix.name``."""
+    return {f"{prefix}.{n}": v for n, v in values.items()}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import UnknownNameError, require
+from pneuopt.quantities.errors import LogError, UnknownNameError, require
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -94,6 +94,13 @@ class Trajectory:
         """Interpolate linearly onto another grid; before the first and after the last sample, their values stay."""
         grid = np.asarray(t, dtype=float)
         return Trajectory(grid, {n: np.interp(grid, self.t, c) for n, c in self.values.items()})
+
+    def fill_gaps(self, name: str) -> Array:
+        """The column with its missing samples interpolated linearly; one without any sample is a `LogError`."""
+        column = self[name]
+        known = np.isfinite(column)
+        require(bool(known.any()), f"channel {name!r} has no samples", LogError)
+        return np.interp(self.t, self.t[known], column[known])
 
     def to_frame(self) -> "pd.DataFrame":
         """Tabulate: the index is the time [s], a column a signal."""

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import RolloutResult
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback, Status
@@ -30,7 +31,6 @@ STAGE_COST_TOLERANCE = 1e-3  # a stage ends where the promised decrease is this 
 FINAL_COST_TOLERANCE = 5e-7  # likewise the last, in noise variances: half of (0.1 % of a standard deviation)^2
 MIN_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
-RK4_MAX_H_LAMBDA = 2.0  # h |lambda| of a search's steps; RK4 is stable below 2.78
 STALL_COST_DECREASE = 2e-3  # of the cost an iteration, below which a search that goes on gets nowhere
 GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, "the gaps between segments take up what the model cannot")
 STIFFNESS_UPDATE_CHANGE = 0.03  # a parameter's relative change that has the stiffness judged anew

@@ -11,8 +11,8 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.evaluation.cases import TuningCase
+from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.margins import frequency_response
-from pneuopt.evaluation.means import TAIL_SHARE
 from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
 from pneuopt.evaluation.response import highest_dither_frequency
 from pneuopt.evaluation.specification import Specification

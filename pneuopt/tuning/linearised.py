@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.evaluation.means import TAIL_SHARE
+from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
 from pneuopt.evaluation.requirements import (
     ROBUSTNESS_REQUIREMENTS,

@@ -13,9 +13,9 @@ from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.air import air_consumption, meter_outputs
+from pneuopt.evaluation.dither_mean import DitherPeriodMean
 from pneuopt.evaluation.metrics import BandCentre, Envelope, batch_metrics
 from pneuopt.evaluation.response import MAX_READINGS_A_SAMPLE
-from pneuopt.evaluation.window import DitherPeriodMean
 from pneuopt.quantities.arrays import Array
 
 SIGNAL_OUTPUT, CONTROL_OUTPUT, FLOW_OUTPUT, SPOOL_OUTPUT = range(

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.means import TAIL_SHARE
+from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import SettlingTime, metric_name, upper_limit, user_limit, with_user_limit
 from pneuopt.evaluation.specification import Specification

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.evaluation.air import ANR_DENSITY, LITRES_PER_CUBIC_METRE
-from pneuopt.evaluation.means import end_mean
+from pneuopt.evaluation.dither_mean import DitherPeriodMean, end_mean
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.requirements import (
     IAE,
@@ -25,7 +25,6 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.evaluation.window import DitherPeriodMean
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.readings import CONTROL_OUTPUT, FLOW_OUTPUT, INTEGRAL_OUTPUT, SIGNAL_OUTPUT, ReferenceGrid
 

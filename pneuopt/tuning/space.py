@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, command_range, highest_dither_frequency
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
-RK4_MAX_H_LAMBDA = 2.0  # |lambda h| of an RK4 step, with a margin to 2.78
 MAX_LOOP_SUBSTEPS = 100
 MAX_ROUNDING_POINTS = 625  # points: all that differ by two last places or less in four gains
 

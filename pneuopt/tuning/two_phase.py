@@ -15,9 +15,10 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, disturbance_input
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
+from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.margins import frequency_grid, sensitivity_terms
-from pneuopt.evaluation.means import TAIL_SHARE
 from pneuopt.evaluation.requirements import (
     METRICS,
     REQUIREMENT_KINDS,
@@ -37,7 +38,7 @@ from pneuopt.quantities.status import ProgressCallback
 from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, regular_nodes
-from pneuopt.tuning.space import RK4_MAX_H_LAMBDA, Space, fastest_eigenvalue, rk4_substeps
+from pneuopt.tuning.space import Space, fastest_eigenvalue, rk4_substeps
 
 EXACT_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.exact and kind is not SettlingTime)
 UNKNOWN_UPPER_BOUNDS = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}

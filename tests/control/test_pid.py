@@ -4,33 +4,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pneuopt.control.pid import PID, unit_ratio
-from pneuopt.quantities.errors import InputError, UnitError
+from pneuopt.control.pid import PID
+from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Quantity
 
 MEASURED, COMMAND = Quantity("speed", "m/s"), Quantity("valve_voltage", "V")
 GAINS = {"Kp": 2.0, "Ki": 9.0, "Kd": 0.05, "Tf": 0.004, "b": 0.7, "c": 0.4, "Tt": 0.06, "lower": -1.0, "upper": 1.5}
-
-
-@pytest.mark.parametrize(
-    ("above", "below", "expected"),
-    [
-        ("V", "m/s", "V*s/m"),
-        ("V*s", "m/s", "V*s^2/m"),
-        ("N", "m", "N/m"),
-        ("V", "Pa(g)", "V/Pa"),
-        ("1", "m^2/s^2", "s^2/m^2"),
-        ("kg/(m*s)", "Pa", "kg/(m*s*Pa)"),
-        ("m", "m", "1"),
-    ],
-)
-def test_units_of_gains_are_simplified(above: str, below: str, expected: str) -> None:
-    assert unit_ratio(above, below) == expected
-
-
-def test_an_unreadable_unit_is_refused() -> None:
-    with pytest.raises(UnitError, match=r"cannot read the unit 'm\*\*2'"):
-        unit_ratio("V", "m**2")
 
 
 @pytest.mark.parametrize("sample_time", [0.0, -1e-3, inf])

@@ -9,10 +9,9 @@ from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import define
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.instruments import Sensor
 from pneuopt.evaluation.margins import frequency_response, margins
 from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, SettlingTime
-from pneuopt.evaluation.rig import Rig
+from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.evaluation.scenarios import Scenarios, corners
 from pneuopt.evaluation.specification import specify
 from pneuopt.identification.logged_loop import LoggedLoop

@@ -13,8 +13,8 @@ from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable, Runnable, check_smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names, parameter_vector
-from pneuopt.evaluation.instruments import Sensor
-from pneuopt.evaluation.rig import Rig, record
+from pneuopt.evaluation.record import record
+from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, LuGre, Stribeck

@@ -11,9 +11,8 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
 from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.instruments import Actuator, Sensor
 from pneuopt.evaluation.requirements import IAE
-from pneuopt.evaluation.rig import Rig
+from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.models.catalog import r25
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, LuGre, Stribeck, Viscous

@@ -14,8 +14,8 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.evaluation.instruments import Actuator, Sensor
-from pneuopt.evaluation.rig import Recording, Rig, record
+from pneuopt.evaluation.record import Recording, record
+from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.identification.identify import identify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import FrictionModel, Stribeck

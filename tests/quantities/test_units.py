@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pneuopt.quantities.errors import UnitError
-from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, si_conversion, write_value
+from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, si_conversion, unit_ratio, write_value
 
 
 @pytest.mark.parametrize(
@@ -156,3 +156,24 @@ def test_pint_stays_out_of_import_time() -> None:
 def test_a_doubled_percent_sign_is_refused(text: str) -> None:
     with pytest.raises(UnitError, match=r"unknown unit '% ?%'"):
         read_value(text, "1")
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "expected"),
+    [
+        ("V", "m/s", "V*s/m"),
+        ("V*s", "m/s", "V*s^2/m"),
+        ("N", "m", "N/m"),
+        ("V", "Pa(g)", "V/Pa"),
+        ("1", "m^2/s^2", "s^2/m^2"),
+        ("kg/(m*s)", "Pa", "kg/(m*s*Pa)"),
+        ("m", "m", "1"),
+    ],
+)
+def test_units_of_gains_are_simplified(above: str, below: str, expected: str) -> None:
+    assert unit_ratio(above, below) == expected
+
+
+def test_an_unreadable_unit_is_refused() -> None:
+    with pytest.raises(UnitError, match=r"cannot read the unit 'm\*\*2'"):
+        unit_ratio("V", "m**2")

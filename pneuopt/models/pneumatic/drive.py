@@ -11,7 +11,7 @@ import numpy as np
 from pneuopt.dynamics.excitation import Excitation, SeparatingRun
 from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest
 from pneuopt.dynamics.system import Axis, Symbols, System, define, names, parameter_vector, stack, symbols
-from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity, without_prefix
+from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
 from pneuopt.models.friction import FrictionModel, Stribeck, law_inputs
 from pneuopt.models.linear import VALVE_VOLTAGE
 from pneuopt.models.load import Load
@@ -26,7 +26,7 @@ from pneuopt.models.starts.pneumatic import PneumaticStarts
 from pneuopt.models.starts.pressure_zero import PressureZeroCheck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.trajectories import Trajectory
 
 SIDES = ("a", "b")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.dynamics.guards import ValidityLimit
+from pneuopt.dynamics.hooks import ValidityLimit
 from pneuopt.models.pneumatic.chamber import MIN_CHAMBER_PRESSURE
 from pneuopt.models.pneumatic.cylinder import STOP_ROUNDING
 from pneuopt.quantities.errors import HardwareError, require

@@ -92,7 +92,7 @@ def filter_channel(measured: Trajectory, name: str, derivative: int) -> Array:
     step = float(np.median(np.diff(measured.t)))
     window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
     window = min(window, (len(measured) - 1) // 2 * 2 + 1)
-    column = _interpolate_gaps(measured, name)
+    column = measured.fill_gaps(name)
     return np.asarray(savgol_filter(column, window, min(3, window - 1), deriv=derivative, delta=step))
 
 
@@ -341,11 +341,3 @@ def _friction_force(name: str, rows: RegressionRows, values: Mapping[str, float]
     used = {n: c for n, c in rows.columns.items() if n in p}
     taken = (values.get(n, values.get(f"{n}[{name}]", p.value(n))) * c for n, c in used.items())
     return np.asarray(rows.force - sum(taken))
-
-
-def _interpolate_gaps(measured: Trajectory, name: str) -> Array:
-    """The column with missing samples interpolated, for filters only."""
-    column = measured[name]
-    known = np.isfinite(column)
-    require(bool(known.any()), f"channel {name!r} has no samples", LogError)
-    return np.interp(measured.t, measured.t[known], column[known])

@@ -8,14 +8,13 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define, names
-from pneuopt.models.drive import without_prefix
 from pneuopt.models.friction import Viscous
 from pneuopt.models.pneumatic.chamber import Polytropic, Thermal, blend
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import GAS_CONSTANT
 from pneuopt.models.pneumatic.valve import Port
-from pneuopt.quantities.parameters import Quantity
+from pneuopt.quantities.parameters import Quantity, without_prefix
 from pneuopt.quantities.trajectories import Trajectory
 
 AREAS = np.pi / 4 * 0.032**2, np.pi / 4 * (0.032**2 - 0.012**2)

@@ -8,12 +8,12 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.guards import Contact, ValidityLimit
+from pneuopt.dynamics.hooks import Contact, ValidityLimit
 from pneuopt.dynamics.simulate import contacts, simulate
 from pneuopt.dynamics.system import System, define, names
-from pneuopt.evaluation.instruments import Sensor
+from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import SettlingTime
-from pneuopt.evaluation.rig import Rig, record
+from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
