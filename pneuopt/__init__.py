@@ -76,6 +76,7 @@ _HOME = {
     "pneuopt.control.reference": ("Step",),
     "pneuopt.control.sensor": ("Encoder", "SensorLag"),
     "pneuopt.control.loop": ("ClosedLoop",),
+    "pneuopt.control.linear_loop": ("linear_plant", "open_loop"),
     "pneuopt.control.averaging": ("average_dither", "mean_start", "ripple"),
     "pneuopt.evaluation.margins": ("Margins", "frequency_response", "margins"),
     "pneuopt.evaluation.metrics": ("BandCentre", "step_metrics"),

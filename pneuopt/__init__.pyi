@@ -15,6 +15,7 @@ from pneuopt.control.forms import (
     to_series,
     to_standard,
 )
+from pneuopt.control.linear_loop import linear_plant, open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
@@ -220,8 +221,10 @@ __all__ = [
     "identifiability",
     "identify",
     "judge_dither",
+    "linear_plant",
     "margins",
     "mean_start",
+    "open_loop",
     "pareto_front",
     "plot_bode",
     "plot_correlation",

@@ -5,6 +5,7 @@ import hashlib
 import re
 import subprocess
 import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pytest
@@ -69,3 +70,59 @@ def test_the_readmes_code_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     printed = capsys.readouterr().out
     assert "friction.coulomb" in printed
     assert "SettlingTime" in printed
+
+
+def imports_of(path: Path) -> set[str]:
+    """The modules of pneuopt that a file imports when it runs, wherever in the file; not those for type checking."""
+    found: set[str] = set()
+
+    def visit(node: ast.AST) -> None:
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            for other in node.orelse:
+                visit(other)
+            return
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found.update({node.module, *(f"{node.module}.{a.name}" for a in node.names)})
+        if isinstance(node, ast.Import):
+            found.update(a.name for a in node.names)
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(path.read_text(encoding="utf-8")))
+    return found
+
+
+def import_circle(imports: Mapping[str, Iterable[str]]) -> list[str]:
+    """Modules each of which imports the next, and the last the first; empty where there is no circle."""
+    done: set[str] = set()
+
+    def search(module: str, path: list[str]) -> list[str]:
+        if module in path:
+            return [*path[path.index(module) :], module]
+        if module in done:
+            return []
+        for other in sorted(imports[module]):
+            if circle := search(other, [*path, module]):
+                return circle
+        done.add(module)
+        return []
+
+    return next((circle for module in sorted(imports) if (circle := search(module, []))), [])
+
+
+def test_no_module_imports_itself_round_a_circle() -> None:
+    files = {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in (ROOT / "pneuopt").rglob("*.py")}
+    modules = {name.removesuffix(".__init__"): path for name, path in files.items()}
+    circle = import_circle({n: (imports_of(p) & modules.keys()) - {n, "pneuopt"} for n, p in modules.items()})
+    assert not circle, " -> ".join(circle)
+
+
+def test_a_circle_is_found_and_named() -> None:
+    assert import_circle({"a": ["b"], "b": ["c"], "c": ["b"]}) == ["b", "c", "b"]
+    assert import_circle({"a": ["b", "c"], "b": ["c"], "c": []}) == []
+
+
+def test_an_import_for_type_checking_only_is_no_arrow(tmp_path: Path) -> None:
+    path = tmp_path / "module.py"
+    path.write_text("if TYPE_CHECKING:\n    import a\nelse:\n    import b\n\ndef f():\n    from c import d\n")
+    assert imports_of(path) == {"b", "c", "c.d"}

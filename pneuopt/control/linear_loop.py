@@ -1,26 +1,39 @@
-"""The loop linearised: the plant as the controller sees it, and the open loop whose margins count."""
+"""The loop linearised: `linear_plant`, the plant as the controller sees it; `open_loop`, whose margins count."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.rest import find_rest
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
-if TYPE_CHECKING:
-    from pneuopt.control.loop import ClosedLoop
-
 
 def linear_plant(
-    loop: "ClosedLoop", parameters: ParameterSet, x: Array | None, u: Mapping[str, float] | None
+    loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
 ) -> Linearisation:
-    """As `ClosedLoop.linear_plant`."""
+    """The plant from command to measured output, or to the reading of a sensor with a lag, linearised.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+    x : ndarray, shape (n_plant_states,), optional
+        The plant's operating point, an equilibrium or not; by default the closed loop's rest. Dry friction makes a
+        resting plant look stiff: linearise such a plant in motion.
+    u : mapping of str to float, optional
+        The plant's inputs there, zero where absent; at rest the command is solved for.
+
+    Returns
+    -------
+    Linearisation
+    """
     loop.check(parameters)
     if x is None:
         x, command = find_rest(loop, parameters, 0.0, {})
@@ -38,9 +51,18 @@ def linear_plant(
 
 
 def open_loop(
-    loop: "ClosedLoop", parameters: ParameterSet, x: Array | None, u: Mapping[str, float] | None
+    loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
 ) -> Linearisation:
-    """As `ClosedLoop.open_loop`."""
+    """``L(s) = C(s) P(s)`` under negative feedback, cut at the measured output, without saturation and dither.
+
+    A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé form,
+    its integral as one without a dead band. Parameters as for `linear_plant`.
+
+    Returns
+    -------
+    Linearisation
+        From the control error, input "error", to the measured output; the plant's states come first.
+    """
     plant, controller = linear_plant(loop, parameters, x, u), _linear_controller(loop, parameters)
     m, n = len(controller.A), len(plant.A)
     return Linearisation(
@@ -54,7 +76,7 @@ def open_loop(
     )
 
 
-def linear_gains(loop: "ClosedLoop", p: Any) -> Any:
+def linear_gains(loop: ClosedLoop, p: Any) -> Any:
     """Kp, Ki, Kd, Tf of the controller's continuous equivalent, shape (4, m).
 
     Backward Euler puts ``(1 - e^(-s h))/h``, nearly ``s/(1 + s h/2)``, for s: a sampled controller is the continuous
@@ -86,7 +108,7 @@ def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.comple
     return np.asarray((1 - s / 2 + s**2 / 12) / (1 + s / 2 + s**2 / 12))
 
 
-def _linear_controller(loop: "ClosedLoop", parameters: ParameterSet) -> Linearisation:
+def _linear_controller(loop: ClosedLoop, parameters: ParameterSet) -> Linearisation:
     Kp, Ki, Kd, Tf = linear_gains(loop, loop.parameter_vector(parameters)).full().ravel().tolist()
     require(Tf > 0, "a continuous derivative needs a filter, Tf > 0")
     A, B = np.diag([0.0, -1 / Tf]), np.array([[Ki], [1 / Tf]])

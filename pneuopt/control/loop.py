@@ -17,14 +17,12 @@ import numpy as np
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
-from pneuopt.control.linear_loop import linear_plant, open_loop
 from pneuopt.control.pid import PID
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.control.wiring import Signals, check_algebraic_loop, check_initial_command, evaluate_plant, select_signal
 from pneuopt.dynamics.system import (
     DiscreteSystem,
-    Linearisation,
     Motion,
     Symbols,
     System,
@@ -303,37 +301,6 @@ class ClosedLoop:
         seen = sensor[0] if sensor else y[self.feedback.name]
         own = self.pid.start(reference, seen, command, {**without_prefix(value, "pid"), "Kp": float(self.gains(p)[0])})
         return np.concatenate([x, sensor, own, [reference] if self.feedforward else []])
-
-    def linear_plant(
-        self, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
-    ) -> Linearisation:
-        """The plant from command to measured output, or to what its sensor's lag shows, linearised.
-
-        Parameters
-        ----------
-        parameters : ParameterSet
-        x : ndarray, shape (n_plant_states,), optional
-            The plant's operating point, an equilibrium or not; by default the closed loop's rest. Dry friction makes a
-            resting plant look stiff: linearise such a plant in motion.
-        u : mapping of str to float, optional
-            The plant's inputs there, zero where absent; at rest the command is solved for.
-        """
-        return linear_plant(self, parameters, x, u)
-
-    def open_loop(
-        self, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
-    ) -> Linearisation:
-        """``L(s) = C(s) P(s)`` under negative feedback, cut at the measured output, without clip and dither.
-
-        A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé
-        form; the integral as without a dead band. Parameters as for `linear_plant`.
-
-        Returns
-        -------
-        Linearisation
-            From the control error, input "error", to the measured output; the plant's states come first.
-        """
-        return open_loop(self, parameters, x, u)
 
     def _continuous_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         lead, added = self._feedforward_terms(x, u, p)

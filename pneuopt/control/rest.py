@@ -1,7 +1,7 @@
 """Where a loop rests, or moves steadily: the equilibrium of plant and controller, without dither and clip."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -12,19 +12,56 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 
-if TYPE_CHECKING:
-    from pneuopt.control.loop import ClosedLoop
-
 INTEGRAL_STATE = "pid.integral"
 
 
-def find_rest(
-    loop: "ClosedLoop", parameters: ParameterSet, reference: float, start: Mapping[str, float]
-) -> tuple[Array, float]:
-    """The plant's state and the command.
+class WiredLoop(Protocol):
+    """What of a `ClosedLoop` its equilibrium depends on."""
 
-    A plant that knows its rest is asked for it. Else the equilibrium is solved for, where a state on which no rate and
-    not the measured output depends, the position of a servo axis, may run on.
+    @property
+    def plant(self) -> System:
+        """Without the controller."""
+        ...
+
+    @property
+    def command(self) -> Quantity:
+        """The plant's input that the controller drives."""
+        ...
+
+    @property
+    def feedback(self) -> Quantity:
+        """The plant's output that is fed back."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """The reference, then the plant's other inputs."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """The plant's, then the control."""
+        ...
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """The plant's and the controller's."""
+        ...
+
+    @property
+    def gains(self) -> ca.Function:
+        """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form."""
+        ...
+
+
+def find_rest(
+    loop: WiredLoop, parameters: ParameterSet, reference: float, start: Mapping[str, float]
+) -> tuple[Array, float]:
+    """The plant's state and the command, at rest or in steady motion.
+
+    A plant with a `rest_hook` gives them. Otherwise they are the equilibrium of plant and controller; a state that
+    neither the rates nor the measured output depend on, such as the position of an axis under speed control, is left
+    out and may keep moving.
 
     Parameters
     ----------
@@ -63,7 +100,7 @@ def find_rest(
     return np.array([found.get(n, 0.0) for n in names(plant.states)]), command
 
 
-def set_sliding_direction(loop: "ClosedLoop", parameters: ParameterSet, reference: float) -> ParameterSet:
+def set_sliding_direction(loop: WiredLoop, parameters: ParameterSet, reference: float) -> ParameterSet:
     """The parameters with which a loop begins: Karnopp's friction already slides where the plant moves."""
     if loop.feedback.name != "speed" or FRICTION_DIRECTION not in loop.parameters:
         return parameters
@@ -79,9 +116,9 @@ def unobservable_states(plant: System, measured: str) -> tuple[str, ...]:
     return tuple(n for n, counts in zip(names(plant.states), matters, strict=True) if not counts)
 
 
-def _rest_system(loop: "ClosedLoop", free: tuple[str, ...], parameters: ParameterSet) -> System:
+def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSet) -> System:
     """The loop with the integral as its controller's only state, and without the plant's free ones."""
-    plant, acts = loop.plant, bool(loop.parallel_form(parameters).Ki)
+    plant, acts = loop.plant, bool(loop.gains(parameter_vector(loop.parameters, parameters))[1])
     integral = [Quantity(INTEGRAL_STATE, loop.command.unit, loop.command.nominal)] if acts else []
     states = [*(q for q in plant.states if q.name not in free), *integral]
 

@@ -2,7 +2,7 @@
 
 How a tuner limits the maximum sensitivity Ms::
 
-    omega = frequency_grid(loop.open_loop(parameters), 20)   # or any grid of your own
+    omega = frequency_grid(open_loop(loop, parameters), 20)   # or any grid of your own
     terms = sensitivity_terms(loop, omega, parameters)       # once
     terms(p) >= 1 / Ms**2                                    # p in the order of loop.parameters: numbers, SX or MX
 """
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
-from pneuopt.control.linear_loop import linear_gains, pade_delay_response
+from pneuopt.control.linear_loop import linear_gains, linear_plant, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.quantities.arrays import Array
@@ -61,7 +61,7 @@ class Margins:
 
 
 def margins(open_loop: Linearisation) -> Margins:
-    """Margins of ``L(s)`` under negative feedback (`ClosedLoop.open_loop`).
+    """Margins of ``L(s)`` under negative feedback (`open_loop`).
 
     Crossings are bracketed on `frequency_grid` and refined to machine precision.
 
@@ -111,7 +111,7 @@ def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float
     Parameters
     ----------
     open_loop : Linearisation
-        ``L = C P`` (`ClosedLoop.open_loop`), strictly proper.
+        ``L = C P`` (`open_loop`), strictly proper.
     gains : (float, float, float, float)
         Kp, Ki, Kd, Tf of the PID C, with Tf > 0.
 
@@ -196,7 +196,7 @@ def sensitivity_terms(
     parameters : ParameterSet
         The plant's values.
     x : ndarray, shape (n_plant_states,), optional
-        The plant's operating point, as for `ClosedLoop.linear_plant`.
+        The plant's operating point, as for `linear_plant`.
 
     Returns
     -------
@@ -211,7 +211,7 @@ def sensitivity_terms(
     free = [n for n in parameters.free_names if n in loop.plant.parameters]
     require(not free, f"{', '.join(free)}: free, but the sensitivity takes the plant as fixed; fix it", ModelError)
     w = np.asarray(omega, dtype=float)
-    P = frequency_response(loop.linear_plant(parameters, x), w) * pade_delay_response(w, loop.dead_time)
+    P = frequency_response(linear_plant(loop, parameters, x), w) * pade_delay_response(w, loop.dead_time)
     p = ca.SX.sym("p", len(loop.parameters))
     Kp, Ki, Kd, Tf = ca.vertsplit(linear_gains(loop, p))
     ws, re, im = ca.DM(w), ca.DM(P.real.copy()), ca.DM(P.imag.copy())

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
+from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, disturbance_input
 from pneuopt.dynamics.system import Linearisation
@@ -60,8 +61,8 @@ def linearise_open_loop(
 ) -> Linearisation:
     """The open loop for margins, about a plant state x under a command, and under what disturbs it in the end."""
     others = {} if reference is None else {disturbance_input(n): v for n, v in reference.disturbance.items()}
-    return add_disturbances(loop, [reference] if reference else []).open_loop(
-        parameters, x, {loop.command.name: command, **others}
+    return open_loop(
+        add_disturbances(loop, [reference] if reference else []), parameters, x, {loop.command.name: command, **others}
     )
 
 

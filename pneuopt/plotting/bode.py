@@ -27,7 +27,7 @@ def plot_bode(open_loop: Linearisation, before: Linearisation | None = None) -> 
     Parameters
     ----------
     open_loop : Linearisation
-        Of `ClosedLoop.open_loop`.
+        Of `open_loop`.
     before : Linearisation, optional
         With the gains before tuning.
 

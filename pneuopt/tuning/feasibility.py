@@ -6,6 +6,7 @@ from math import inf
 
 import numpy as np
 
+from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
@@ -186,7 +187,7 @@ def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
     reference, own = case.reference, case.case_parameters(loop.parameters | space.parameters)
     try:
         x, command = _find_operating_point(loop, case, space, reference.final)
-        plant = loop.linear_plant(own, x, {loop.command.name: command})
+        plant = linear_plant(loop, own, x, {loop.command.name: command})
         slow = complex(frequency_response(plant, [STATIC_SIGN_FREQUENCY / reference.horizon])[0])
     except (ConvergenceError, InputError, ModelError, np.linalg.LinAlgError):
         return 0.0

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
+from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, disturbance_input
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
@@ -362,7 +363,7 @@ def _sensitivity_limit(
 def _sensitivity_frequencies(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) -> Array:
     """Frequencies around those of the loop's modes, where the sensitivity peaks."""
     own = Space(averaged, space.names).parameters_at(point)
-    full = frequency_grid(loop.open_loop(own), 40)
+    full = frequency_grid(open_loop(loop, own), 40)
     return np.asarray(full[(full > 30 * full[0]) & (full < full[-1] / 30)], dtype=float)
 
 

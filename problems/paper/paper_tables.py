@@ -245,7 +245,7 @@ def _metrics(case: Case, band: float = 0.02) -> dict[str, float]:
 
 def _margins(case: Case) -> po.Margins:
     loop, parameters = closed_loop(case)
-    return po.margins(loop.open_loop(parameters))
+    return po.margins(po.open_loop(loop, parameters))
 
 
 def _draw(axes: "Axes", title: str, cases: Mapping[str, Case]) -> None:
@@ -261,7 +261,7 @@ def _draw(axes: "Axes", title: str, cases: Mapping[str, Case]) -> None:
 def _draw_bode(gain: "Axes", phase: "Axes") -> None:
     loop, parameters = closed_loop(PLAIN)
     m, w = _margins(PLAIN), np.geomspace(0.5, 500, 400)
-    L = po.frequency_response(loop.open_loop(parameters), w)
+    L = po.frequency_response(po.open_loop(loop, parameters), w)
     gain.semilogx(w, 20 * np.log10(np.abs(L)))
     phase.semilogx(w, np.degrees(np.unwrap(np.angle(L))))
     phase.vlines(m.gain_crossover, -180, m.phase_margin - 180, color="C3", lw=2)

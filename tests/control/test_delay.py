@@ -6,6 +6,7 @@ import control
 import numpy as np
 import pytest
 
+from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
@@ -41,7 +42,7 @@ def exact(h: float, delay: int) -> control.TransferFunction:
 @pytest.mark.parametrize("delay", [0, 1])
 def test_margins_are_those_of_the_sampled_loop(second_order: System, h: float, delay: int) -> None:
     loop = ClosedLoop(second_order, PID(h, delay=delay))
-    ours, L = margins(loop.open_loop(loop.parameters.with_values(GAINS))), exact(h, delay)
+    ours, L = margins(open_loop(loop, loop.parameters.with_values(GAINS))), exact(h, delay)
     w = np.geomspace(0.1, 0.999 * np.pi / h, 2000)
     Ms = np.max(1 / np.abs(1 + L(np.exp(1j * w * h))))
     gain, phase, *_ = control.stability_margins(control.frd(L, w, smooth=True))
@@ -54,7 +55,7 @@ def test_a_delay_costs_phase(second_order: System) -> None:
     found = []
     for delay in (0, 1):
         loop = ClosedLoop(second_order, PID(4e-3, delay=delay))
-        found.append(margins(loop.open_loop(loop.parameters.with_values(GAINS))))
+        found.append(margins(open_loop(loop, loop.parameters.with_values(GAINS))))
     lost = np.degrees(found[0].gain_crossover * 4e-3)
     assert found[0].phase_margin - found[1].phase_margin == pytest.approx(lost, rel=1e-3)
 
