@@ -32,7 +32,8 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
     For a `MotionDrive` the force as measured, offset and pressure and all. For a drive with a mass what pushes it (the
     logged force or pressures, less the load) less mass times acceleration, each derivative a local slope of the log:
     the fit has no part in the points but for what is not logged, and the load. Where the motion reverses there are
-    none, for a slope taken across the jump is none. The curve is that of steady motion, at the pressures' median.
+    none, for a slope taken across the jump is none. The curve is that of steady motion, at the median
+    of the pressures, and of the size of a logged force, for laws that depend on them.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
         fitted = np.concatenate([run["force"] for run in result.trajectories.values()])
         axes.plot(speed[::every], fitted[::every], ".", color=BLUE, ms=2.5, label="fitted")
     else:
-        _draw_curve(axes, system, result, _speed_grid(speed))
+        _draw_curve(axes, system, result, experiments, _speed_grid(speed))
     low, high = np.nanpercentile(force, [0.5, 99.5])
     axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
     speed_unit = next(q.unit for q in (*system.states, *system.inputs) if q.name == axis.speed)
@@ -128,13 +129,17 @@ def _drive_points(
     return speed, np.where(reverses > 0, np.nan, force)
 
 
-def _draw_curve(axes: "Axes", system: System, result: IdentificationResult, grid: Array) -> None:
+def _draw_curve(
+    axes: "Axes", system: System, result: IdentificationResult, experiments: Sequence[Experiment], grid: Array
+) -> None:
     """The fitted curve, and how far the estimates' covariance lets it move; no band where it does not say."""
     shared = [n for n in result.covariance.index if n in result.parameters]
     usual = {
         n: float(np.median(np.concatenate([run[n] for run in result.trajectories.values()])))
         for n in names(system.states)
     }
+    logs = [e.trajectory for e in experiments]
+    usual |= {n: float(np.nanmedian(np.abs(np.concatenate([q[n] for q in logs])))) for n in names(system.inputs)}
 
     def friction(values: Mapping[str, float]) -> Array:
         moved = {n: replace(result.parameters[n], value=values[n], lower=-math.inf, upper=math.inf) for n in shared}
@@ -152,8 +157,9 @@ def _steady_friction(system: System, parameters: ParameterSet, usual: Mapping[st
 
     A bristle's rate is linear in its deflection: two points tell where it is zero.
     """
-    inputs, axis = {n: np.zeros(len(speeds)) for n in names(system.inputs)}, _moving_axis(system)
-    still = {n: np.full(len(speeds), 0.0 if n == axis.speed else value) for n, value in usual.items()}
+    axis, usual_columns = _moving_axis(system), {n: np.full(len(speeds), value) for n, value in usual.items()}
+    inputs = {n: usual_columns[n] for n in names(system.inputs)}
+    still = {n: usual_columns[n] for n in names(system.states)} | {axis.speed: np.zeros(len(speeds))}
     bristles = {s.name: s.nominal for s in system.states if s.name.startswith("friction.")}
     still |= {n: np.zeros(len(speeds)) for n in bristles}
     moving, bent = {**still, axis.speed: speeds}, {n: np.full(len(speeds), size) for n, size in bristles.items()}
