@@ -47,6 +47,7 @@ _HOME = {
         "Viscous",
     ),
     "pneuopt.models.friction_laws": ("friction_ladder",),
+    "pneuopt.models.load_dependent": ("LoadDependent",),
     "pneuopt.models.karnopp": ("Karnopp",),
     "pneuopt.models.load": ("Load",),
     "pneuopt.models.drive": ("ForceDrive", "MotionDrive"),

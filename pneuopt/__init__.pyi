@@ -74,6 +74,7 @@ from pneuopt.models.friction_laws import friction_ladder
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.models.load import Load
+from pneuopt.models.load_dependent import LoadDependent
 from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
 from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
@@ -150,6 +151,7 @@ __all__ = [
     "LimitCycle",
     "Linearisation",
     "Load",
+    "LoadDependent",
     "LogComparison",
     "LuGre",
     "Margins",

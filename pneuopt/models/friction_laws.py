@@ -16,6 +16,7 @@ from pneuopt.models.friction import (
     Stribeck,
     Viscous,
 )
+from pneuopt.models.load_dependent import LoadDependent
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ FRICTION_LAWS: Mapping[str, Callable[[], FrictionModel]] = {
 
 FRICTION_WRAPPERS: Mapping[str, Wrapper] = {
     "asymmetric": Wrapper(Asymmetric),
+    "load_dependent": Wrapper(LoadDependent),
     "pressure_dependent": Wrapper(PressureDependent, "chamber", CHAMBER_PRESSURES),
 }
 """Laws around another law, the innermost first: `asymmetric = true` in a file."""

@@ -35,6 +35,7 @@ TRUTH: Mapping[str, Mapping[str, float]] = {
     "stribeck": CURVE,
     "lugre": {**CURVE, "bristle_stiffness": 6e4},
     "asymmetric": {"coulomb_asymmetry": 0.2, "viscous_asymmetry": -0.1},
+    "load_dependent": {"coulomb_load": 0.15},
     "pressure_dependent": {"coulomb_pressure_a": 3e-5, "coulomb_pressure_b": 2e-5},
 }
 EVEN = {

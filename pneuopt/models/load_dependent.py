@@ -1,0 +1,77 @@
+"""Friction that grows with the force that a gear or a guide transmits."""
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from pneuopt.dynamics.excitation import Excitation, SeparatingRun
+from pneuopt.dynamics.system import Symbols
+from pneuopt.models.friction import Force, FrictionModel
+from pneuopt.models.friction_start import FrictionSamples, FrictionStart
+from pneuopt.models.needs import FRICTION_LEVELS
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+
+
+@dataclass(frozen=True)
+class LoadDependent:
+    """A base model whose Coulomb and static levels rise with the transmitted force F: + coulomb_load |F|, |F| smooth.
+
+    ``|F| = sqrt(F^2 + load_rounding^2) - load_rounding``: zero without load, and never more than the true size. F is
+    what drives the load, the input of a `ForceDrive`. Gears of servos: coulomb_load 0.01 to 0.2.
+
+    Source: Hamon, Gautier, Garrec, Dynamic identification of robots with a dry friction model depending on load and
+    velocity, IROS 2010.
+    """
+
+    base: FrictionModel
+
+    def __post_init__(self) -> None:
+        message = f"{self.base} has no Coulomb level that could rise with load; take Coulomb(), Stribeck() or LuGre()"
+        require("coulomb" in self.base.parameters, message, ModelError)
+
+    @property
+    def states(self) -> tuple[Quantity, ...]:
+        """Those of the base model."""
+        return self.base.states
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:
+        """Those of the base model, and the transmitted force [N]."""
+        return (*self.base.inputs, Quantity("force", "N", nominal=100.0))
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Those of the base, coulomb_load [1] and load_rounding [N]."""
+        own = {
+            "coulomb_load": Parameter(0.0, "1", lower=0.0, upper=0.9),
+            "load_rounding": Parameter(1.0, "N", lower=1e-3, upper=1e3, log=True),
+        }
+        return self.base.parameters | ParameterSet(own)
+
+    @property
+    def excitation(self) -> Excitation:
+        """Loads that differ, and what the base needs."""
+        words = "log sliding under a load that is known and large: a weight lifted and lowered, or a spring"
+        others = FRICTION_LEVELS | {"viscous", "load.mass"}
+        return Excitation(runs=(SeparatingRun(frozenset({"coulomb_load"}), others, words),)) | self.base.excitation
+
+    @property
+    def start(self) -> FrictionStart:
+        """Levels are linear in the size of the force."""
+        base = self.base.start
+
+        def columns(s: FrictionSamples) -> dict[str, Array]:
+            rounding = s.values["load_rounding"]
+            size = np.sqrt(s.inputs["force"] ** 2 + rounding**2) - rounding
+            return base.columns(s) | {"coulomb_load": s.side * size}
+
+        return replace(base, columns=columns, unknowns=(*base.unknowns, "coulomb_load"))
+
+    def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
+        """See the class."""
+        size = ca.sqrt(u["force"] ** 2 + p["load_rounding"] ** 2) - p["load_rounding"]
+        raised = {n: p[n] + p["coulomb_load"] * size for n in ("coulomb", "static") if n in p}
+        return self.base.force(v, z, u, {**p, **raised})
