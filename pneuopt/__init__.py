@@ -112,7 +112,6 @@ _HOME = {
         "StepEnvelope",
     ),
     "pneuopt.tuning.condensed": ("Condensed",),
-    "pneuopt.tuning.confirmed": ("Confirmed",),
     "pneuopt.tuning.screening": ("Screening",),
     "pneuopt.tuning.two_phase": ("TwoPhase",),
     "pneuopt.evaluation.evaluate": ("evaluate", "respond"),

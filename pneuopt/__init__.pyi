@@ -101,7 +101,6 @@ from pneuopt.shooting.full_space import FullSpace
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.sweep import grid, sweep
 from pneuopt.tuning.condensed import Condensed
-from pneuopt.tuning.confirmed import Confirmed
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.tune import TuningResult, tune
@@ -121,7 +120,6 @@ __all__ = [
     "ClosedLoop",
     "Code",
     "Condensed",
-    "Confirmed",
     "ControlRate",
     "ConvergenceError",
     "Coulomb",

@@ -69,6 +69,7 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
             minimise=task.minimise,
             subject_to=task.subject_to,
             scenarios=task.scenarios(parameters),
+            method=task.method,
             throw=False,
             progress=report_progress,
         )

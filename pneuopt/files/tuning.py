@@ -16,6 +16,7 @@ from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.loop import LOOP_SECTIONS, TUNABLE_SECTIONS, construct_at, read_fixed_value, read_loop_sections
+from pneuopt.files.method import read_method
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
 from pneuopt.files.scenarios import read_scenarios, read_validation_scenarios
 from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
@@ -23,6 +24,7 @@ from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_value
+from pneuopt.tuning.method import Method
 
 if TYPE_CHECKING:
     from pneuopt.tuning.result import TuningResult
@@ -32,7 +34,7 @@ TuningSections = Mapping[str, Any]
 TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
-_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios")
+_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method")
 _EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
 
@@ -53,6 +55,8 @@ class Tuning:
         Of the nominal parameters: the plants and tolerances beside them.
     validation_scenarios : callable
         Likewise: others from the same boxes, to validate a design on.
+    method : Method, optional
+        None: the loop decides.
     """
 
     loop: ClosedLoop
@@ -62,6 +66,7 @@ class Tuning:
     subject_to: tuple[Requirement, ...]
     scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
     validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
+    method: Method | None = None
 
 
 def read_tuning(path: str | Path, plant: System) -> Tuning:
@@ -91,10 +96,12 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     minimise, subject_to = _read_objective(table, path), _read_requirements(table, loop, path)
     if minimise:
         construct_at(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
-    drawn = [
+    drawn = (
         partial(read, table.get("scenarios", {}), str(path)) for read in (read_scenarios, read_validation_scenarios)
-    ]
-    return Tuning(loop, _references(table, loop, path), parameters, minimise, subject_to, *drawn)
+    )
+    method = read_method(table.get("method", {}), f"{path}: [method]")
+    references, (tried, fresh) = _references(table, loop, path), drawn
+    return Tuning(loop, references, parameters, minimise, subject_to, tried, fresh, method)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") -> None:

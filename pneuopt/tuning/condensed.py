@@ -10,6 +10,7 @@ median 0.155 s, 0.183 s where it only swept the dither about the best).
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,13 +21,26 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.tuning.linearised import SMOOTH_REQUIREMENTS, LinearisedProblem, sensitivity_rollout
-from pneuopt.tuning.screening import BestPoint, MeritFunction, first_population, generation, merit
+from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.screening import (
+    SIMULATION_PEAK_MARGIN,
+    BestPoint,
+    MeritFunction,
+    Screening,
+    first_population,
+    generation,
+    merit,
+    screening_result,
+    short_screening,
+)
 from pneuopt.tuning.simulator import Simulator, to_records
 from pneuopt.tuning.space import Space
 from pneuopt.tuning.sqp import SQP, LinearisedPoint, descend
 
 NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # gradients are wrong or useless there
 QUANTISER_PARAMETERS = ("sensor.resolution",)  # what makes steps of a signal, wherever it is among the parameters
+# Gains up to which one plant is tuned as well without gradients; eight on a drive with friction take twice the time.
+MAX_SCREENING_GAINS = 6
 MIN_POINT_DISTANCE = 0.03  # of a gain's range: two points closer than that are one
 PROGRAM_MARGIN = 0.005  # by which the programs' band and limits are tighter: a solution lies on them, and grazes them
 MAX_PENALTY_RAISES = 2  # times that the penalties are raised tenfold, where they did not keep the limits
@@ -81,6 +95,9 @@ class Condensed:
     digits: int | None = 4
     steps: SQP = field(default_factory=SQP)
 
+    peak_margin: ClassVar[float] = SIMULATION_PEAK_MARGIN
+    parameters_without_effect: ClassVar[tuple[str, ...]] = ()
+
     def __post_init__(self) -> None:
         for n, least in (("generations", 1), ("keep", 1), ("iterations", 1), ("restarts", 0)):
             value = getattr(self, n)
@@ -93,16 +110,44 @@ class Condensed:
         require(0 <= self.margin < 1, f"Condensed: margin is a fraction below 1, got {self.margin}")
         require(self.digits is None or self.digits >= 2, f"Condensed: digits must be at least 2, got {self.digits}")
 
+    @property
+    def successor(self) -> None:
+        """None: its answer is final."""
 
-def check_differentiable(space: Space, spec: Specification) -> None:
-    """Refuse what gradients cannot do: `InputError` names it and the remedy."""
-    strange = [*_nonsmooth_requirements(spec), *_nonsmooth_parameters(space)]
-    require(not strange, f"Condensed has no gradient for {', '.join(strange)}; use method=Screening()")
+    def check(self, task: TuningTask) -> None:
+        """Refuse what gradients cannot do: `InputError` names it and the remedy."""
+        strange = _nonsmooth_terms(task)
+        require(not strange, f"Condensed has no gradient for {', '.join(strange)}; use method=Screening()")
+
+    def suits(self, task: TuningTask) -> bool:
+        """For scenarios or many gains, where there are gradients of all requirements to all that is free."""
+        many = bool(task.scenarios) or len(task.space.names) > MAX_SCREENING_GAINS
+        return many and not _nonsmooth_terms(task)
+
+    def find(
+        self,
+        task: TuningTask,
+        simulator: Simulator,
+        spec: Specification,
+        start: Array,
+        attempt: int,  # noqa: ARG002
+        progress: ProgressCallback,
+    ) -> SearchResult:
+        """The best point found; see `Method.find`."""
+        best = run_gradient_search(simulator, task.references, task.space, spec, self, start, progress)
+        return screening_result(task, simulator, spec, best)
+
+    def shorten(self, margin: float) -> Screening:
+        """A short search, from a point that is close."""
+        return short_screening(margin, self.digits)
+
+    def limit_path(self, task: TuningTask, spec: Specification) -> None:
+        """None: it can only search anew."""
 
 
-def is_differentiable(space: Space, spec: Specification) -> bool:
-    """Whether there are gradients of all requirements to all that is free."""
-    return not _nonsmooth_requirements(spec) and not _nonsmooth_parameters(space)
+def _nonsmooth_terms(task: TuningTask) -> list[str]:
+    """Requirements without a gradient, and free parameters to which there is none."""
+    return [*_nonsmooth_requirements(task.spec), *_nonsmooth_parameters(task.space)]
 
 
 def _nonsmooth_requirements(spec: Specification) -> list[str]:
@@ -135,7 +180,6 @@ def run_gradient_search(
     tell : callable
         Hears of each stage.
     """
-    check_differentiable(space, spec)
     scale = min(r.horizon - r.at for r in references)
     search = _CondensedSearch(simulator, spec, method, scale, space.to_unit(start), tell)
     try:

@@ -34,13 +34,13 @@ from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.shooting.solution import Solution
+from pneuopt.tuning.method import LimitPath, Method, SearchResult
 from pneuopt.tuning.relaxation import limits_with_settling
-from pneuopt.tuning.result import SearchResult, TuningResult
+from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.screening import first_population
-from pneuopt.tuning.search import Method, Search, end_point, short_method
+from pneuopt.tuning.search import Search, end_point
 from pneuopt.tuning.simulator import to_records
 from pneuopt.tuning.tune import prepare_search
-from pneuopt.tuning.two_phase import TwoPhase, TwoPhasePath, two_phase_path
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -196,8 +196,8 @@ class _Front:
             self.designs = ends[:1]
             return
         self.designs = [ends[0], *(Design(limit) for limit in _limit_grid(high, low, points)[1:-1]), ends[1]]
-        if isinstance(self.base_search.method, TwoPhase):
-            self._follow()
+        if points > 2 and self._path is not None:
+            self._follow(self._path)
         else:
             for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
                 self._improve(k, self._gains(start))
@@ -220,14 +220,14 @@ class _Front:
         spec = replace(
             self.base_search.spec,
             weights=weights,
-            limits=limits_with_settling(self.base_search.spec, self.base_search.certifier.references),
+            limits=limits_with_settling(self.base_search.spec, self.base_search.task.references),
         )
         held = requirement is self.second and self.last is not None
         if self.last is not None and held:
             spec = self._constrain_second(self.last)
         method, point = self.base_search.method, None
         if start is not None:  # a search over wide bands would lose it
-            method, point = short_method(method, method.margin), end_point(start, self.base_search.space)
+            method, point = method.shorten(method.margin), end_point(start, self.base_search.space)
         result = _check_interruption(self.base_search.with_specification(spec, method).run(point))
         if not result.status.converged:
             which = "at its last limit" if held else "as good as the limits allow"
@@ -237,7 +237,7 @@ class _Front:
 
     def _weight(self, requirement: Requirement) -> float:
         """That makes a requirement of the order of the horizon, as the searches' penalties are."""
-        horizon = min(r.horizon - r.at for r in self.base_search.certifier.references)
+        horizon = min(r.horizon - r.at for r in self.base_search.task.references)
         return (
             horizon / self._requirement_scales[metric_name(requirement)]
             if self._requirement_scales[metric_name(requirement)]
@@ -257,12 +257,12 @@ class _Front:
         weights = {self.first: self._weight(self.first)}
         return replace(self.base_search.spec, weights=weights, limits=(*others, with_upper_limit(self.second, limit)))
 
-    def _follow(self) -> None:
+    def _follow(self, path: LimitPath) -> None:
         """With a solver along the limits; where what is found does not survive printing, again with more margin."""
         todo = list(range(1, len(self.designs) - 1))
         for margin in self._margins:
             asked = [self._search_for(k, self.base_search.method) for k in todo]
-            found = self._track([own.tighten(margin) for own in asked]) if todo else []
+            found = self._track(path, [own.tighten(margin) for own in asked]) if todo else []
             for k, own, solution in zip(todo, asked, found, strict=True):
                 self._certify(k, own, solution, margin)
                 self.base_search.progress(f"design {k + 1} of {len(self.designs)}: {_design_status(self.designs[k])}")
@@ -274,24 +274,22 @@ class _Front:
         return tuple(self.base_search.method.margin * factor for factor in (1, 2, 4))
 
     @cached_property
-    def _path(self) -> TwoPhasePath:
-        """The problem, differentiated once, of which all designs are solutions."""
-        method, search = self.base_search.method, self._search_for(1, self.base_search.method)
-        assert isinstance(method, TwoPhase)
-        spec, notary = search.tighten(method.margin), search.certifier
-        return two_phase_path(notary.loop, notary.references, search.space, spec, method)
+    def _path(self) -> LimitPath | None:
+        """The problem, prepared once, of which all designs are solutions; None where each is a search of its own."""
+        search = self._search_for(1, self.base_search.method)
+        return search.method.limit_path(search.task, search.tighten(search.method.margin))
 
-    def _track(self, specs: Sequence[Specification]) -> list[Solution]:
+    def _track(self, path: LimitPath, specs: Sequence[Specification]) -> list[Solution]:
         """From the first end; where the other end is on another branch, from there, too, and the better.
 
         Two tracks that agree next to the second end are one.
         """
         space, ends = self.base_search.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
         starts = [end_point(result, space) for result in ends]
-        found = self._path.follow(starts[0], specs)
-        other = self._path.follow(starts[1], specs[-1:])
+        found = path.follow(starts[0], specs)
+        other = path.follow(starts[1], specs[-1:])
         if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - MIN_IMPROVEMENT):
-            other = self._path.follow(starts[1], specs[::-1])
+            other = path.follow(starts[1], specs[::-1])
         for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
             spent = found[k].stats["seconds"] + back.stats["seconds"]
             better = back if _solution_cost(back) < _solution_cost(found[k]) else found[k]
@@ -322,12 +320,12 @@ class _Front:
 
     def _improve(self, k: int, start: Array | None) -> None:
         """Search for a design from given gains; the better stays."""
-        begun, old, follows = time.perf_counter(), self.designs[k], isinstance(self.base_search.method, TwoPhase)
-        if follows and start is not None:
-            result, spent = self._resolve(k, start)
+        begun, old, path = time.perf_counter(), self.designs[k], self._path
+        if path is not None and start is not None:
+            result, spent = self._resolve(path, k, start)
         else:
             search, spent = (
-                self._search_for(k, short_method(self.base_search.method, self.base_search.method.margin)),
+                self._search_for(k, self.base_search.method.shorten(self.base_search.method.margin)),
                 0.0,
             )
             result = _check_interruption(search.run(start))
@@ -338,11 +336,11 @@ class _Front:
             f"{metric_name(self.second)} {user_value(self.second, old.limit):.4g}: {result.status}"
         )
 
-    def _resolve(self, k: int, start: Array) -> tuple[TuningResult, float]:
+    def _resolve(self, path: LimitPath, k: int, start: Array) -> tuple[TuningResult, float]:
         """The solver's answer from given gains, with more margin where it does not survive printing; its seconds."""
         search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
         for margin in self._margins:
-            (solution,) = self._path.follow(start, [search.tighten(margin)])
+            (solution,) = path.follow(start, [search.tighten(margin)])
             result, spent = self._round_and_certify(search, solution, margin), spent + solution.stats["seconds"]
             if result.status.converged:
                 break

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import (
@@ -21,16 +19,15 @@ from pneuopt.evaluation.requirements import (
     user_limit,
     user_value,
 )
-from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.relaxation import describe_relaxations
 from pneuopt.tuning.simulator import Simulator, worst_values
-from pneuopt.tuning.space import Space
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,51 +88,27 @@ class TuningResult:
 
 
 @dataclass(frozen=True, eq=False)
-class SearchResult:
-    """What a search hands over: a point before rounding, what is active there, figures; whether it came to its end.
-
-    `remark` is for the status of a design that holds.
-    """
-
-    point: Array
-    status: Status
-    active: tuple[str, ...]
-    stats: Mapping[str, float]
-    is_complete: bool = True
-    remark: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class Certifier:
     """Certifies what a search found.
 
     Parameters
     ----------
-    loop : ClosedLoop
-    references : tuple of Step
-    scenarios : mapping of str to mapping
-    space : Space
-    spec : Specification
-        As asked for.
-    method : object
+    task : TuningTask
+    method : Method
         For the provenance.
     """
 
-    loop: ClosedLoop
-    references: tuple[Step, ...]
-    scenarios: Scenarios
-    space: Space
-    spec: Specification
-    method: object
+    task: TuningTask
+    method: Method
 
     def certify(self, simulator: Simulator, found: SearchResult, point: Array) -> TuningResult:
         """Claim and certificate of a point; its values are handed out where the certificate holds."""
         import pandas as pd
 
-        parameters = self.space.parameters_at(point)
-        ripple = ("Ripple",) if self.loop.dither_period(parameters) else ()
-        shown = list(dict.fromkeys((*TABLE_METRICS, *ripple, *self.spec.kinds)))
-        rows = zip(simulator.cases, simulator.table(point, self.spec), strict=True)
+        parameters = self.task.space.parameters_at(point)
+        ripple = ("Ripple",) if self.task.loop.dither_period(parameters) else ()
+        shown = list(dict.fromkeys((*TABLE_METRICS, *ripple, *self.task.spec.kinds)))
+        rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:
             certified, met = self._evaluate(parameters)
@@ -146,19 +119,25 @@ class Certifier:
             certified, met, slopes = claimed * np.nan, [], {}
             status = Status(Code.NOT_CERTIFIED, str(error))
         deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
-        values = dict(zip(self.space.names, point.tolist(), strict=True))
+        values = dict(zip(self.task.space.names, point.tolist(), strict=True))
         contacts = {"contacts": float(len(met))} if met else {}
         rejected = {} if status.converged else {f"rejected.{n}": v for n, v in values.items()}
         return TuningResult(
-            self.space.parameters.with_values(values) if status.converged else self.space.parameters,
+            self.task.space.parameters.with_values(values) if status.converged else self.task.space.parameters,
             claimed,
             certified,
-            requirement_table(self.spec, claimed, certified, found.active),
-            pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.space.names], dtype=float),
+            requirement_table(self.task.spec, claimed, certified, found.active),
+            pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.task.space.names], dtype=float),
             found.active,
             status,
             {**found.stats, **deviation, **contacts, **rejected, **slopes},
-            provenance(self.method, *self.spec.weights, *self.spec.limits, *self.references, *self.scenarios.items()),
+            provenance(
+                self.method,
+                *self.task.spec.weights,
+                *self.task.spec.limits,
+                *self.task.references,
+                *self.task.scenarios.items(),
+            ),
         )
 
     def _evaluate(self, parameters: ParameterSet) -> tuple["pd.DataFrame", list[str]]:
@@ -166,12 +145,12 @@ class Certifier:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             certified = evaluate(
-                self.loop,
-                self.references,
+                self.task.loop,
+                self.task.references,
                 parameters,
-                scenarios=self.scenarios,
-                band=self.spec.band,
-                envelope=self.spec.envelope,
+                scenarios=self.task.scenarios,
+                band=self.task.spec.band,
+                envelope=self.task.spec.envelope,
             )
         return certified, [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
 
@@ -180,14 +159,14 @@ class Certifier:
         if not found.status.converged:
             return found.status
         claim, proof = (worst_values([requirement_values(dict(f[r])) for r in f]) for f in (claimed, certified))
-        for q in self.spec.violations(proof):
+        for q in self.task.spec.violations(proof):
             n, (value, allowed) = metric_name(q), describe_value(q, proof[metric_name(q)])
             return Status(
                 Code.NOT_CERTIFIED,
                 f"{n} is {value}{self._worst_case(certified, n)}, {allowed}, claimed {describe_value(q, claim[n])[0]}; "
                 f"give {n} more room",
             )
-        ours, theirs = self.spec.objective(proof), min(self.spec.objective(claim), found.stats["optimum"])
+        ours, theirs = self.task.spec.objective(proof), min(self.task.spec.objective(claim), found.stats["optimum"])
         if not ours <= theirs * (1 + MAX_CERTIFIED_EXCESS):
             return Status(
                 Code.NOT_CERTIFIED,
@@ -199,8 +178,9 @@ class Certifier:
             if "starts" in found.stats
             else ""
         )
-        message = f"certified objective {ours:.6g}, claimed {self.spec.objective(claim):.6g}{agreeing}"
-        return Status(Code.CONVERGED, f"{message}; {found.remark}" if found.remark else message)
+        return Status(
+            Code.CONVERGED, f"certified objective {ours:.6g}, claimed {self.task.spec.objective(claim):.6g}{agreeing}"
+        )
 
     def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
         """The worst case, where there are several."""

@@ -6,21 +6,31 @@ what settles within 10 % leads to what settles within 2 %.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.optimize import minimize
 
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.requirements import ROBUSTNESS_REQUIREMENTS, SettlingTime, metric_name, upper_limit
+from pneuopt.evaluation.requirements import (
+    ROBUSTNESS_REQUIREMENTS,
+    SettlingTime,
+    describe_value,
+    metric_name,
+    upper_limit,
+)
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.status import ProgressCallback
+from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.readings import WORST_MERIT, penalty_settling_time
-from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.simulator import Responses, Simulator, to_records
 from pneuopt.tuning.space import Space
 
+LIMIT_TOLERANCE = 1e-4  # by which a search may end on the wrong side of a limit; the certificate decides
+# Share of the margin for peaks of command and sensitivity: what a search's coarser samples may miss of a peak.
+SIMULATION_PEAK_MARGIN = 1 / 5
 VIOLATION_PENALTY = 20.0  # weight of a limit's relative violation beside that of never settling
 
 
@@ -53,12 +63,46 @@ class Screening:
     seed: int = 0
     digits: int | None = 4
 
+    peak_margin: ClassVar[float] = SIMULATION_PEAK_MARGIN
+    parameters_without_effect: ClassVar[tuple[str, ...]] = ()
+
     def __post_init__(self) -> None:
         require(self.members >= 5, f"Screening: members must be at least 5, got {self.members}")
         require(self.generations >= 1, f"Screening: generations must be at least 1, got {self.generations}")
         require(self.refinements >= 0, f"Screening: refinements must not be negative, got {self.refinements}")
         require(0 <= self.margin < 1, f"Screening: margin is a fraction below 1, got {self.margin}")
         require(self.digits is None or self.digits >= 2, f"Screening: digits must be at least 2, got {self.digits}")
+
+    @property
+    def successor(self) -> None:
+        """None: its answer is final."""
+
+    def check(self, task: TuningTask) -> None:
+        """It can tune any loop."""
+
+    def suits(self, task: TuningTask) -> bool:  # noqa: ARG002
+        """Always."""
+        return True
+
+    def find(
+        self,
+        task: TuningTask,
+        simulator: Simulator,
+        spec: Specification,
+        start: Array,
+        attempt: int,  # noqa: ARG002
+        progress: ProgressCallback,
+    ) -> SearchResult:
+        """The best point found; see `Method.find`."""
+        best = run_screening(simulator, task.references, task.space, spec, self, start, progress)
+        return screening_result(task, simulator, spec, best)
+
+    def shorten(self, margin: float) -> "Screening":
+        """A short search, from a point that is close."""
+        return short_screening(margin, self.digits)
+
+    def limit_path(self, task: TuningTask, spec: Specification) -> None:
+        """None: it can only search anew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +164,29 @@ def _search(judge: "MeritFunction", spec: Specification, method: Screening, tell
             tell(f"band {band:.3g}, generation {number + 1} of {method.generations}: best {merits.min():.4g}")
     if method.refinements:
         _refine(judge.best, judge, method.refinements)
+
+
+def screening_result(task: TuningTask, simulator: Simulator, spec: Specification, best: BestPoint) -> SearchResult:
+    """What a search by simulation hands over.
+
+    Parameters
+    ----------
+    task : TuningTask
+        Whose limits the status is about.
+    simulator : Simulator
+    spec : Specification
+        The tightened one that was searched for.
+    best : BestPoint
+    """
+    values = to_records(simulator.values(best.point[None], spec))[0]
+    stats = {"simulations": float(best.count), "optimum": spec.objective(values)}
+    active = _active_limits(task.space, spec, best.point, values)
+    return SearchResult(best.point, _screening_status(task.spec, values), active, stats, best.is_complete)
+
+
+def short_screening(margin: float, digits: int | None) -> Screening:
+    """A short search from a point that is close: wide bands would lose it."""
+    return Screening(24, 8, (), 200, margin, digits=digits)
 
 
 class MeritFunction:
@@ -277,3 +344,26 @@ def first_population(members: int, start: Array, rng: np.random.Generator) -> Ar
     found: Array = (cells + rng.random(cells.shape)) / members
     found[0] = np.clip(start, 0.0, 1.0)
     return found
+
+
+def _screening_status(spec: Specification, values: Mapping[str, float]) -> Status:
+    """What a screening achieved: it keeps the limits, or the closest it came."""
+    broken = [
+        f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
+        for q in spec.violations(values, LIMIT_TOLERANCE)
+    ]
+    if broken:
+        return Status(Code.INFEASIBLE, f"the closest found has {'; '.join(broken)}; relax a limit or widen the bounds")
+    if not np.isfinite(spec.objective(values)):
+        return Status(
+            Code.NOT_CONVERGED, "nothing found settles; widen the band or the bounds, or lengthen the horizon"
+        )
+    return Status(Code.CONVERGED)
+
+
+def _active_limits(space: Space, spec: Specification, point: Array, values: Mapping[str, float]) -> tuple[str, ...]:
+    """Limits within 2 % of being reached, gains within 0.1 % of their range of a bound."""
+    limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= 0.98 * upper_limit(q)]
+    low, up = space.bounds.T
+    near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
+    return (*limits, *(n for n, held in zip(space.names, near, strict=True) if held))

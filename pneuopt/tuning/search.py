@@ -1,37 +1,31 @@
 """`Search`: one tuning from its start to a certified answer, or to how far its limits would have to give way."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from pneuopt.evaluation.requirements import describe_value, metric_name, upper_limit
+from pneuopt.evaluation.requirements import metric_name
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, ProgressCallback, Status
-from pneuopt.tuning.condensed import Condensed, run_gradient_search
-from pneuopt.tuning.confirmed import Confirmed, confirm
+from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.relaxation import relax_all, relaxation_row, relaxation_specification
 from pneuopt.tuning.result import (
     MAX_CERTIFIED_EXCESS,
     Certifier,
-    SearchResult,
     TuningResult,
     relaxation_share,
     with_relaxations,
 )
-from pneuopt.tuning.screening import Screening, merit, run_screening
+from pneuopt.tuning.screening import merit
 from pneuopt.tuning.simulator import Simulator, to_records
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.two_phase import TwoPhase, solve_two_phase
 
-Method = TwoPhase | Screening | Condensed | Confirmed
 MARGINS_TO_TRY = 3  # margins tried, each twice the one before
 MAX_CERTIFIED_POINTS = 5  # printed gains certified at each margin, at most
 ROUNDING_ROUNDS = 3  # of looking around for printed gains that lose next to nothing
-LIMIT_TOLERANCE = 1e-4  # by which a search may end on the wrong side of a limit; the certificate decides
-EXACT_PEAK_MARGIN, SCREENING_PEAK_MARGIN = 1 / 300, 1 / 5  # of the margin, for peak control and sensitivity
 RELAXATION_MARGIN = 0.002  # margin of the search for how far a limit has to give way: what it finds shall be the least
 
 
@@ -39,11 +33,24 @@ RELAXATION_MARGIN = 0.002  # margin of the search for how far a limit has to giv
 class Search:
     """One tuning: search, print, certify, and again with a wider margin where the certificate fails."""
 
-    certifier: Certifier
-    space: Space
-    spec: Specification
+    task: TuningTask
     method: Method
     progress: ProgressCallback
+
+    @property
+    def space(self) -> Space:
+        """The free gains."""
+        return self.task.space
+
+    @property
+    def spec(self) -> Specification:
+        """As asked for."""
+        return self.task.spec
+
+    @property
+    def certifier(self) -> Certifier:
+        """Of what is found."""
+        return Certifier(self.task, self.method)
 
     def run(self, start: Array | None = None) -> TuningResult:
         """The result, from a point other than the given gains where there is one."""
@@ -52,12 +59,14 @@ class Search:
             if start is None:
                 self._report_start(simulator)
         except KeyboardInterrupt:
-            nothing = SearchResult(self.space.start, Status(Code.INTERRUPTED), (), {"simulations": 1.0})
-            return self._result_so_far(simulator, nothing)
+            return self._result_so_far(simulator, _interrupted_at(self.space.start))
         result, start, counts = None, self.space.start if start is None else start, dict[str, float]()
         for attempt in range(MARGINS_TO_TRY):
             margin = min(self.method.margin * 2**attempt, 0.5)
-            found = self._search(simulator, attempt, margin, start)
+            try:
+                found = self.method.find(self.task, simulator, self.tighten(margin), start, attempt, self.progress)
+            except KeyboardInterrupt:  # of a method that has no best so far
+                found = _interrupted_at(start)
             counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
             found = replace(found, stats={**found.stats, **counts, "margin": margin})
             if not found.is_complete:
@@ -74,8 +83,8 @@ class Search:
     @cached_property
     def simulator(self) -> Simulator:
         """Of all cases, that reads what is asked for."""
-        notary = self.certifier
-        return Simulator(notary.loop, notary.references, self.space, notary.scenarios, self.spec)
+        task = self.task
+        return Simulator(task.loop, task.references, task.space, task.scenarios, task.spec)
 
     def _report_start(self, simulator: Simulator) -> None:
         """Say where the given gains are no good: a search copes with that, but one may be mistyped."""
@@ -104,7 +113,7 @@ class Search:
 
     def with_specification(self, spec: Specification, method: Method) -> "Search":
         """The same for another specification, of the same kinds, on the same simulator."""
-        other = replace(self, certifier=replace(self.certifier, spec=spec, method=method), spec=spec, method=method)
+        other = replace(self, task=replace(self.task, spec=spec), method=method)
         vars(other)["simulator"] = self.simulator
         return other
 
@@ -120,54 +129,9 @@ class Search:
         values = {f"rejected.{n}": best.parameters.value(n) for n in self.space.names if best.status.converged}
         return replace(best, parameters=self.space.parameters, status=status, stats={**values, **best.stats})
 
-    def _search(self, simulator: Simulator, attempt: int, margin: float, start: Array) -> SearchResult:
-        if isinstance(self.method, TwoPhase):
-            return self._solve_two_phase(attempt, margin, start)
-        return self._search_by_simulation(simulator, margin, start)
-
-    def _solve_two_phase(self, attempt: int, margin: float, start: Array) -> SearchResult:
-        assert isinstance(self.method, TwoPhase)
-        method = self.method if attempt == 0 else replace(self.method, starts=1)
-        space = Space(self.space.parameters_at(start), self.space.names)
-        optima = solve_two_phase(
-            self.certifier.loop, self.certifier.references, space, self.tighten(margin), method, self.progress
-        )
-        best, values = optima.best, optima.best.parameters
-        stats = {
-            "starts": float(optima.starts),
-            "starts_converged": float(optima.converged),
-            "starts_agreeing": float(optima.agreeing),
-            "optimum": best.stats.get("cost", np.nan),
-            "iterations": best.stats.get("iterations", 0.0),
-        }
-        point = np.array([values.value(n) for n in self.space.names])
-        return SearchResult(point, best.status, tuple(best.multipliers), stats)
-
     def tighten(self, margin: float) -> Specification:
-        """An exact problem needs next to no room on peaks; a screening's coarser simulation needs some."""
-        return self.spec.tighten(
-            margin, margin * (EXACT_PEAK_MARGIN if isinstance(self.method, TwoPhase) else SCREENING_PEAK_MARGIN)
-        )
-
-    def _search_by_simulation(self, simulator: Simulator, margin: float, start: Array) -> SearchResult:
-        assert not isinstance(self.method, TwoPhase)
-        spec = self.tighten(margin)
-        arguments = (simulator, self.certifier.references, self.space, spec)
-        method = self.method.first if isinstance(self.method, Confirmed) else self.method
-        if isinstance(method, Condensed):
-            found = run_gradient_search(*arguments, method, start, self.progress)
-        else:
-            found = run_screening(*arguments, method, start, self.progress)
-        values = to_records(simulator.values(found.point[None], spec))[0]
-        stats, status = {"simulations": float(found.count)}, _screening_status(self.spec, values)
-        point, text = found.point, ""
-        if isinstance(self.method, Confirmed) and status.converged and found.is_complete:
-            self.progress("full-space multiple shooting from the search's answer")
-            point, text = confirm(simulator, self.certifier.references, spec, self.method, point, values)
-            values = to_records(simulator.values(point[None], spec))[0]
-        stats["optimum"] = spec.objective(values)
-        active = _active_limits(self.space, spec, point, values)
-        return SearchResult(point, status, active, stats, found.is_complete, text)
+        """What is asked for, with so much room left as the method's answer may lose."""
+        return self.spec.tighten(margin, margin * self.method.peak_margin)
 
     def _round_gains(self, simulator: Simulator, found: SearchResult, margin: float) -> Iterator[Array]:
         """The gains as printed; where those break a limit or lose too much, what a last place more or less mends."""
@@ -175,12 +139,11 @@ class Search:
         if digits is None:
             yield found.point
             return
-        scale = min(r.horizon - r.at for r in self.certifier.references)
         nearest = self.space.round_point(found.point, digits)
         points, most = nearest[None], found.stats["optimum"] * (1 + MAX_CERTIFIED_EXCESS)
         for _ in range(ROUNDING_ROUNDS):
             values = simulator.values(points, spec)
-            order, rows = np.argsort(merit(values, spec, scale)), to_records(values)
+            order, rows = np.argsort(merit(values, spec, self.task.horizon)), to_records(values)
             for k in order.tolist():
                 good = not spec.violations(rows[k]) and spec.objective(rows[k]) <= most
                 if good and len(tried) < MAX_CERTIFIED_POINTS and points[k].tolist() not in tried:
@@ -201,16 +164,21 @@ class Search:
         yield from points[order or [0]]
 
 
+def _interrupted_at(point: Array) -> SearchResult:
+    """Of a search that was cut short before it had found anything."""
+    return SearchResult(point, Status(Code.INTERRUPTED), (), {"simulations": 1.0}, is_complete=False)
+
+
 def relax(search: Search, result: TuningResult) -> TuningResult:
     """Say how far the limits have to give way, each alone and all together.
 
     Where it turns out that a design keeps them all, which a search with its margins can miss, that is the answer.
     """
     spec, points, rows = search.spec, [end_point(result, search.space)], dict[str, dict[str, float]]()
-    method = short_method(search.method, RELAXATION_MARGIN)
+    method = search.method.shorten(RELAXATION_MARGIN)
     for q in spec.limits:
         search.progress(f"how far {metric_name(q)} would have to give way alone")
-        found = search.with_specification(relaxation_specification(spec, q, search.certifier.references), method).run(
+        found = search.with_specification(relaxation_specification(spec, q, search.task.references), method).run(
             points[0]
         )
         if found.status.code is Code.INTERRUPTED:
@@ -233,13 +201,6 @@ def relax(search: Search, result: TuningResult) -> TuningResult:
     return with_relaxations(replace(judged, stats={**result.stats, **judged.stats}), rows)
 
 
-def short_method(method: Method, margin: float) -> TwoPhase | Screening:
-    """A short search from a point that is close."""
-    if isinstance(method, TwoPhase):
-        return replace(method, starts=2, margin=margin, solver=replace(method.solver, max_iterations=150))
-    return Screening(24, 8, (), 200, margin, digits=method.digits)
-
-
 def _continue_from_feasible(search: Search, point: Array) -> TuningResult:
     """The best from a design that keeps all limits; or that design, where the margins leave no room for a search."""
     found = search.run(point)
@@ -249,26 +210,3 @@ def _continue_from_feasible(search: Search, point: Array) -> TuningResult:
 def end_point(result: TuningResult, space: Space) -> Array:
     """The point that a search ended in, whether it was handed out or not."""
     return np.array([result.stats.get(f"rejected.{n}", result.parameters.value(n)) for n in space.names])
-
-
-def _screening_status(spec: Specification, values: Mapping[str, float]) -> Status:
-    """What a screening achieved: it keeps the limits, or the closest it came."""
-    broken = [
-        f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
-        for q in spec.violations(values, LIMIT_TOLERANCE)
-    ]
-    if broken:
-        return Status(Code.INFEASIBLE, f"the closest found has {'; '.join(broken)}; relax a limit or widen the bounds")
-    if not np.isfinite(spec.objective(values)):
-        return Status(
-            Code.NOT_CONVERGED, "nothing found settles; widen the band or the bounds, or lengthen the horizon"
-        )
-    return Status(Code.CONVERGED)
-
-
-def _active_limits(space: Space, spec: Specification, point: Array, values: Mapping[str, float]) -> tuple[str, ...]:
-    """Limits within 2 % of being reached, gains within 0.1 % of their range of a bound."""
-    limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= 0.98 * upper_limit(q)]
-    low, up = space.bounds.T
-    near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)
-    return (*limits, *(n for n, held in zip(space.names, near, strict=True) if held))

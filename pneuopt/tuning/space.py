@@ -172,6 +172,11 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     return Space(full, free)
 
 
+def clip_level(loop: ClosedLoop, p: ParameterSet) -> float:
+    """The largest command that the controller's own limits let through; inf without limits."""
+    return max(abs(p.value("pid.lower")), abs(p.value("pid.upper"))) if loop.pid.limits else float("inf")
+
+
 def _check_amplitude(p: ParameterSet) -> None:
     """Refuse a search where dither alone, around no matter what offset, runs into the command's limits."""
     (low, high, whose), most = command_range(p), p["dither.amplitude"].upper

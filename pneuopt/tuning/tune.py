@@ -8,8 +8,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
@@ -17,31 +15,19 @@ from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.requirements import PeakControl, Requirement
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
-from pneuopt.evaluation.specification import Specification, specify
+from pneuopt.evaluation.specification import specify
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
-from pneuopt.tuning.condensed import Condensed, check_differentiable, is_differentiable
-from pneuopt.tuning.confirmed import Confirmed, check_confirmable
 from pneuopt.tuning.feasibility import check_feasibility
-from pneuopt.tuning.result import Certifier, TuningResult
-from pneuopt.tuning.screening import Screening
-from pneuopt.tuning.search import Method, Search, relax
-from pneuopt.tuning.space import Space, search_space
-from pneuopt.tuning.two_phase import TwoPhase, check_exact, has_few_steps, is_exact, is_linear
+from pneuopt.tuning.method import Method, TuningTask
+from pneuopt.tuning.methods import choose_method
+from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.search import Search, relax
+from pneuopt.tuning.space import Space, clip_level, search_space
 
-__all__ = ["Method", "TuningResult", "prepare_search", "tune"]
-MAX_SCREENING_GAINS = (
-    6  # up to which one plant is tuned as well without gradients; with 8 on T32 it takes twice the time
-)
+__all__ = ["TuningResult", "prepare_search", "tune"]
 INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)  # limits may be why
-PARAMETERS_WITHOUT_EFFECT = (
-    "dither.amplitude",
-    "dither.frequency",
-    "pid.Tt",
-    "pid.lower",
-    "pid.upper",
-)  # by a linear loop's average
 
 
 def tune(
@@ -73,10 +59,10 @@ def tune(
     scenarios : mapping of str to mapping, optional
         Plants beside the nominal one, or tolerances of the gains: of `corners`, `samples`, `draws`, `tolerances`, or
         several of them joined with ``|``. The worst over references and scenarios counts.
-    method : TwoPhase, Screening, Condensed or Confirmed, optional
-        By default the first for one linear plant with a continuous controller that no clip can hold back, if it has
-        equations for all that is asked for; else, or where that fails, the last for scenarios or many gains where all
-        is differentiable, and the second.
+    method : TwoPhase, Condensed, Screening or another Method, optional
+        By default the first of them that suits: `TwoPhase` for one linear plant with a continuous controller that no
+        clip can hold back, if it has equations for all that is asked for; `Condensed` for scenarios or many gains where
+        all is differentiable; else, or where `TwoPhase` fails, `Screening`.
     throw : bool
         Raise if nothing could be certified; otherwise the result says so in its status.
     progress : callable, optional
@@ -111,8 +97,9 @@ def tune(
     posed = (loop, references, parameters, minimise, subject_to, scenarios)
     search = prepare_search(*posed, method, progress)
     result = search.run()
-    if method is None and isinstance(search.method, TwoPhase) and not result.status.converged:
-        search = prepare_search(*posed, Screening(), progress)  # the exact problem keeps its band at its nodes only
+    successor = search.method.successor
+    if method is None and successor is not None and not result.status.converged:
+        search = prepare_search(*posed, successor, progress)
         result = search.run()
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     felt = search.space.names
@@ -144,50 +131,15 @@ def prepare_search(
     steps = [references] if isinstance(references, Step) else list(references)
     loop = add_disturbances(loop, steps)
     spec = specify(minimise, subject_to)
-    spec = spec.without(PeakControl) if _clip_level(loop, parameters) <= spec.limit(PeakControl) else spec
     require(len(steps) > 0, "no reference to tune for; give a Step")
     space = search_space(loop, parameters)
-    every = cases(steps, scenarios, space.parameters, space.names)
-    check_feasibility(loop, every, space, spec)
-    given, method = method, _choose_method(method, loop, scenarios, space, spec)
-    if given is None and isinstance(method, TwoPhase) and not has_few_steps(loop, steps, space, method):
-        method = Screening()
-    unfelt = tuple(n for n in space.names if n in PARAMETERS_WITHOUT_EFFECT) if isinstance(method, TwoPhase) else ()
-    felt = Space(space.parameters, tuple(n for n in space.names if n not in unfelt))
-    require(len(felt.names) > 0, f"{', '.join(unfelt)}: without effect on a linear loop; free a gain as well")
-    notary = Certifier(loop, tuple(steps), scenarios, felt, spec, method)
-    return Search(notary, felt, spec, method, progress or (lambda _: None))
-
-
-def _choose_method(
-    method: Method | None, loop: ClosedLoop, scenarios: Scenarios, space: Space, spec: Specification
-) -> Method:
-    """The method, by default what suits the loop."""
-    linear = is_linear(loop)
-    if isinstance(method, TwoPhase):
-        message = (
-            "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()"
-        )
-        require(linear, message)
-        require(not scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
-        check_exact(spec)
-    if isinstance(method, Confirmed):
-        require(not scenarios, "Confirmed is for one plant, not for scenarios; use its first= as the method itself")
-        check_confirmable(loop, space, spec)
-    fast = method.first if isinstance(method, Confirmed) else method
-    if isinstance(fast, Condensed):
-        check_differentiable(space, spec)
-    if method is not None:
-        return method
-    clip = _clip_level(loop, space.parameters)
-    clipped = clip < np.inf and not spec.limit(PeakControl) < clip  # designs that saturate are no less welcome
-    if linear and not clipped and not scenarios and is_exact(spec):
-        return TwoPhase()
-    many = bool(scenarios) or len(space.names) > MAX_SCREENING_GAINS
-    return Condensed() if many and is_differentiable(space, spec) else Screening()
-
-
-def _clip_level(loop: ClosedLoop, parameters: ParameterSet) -> float:
-    """The largest command that the controller's own limits let through."""
-    full = loop.parameters | parameters
-    return max(abs(full.value("pid.lower")), abs(full.value("pid.upper"))) if loop.pid.limits else np.inf
+    spec = spec.without(PeakControl) if clip_level(loop, space.parameters) <= spec.limit(PeakControl) else spec
+    check_feasibility(loop, cases(steps, scenarios, space.parameters, space.names), space, spec)
+    task = TuningTask(loop, tuple(steps), scenarios, space, spec)
+    if method is None:
+        method = choose_method(task)
+    else:
+        method.check(task)
+    felt = Space(space.parameters, tuple(n for n in space.names if n not in method.parameters_without_effect))
+    require(len(felt.names) > 0, f"{', '.join(space.names)}: without effect on a linear loop; free a gain as well")
+    return Search(replace(task, space=felt), method, progress or (lambda _: None))

@@ -9,6 +9,7 @@ a step at the command.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -39,13 +40,19 @@ from pneuopt.quantities.status import ProgressCallback
 from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, regular_nodes
-from pneuopt.tuning.space import Space, fastest_eigenvalue, rk4_substeps
+from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue, rk4_substeps
 
 EXACT_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.exact and kind is not SettlingTime)
 UNKNOWN_UPPER_BOUNDS = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
 SETTLING_PARAMETER = "SettlingTime"
 BAND_PARAMETER = "band.share"  # of the settling band as transcribed: a number that a continuation may move
 MAX_STEPS_A_SEGMENT = 12  # between two nodes; the paper's loop takes 3, a lag with dead time and wide bounds 50
+EXACT_PEAK_MARGIN = 1 / 300  # share of the margin for peaks of command and sensitivity: an exact problem misses none
+# On these the average of a linear loop does not depend.
+PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
 OPTIMA_TOLERANCE = 1e-3  # relative difference of two optima that count as one
 
 
@@ -74,11 +81,68 @@ class TwoPhase:
     digits: int | None = 4
     solver: FullSpace = field(default_factory=lambda: FullSpace(max_iterations=400, first_barrier=1e-2))
 
+    peak_margin: ClassVar[float] = EXACT_PEAK_MARGIN
+    parameters_without_effect: ClassVar[tuple[str, ...]] = PARAMETERS_WITHOUT_EFFECT
+
     def __post_init__(self) -> None:
         require(min(self.nodes) >= 4, f"TwoPhase: each phase needs at least 4 nodes, got {self.nodes}")
         require(0 <= self.margin < 1, f"TwoPhase: margin is a fraction below 1, got {self.margin}")
         require(self.starts >= 1, f"TwoPhase: starts must be at least 1, got {self.starts}")
         require(self.digits is None or self.digits >= 2, f"TwoPhase: digits must be at least 2, got {self.digits}")
+
+    @property
+    def successor(self) -> Screening:
+        """A search by simulation: the exact problem keeps its band at its nodes only."""
+        return Screening()
+
+    def check(self, task: TuningTask) -> None:
+        """Refuse what the problem has no equation for: `InputError` names it and the remedy."""
+        message = (
+            "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()"
+        )
+        require(is_linear(task.loop), message)
+        require(not task.scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
+        inexact = _inexact_requirements(task.spec)
+        require(not inexact, f"TwoPhase has no equation for {', '.join(inexact)}; use method=Screening()")
+
+    def suits(self, task: TuningTask) -> bool:
+        """For a linear loop on one plant that no clip can hold back, if there are equations for all that is asked."""
+        clip = clip_level(task.loop, task.space.parameters)
+        clipped = clip < math.inf and not task.spec.limit(PeakControl) < clip  # designs that saturate are as welcome
+        can = is_linear(task.loop) and not clipped and not task.scenarios and not _inexact_requirements(task.spec)
+        return can and has_few_steps(task.loop, task.references, task.space, self)
+
+    def find(
+        self,
+        task: TuningTask,
+        simulator: Simulator,  # noqa: ARG002
+        spec: Specification,
+        start: Array,
+        attempt: int,
+        progress: ProgressCallback,
+    ) -> SearchResult:
+        """The best optimum of the starts; see `Method.find`."""
+        method = self if attempt == 0 else replace(self, starts=1)
+        space = Space(task.space.parameters_at(start), task.space.names)
+        optima = solve_two_phase(task.loop, task.references, space, spec, method, progress)
+        best, values = optima.best, optima.best.parameters
+        stats = {
+            "starts": float(optima.starts),
+            "starts_converged": float(optima.converged),
+            "starts_agreeing": float(optima.agreeing),
+            "optimum": best.stats.get("cost", np.nan),
+            "iterations": best.stats.get("iterations", 0.0),
+        }
+        point = np.array([values.value(n) for n in task.space.names])
+        return SearchResult(point, best.status, tuple(best.multipliers), stats)
+
+    def shorten(self, margin: float) -> "TwoPhase":
+        """A short search, from a point that is close."""
+        return replace(self, starts=2, margin=margin, solver=replace(self.solver, max_iterations=150))
+
+    def limit_path(self, task: TuningTask, spec: Specification) -> "TwoPhasePath":
+        """The problem, differentiated once, whose limits and settling band then move."""
+        return two_phase_path(task.loop, task.references, task.space, spec, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,25 +165,12 @@ def is_linear(loop: ClosedLoop) -> bool:
     return not ca.depends_on(ca.jacobian(ca.vertcat(*ode(t, x, u, p)), signals), signals)
 
 
-def is_exact(spec: Specification) -> bool:
-    """Whether the two-phase problem has an equation for all that is asked for."""
-    return not _inexact_requirements(spec)
-
-
 def has_few_steps(loop: ClosedLoop, references: Sequence[Step], space: Space, method: TwoPhase) -> bool:
     """Whether the steps between two nodes are few; with many the problem takes minutes, where a screening takes one."""
     own = Space(space.parameters, tuple(n for n in space.names if n not in ("pid.Tt", "pid.lower", "pid.upper")))
     rate = fastest_eigenvalue(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))]).max()
     longest = max(r.horizon for r in references) / min(method.nodes)
     return bool(rate * longest <= MAX_STEPS_A_SEGMENT * RK4_MAX_H_LAMBDA)
-
-
-def check_exact(spec: Specification) -> None:
-    """Refuse what the problem has no equation for: `InputError` names it and the remedy."""
-    require(
-        not _inexact_requirements(spec),
-        f"TwoPhase has no equation for {', '.join(_inexact_requirements(spec))}; use method=Screening()",
-    )
 
 
 def _inexact_requirements(spec: Specification) -> list[str]:

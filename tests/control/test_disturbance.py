@@ -15,8 +15,9 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.method import Method
 from pneuopt.tuning.screening import Screening
-from pneuopt.tuning.tune import Method, tune
+from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 PUSH = Step(0.0, initial=0.2, at=0.1, horizon=1.1, disturbance={"load.force": 30.0})

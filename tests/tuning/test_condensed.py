@@ -33,14 +33,14 @@ from pneuopt.evaluation.scenarios import Scenarios, corners, tolerances
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
-from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.models.linear import Integrator
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.condensed import Condensed
-from pneuopt.tuning.confirmed import Confirmed
 from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.method import TuningTask
+from pneuopt.tuning.methods import choose_method
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
@@ -128,29 +128,6 @@ def test_what_has_no_slope_is_named_with_the_remedy(requirement: Requirement) ->
     loop, given = friction_loop(Dither(80.0))
     with pytest.raises(InputError, match=rf"no gradient for {type(requirement).__name__}; use method=Screening"):
         tune(loop, Step(0.1), given, minimise=requirement, method=QUICK)
-
-
-@pytest.mark.slow
-def test_full_space_confirms_the_search_or_betters_it() -> None:
-    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
-    given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
-    limits: list[Requirement] = [Overshoot(0.05), PeakControl(4.0)]
-    rough, fine = Screening(members=6, generations=1, refinements=0), Screening(members=20, generations=6)
-    found = [
-        tune(loop, STEP, given, minimise=SettlingTime(), subject_to=limits, method=method)
-        for method in (rough, Confirmed(rough), Confirmed(fine))
-    ]
-    first, better, same = (r.certified.loc["SettlingTime"].max() for r in found)
-    assert "full space: bettered from" in found[1].status.message
-    assert better < 0.99 * first
-    assert "full space: confirmed, a local optimum within" in found[2].status.message
-    assert better == pytest.approx(same, rel=0.01)
-
-
-def test_full_space_refuses_what_it_cannot_see() -> None:
-    loop, given = friction_loop(Dither(80.0))
-    with pytest.raises(InputError, match="continuous controller"):
-        tune(loop, Step(0.1), given, minimise=SettlingTime(), method=Confirmed())
 
 
 def test_the_best_settling_time_is_the_one_that_is_measured() -> None:
@@ -269,11 +246,9 @@ def test_a_working_set_takes_in_the_case_that_it_missed() -> None:
 
 @pytest.mark.parametrize(("friction", "kind"), [(Viscous(), "TwoPhase"), (Stribeck(), "Screening")])
 def test_one_plant_and_few_gains_are_left_to_the_other_methods(friction: Viscous | Stribeck, kind: str) -> None:
-    from pneuopt.tuning.tune import _choose_method
-
     loop = ClosedLoop(ForceDrive(friction).system(), PID())
     given = loop.parameters.with_bounds({"pid.Kp": (1.0, 10.0)}).freed("pid.Kp")
     space, spec = search_space(loop, given), specify(SettlingTime())
-    assert type(_choose_method(None, loop, {}, space, spec)).__name__ == kind
+    assert type(choose_method(TuningTask(loop, (STEP,), {}, space, spec))).__name__ == kind
     heavy: Scenarios = {"heavy": {"load.mass": 9.0}}
-    assert type(_choose_method(None, loop, heavy, space, spec)).__name__ == "Condensed"
+    assert type(choose_method(TuningTask(loop, (STEP,), heavy, space, spec))).__name__ == "Condensed"

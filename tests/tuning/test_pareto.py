@@ -17,11 +17,11 @@ from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.plotting import plot_front
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.method import Method
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
-from pneuopt.tuning.tune import Method
 from pneuopt.tuning.two_phase import TwoPhase
 
 STEP = Step(1.0, horizon=1.5)

@@ -22,10 +22,11 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.tuning.method import Method
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
-from pneuopt.tuning.tune import Method, TuningResult, tune
+from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 FAST = Screening(members=20, generations=6, bands=(), refinements=80)

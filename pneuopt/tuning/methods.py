@@ -1,0 +1,19 @@
+"""The methods of `tune`: the one place where a new one is registered, and how one is chosen."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.method import Method, TuningTask
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.two_phase import TwoPhase
+
+# By their key in a tuning's file; the first that suits a task is chosen, and the last suits every task.
+METHODS: Mapping[str, type[TwoPhase] | type[Condensed] | type[Screening]] = MappingProxyType(
+    {"two_phase": TwoPhase, "condensed": Condensed, "screening": Screening}
+)
+
+
+def choose_method(task: TuningTask) -> Method:
+    """The first method that suits a task."""
+    return next(method for method in (kind() for kind in METHODS.values()) if method.suits(task))

@@ -1,0 +1,135 @@
+"""Every registered method through the same mill: a new one is a class and a row in `METHODS`."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import Overshoot, Ripple, SettlingTime
+from pneuopt.evaluation.specification import specify
+from pneuopt.files.tuning import read_tuning
+from pneuopt.models.linear import FirstOrder
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code
+from pneuopt.tuning.method import Method, TuningTask
+from pneuopt.tuning.methods import METHODS, choose_method
+from pneuopt.tuning.space import search_space
+from pneuopt.tuning.tune import tune
+
+STEP, LIMITS = Step(1.0, horizon=1.0), (Overshoot(0.05),)
+SMALL: dict[str, dict[str, object]] = {  # options with which each one takes a second
+    "two_phase": {"starts": 1, "nodes": [20, 20]},
+    "condensed": {"members": 8, "generations": 2, "restarts": 0, "polish": 2, "keep": 1},
+    "screening": {"members": 8, "generations": 3, "bands": [0.1], "refinements": 20},
+}
+FILE = """
+[method]
+kind = "{kind}"
+{options}
+[pid]
+Kp = {{ value = "2 V*s/m", lower = "0.1 V*s/m", upper = "20 V*s/m", free = true }}
+Ki = {{ value = "10 V/m", lower = "0 V/m", upper = "200 V/m", free = true }}
+[[reference]]
+step = "1 m/s"
+horizon = "1 s"
+[minimise]
+settling_time = {{ band = "2 %" }}
+"""
+
+
+def problem(dither: Dither | None = None) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False), dither)
+    free = {"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}
+    return loop, loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 10.0}).with_bounds(free).freed(*free)
+
+
+def read(kind: str, folder: Path, options: dict[str, object]) -> Method:
+    lines = "\n".join(f"{n} = {value}" for n, value in options.items())
+    path = folder / "tuning.toml"
+    path.write_text(FILE.format(kind=kind, options=lines), encoding="utf-8")
+    method = read_tuning(path, FirstOrder().system()).method
+    assert method is not None
+    return method
+
+
+@pytest.fixture(params=list(METHODS))
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_its_key_and_options_are_read_from_a_tunings_file(kind: str, tmp_path: Path) -> None:
+    method = read(kind, tmp_path, SMALL[kind])
+    assert isinstance(method, METHODS[kind])
+    for n, value in SMALL[kind].items():
+        assert getattr(method, n) == (tuple(value) if isinstance(value, list) else value), n
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"margin": 1.5}, "margin is a fraction"), ({"digits": 1}, "digits"), ({"nonsense": 1}, "nonsense")],
+)
+def test_bad_options_are_named_with_file_and_section(
+    kind: str, options: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=rf"tuning.toml: \[method\].*{message}"):
+        read(kind, tmp_path, options)
+
+
+def test_its_fields_say_margin_and_digits(kind: str) -> None:
+    """By which a search is widened and gains are printed."""
+    assert {"margin", "digits"} <= {f.name for f in fields(METHODS[kind])}
+    method = METHODS[kind]()
+    assert 0 <= method.peak_margin <= 1
+    assert 0 < method.shorten(0.01).margin == 0.01
+
+
+def test_it_finds_a_certified_design_and_reports_progress(kind: str, tmp_path: Path) -> None:
+    (loop, given), heard = problem(), list[str]()
+    found = tune(
+        loop,
+        STEP,
+        given,
+        minimise=SettlingTime(),
+        subject_to=LIMITS,
+        method=read(kind, tmp_path, SMALL[kind]),
+        progress=heard.append,
+    )
+    assert found.status.converged
+    assert found.certified.loc["Overshoot"].max() <= 5.0
+    assert heard
+    assert set(found.stats) >= {"optimum", "margin", "seconds"}
+
+
+def test_it_can_be_interrupted(kind: str, tmp_path: Path) -> None:
+    loop, given = problem()
+
+    def stop(_: str) -> None:
+        raise KeyboardInterrupt
+
+    method = read(kind, tmp_path, SMALL[kind])
+    found = tune(loop, STEP, given, minimise=SettlingTime(), method=method, progress=stop, throw=False)
+    assert found.status.code is Code.INTERRUPTED
+    assert found.parameters.value("pid.Kp") == given.value("pid.Kp")
+
+
+def test_what_it_refuses_does_not_suit_it(kind: str) -> None:
+    """Over tasks that some of them cannot do: whoever suits one passes its own check."""
+    loop, given = problem(Dither(80.0))
+    space, method = search_space(loop, given), METHODS[kind]()
+    plain = TuningTask(loop, (STEP,), {}, space, specify(SettlingTime(), LIMITS))
+    tasks = [plain, replace(plain, scenarios={"heavy": {"plant.gain": 2.0}})]
+    tasks += [replace(task, spec=specify(SettlingTime(), [Ripple(0.1)])) for task in tasks]
+    refused = 0
+    for task in tasks:
+        try:
+            method.check(task)
+        except InputError:
+            refused += 1
+            assert not method.suits(task)
+        assert choose_method(task).suits(task)
+    assert refused == {"two_phase": 3, "condensed": 2, "screening": 0}[kind]
