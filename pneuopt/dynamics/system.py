@@ -78,8 +78,9 @@ class System:
     log_warning_hook : LogWarningHook, optional
         What is wrong with logs, as far as the model can see it.
     meter : casadi.Function, optional
-        ``(t, x, u, p) -> (air, spool)``: mass flow from the supply [kg/s], the spool's position [half travels]; they
-        are no outputs, as no log holds them.
+        ``(t, x, u, p) -> (...)``: what the plant consumes, an output a channel, named: "air", the mass flow from the
+        supply [kg/s], "spool", its position [half travels], "power", drawn from its source [W]; those that it has.
+        They are no outputs, as no log holds them.
     excitation : Excitation
         Which motion a log must show for its parameters to be identifiable.
     axis : Axis, optional

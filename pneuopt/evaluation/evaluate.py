@@ -12,11 +12,11 @@ from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.evaluation.air import response_air_consumption
 from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
 from pneuopt.evaluation.margins import margins, noise_gain
+from pneuopt.evaluation.meter import meter_metrics
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.record import record
 from pneuopt.evaluation.response import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
@@ -142,7 +142,7 @@ def _evaluate_case(
     response = _respond(loop, rig, case.reference, parameters)
     metrics = measure(loop, parameters, case.reference, response, band, envelope)
     metrics |= limit_cycle_metrics(loop, parameters, case.reference, response)
-    metrics |= response_air_consumption(loop, parameters, response, case.reference.at)
+    metrics |= meter_metrics(loop, parameters, response, case.reference.at)
     if rig is not None:
         return metrics
     x, command = final_operating_point(loop, parameters, response)

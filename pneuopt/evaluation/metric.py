@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from pneuopt.evaluation.step_record import RowReader, StepRecord
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
 
@@ -51,6 +53,11 @@ class Metric:
         Metrics to values that shall be small, where they are no values that shall be small already.
     headline : bool
         It stands in every table of a tuning, whatever was asked for.
+    slope : callable, optional
+        Of a `StepRecord`: rows and their derivatives, shapes (m, R) and (m, R, N), of which the metric is the largest,
+        a fraction where it counts in percent; without one no gradient search knows the metric.
+    channels : tuple of str
+        Of the plant's meter, that it is read from.
     exact : bool
         `TwoPhase` has an equation for it.
     shown : bool
@@ -72,6 +79,8 @@ class Metric:
     floor: float = -inf
     cost: Callable[[Any], Any] | None = None
     headline: bool = False
+    slope: RowReader | None = None
+    channels: tuple[str, ...] = ()
     exact: bool = False
     shown: bool = True
 
@@ -92,6 +101,11 @@ class Metric:
     def factor(self) -> float:
         """The metric over the fraction that a limit is: 100 where it counts in percent, else 1."""
         return 100 if self.percent else 1
+
+    def largest(self, record: StepRecord) -> Array:
+        """The metric of each response, the largest of its rows, shape (m,), in the unit of `evaluate`."""
+        assert self.slope is not None
+        return np.asarray(self.factor * np.maximum(self.floor, self.slope(record)[0].max(axis=1)))
 
     def requirement_value(self, metric: Any) -> Any:
         """What shall be small, of a number or an array: a fraction of a percentage, a margin's reciprocal."""

@@ -1,6 +1,6 @@
 """Figures of a step response, with python-control's keys, relative to the step's size."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from math import nan
@@ -9,11 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.evaluation.dither_mean import TAIL_SHARE, end_mean, period_mean, tail
+from pneuopt.evaluation.metric import Source
+from pneuopt.evaluation.requirements import METRICS, StepEnvelope
+from pneuopt.evaluation.step_record import StepRecord, without_slopes
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
 MIN_SETTLED_PERIODS = 2  # of the dither, at least, of a response that has settled
-INTEGRAL_METRICS = ("IAE", "ISE", "ITAE")
+
+ROW_METRICS = tuple(name for name, metric in METRICS.items() if metric.slope is not None)
 
 Envelope = Sequence[tuple[float, float, float]]
 """Instants after the step [s], each with the lower and upper bound from then on, as fractions of the step."""
@@ -160,6 +164,7 @@ def batch_metrics(
     only: Collection[str] | None = None,
     averaged: Array | None = None,
     scale: float | None = None,
+    meter: Mapping[str, Array] | None = None,
 ) -> dict[str, Array]:
     """Measure many step responses on one grid at once; see `step_metrics`.
 
@@ -172,6 +177,8 @@ def batch_metrics(
         What is asked for; what takes its time is left out where it is not in it.
     averaged : ndarray, shape (m, k), optional
         Means over the dither's period at the first k samples from the step on, where they are known.
+    meter : mapping of str to ndarray, shape (m, n), optional
+        What the plant's meter showed, by channel.
 
     Returns
     -------
@@ -181,41 +188,93 @@ def batch_metrics(
     raw, size = _cut_record(t, y, start, band), reference_final - initial if scale is None else scale
     if averaged is None and dither_period is not None:
         averaged = _period_averages(raw, initial, dither_period)
-    smooth = raw if averaged is None else _StepRecord(raw.t[: averaged.shape[1]], averaged)
+    smooth = raw if averaged is None else _Samples(raw.t[: averaged.shape[1]], averaged)
     steady = end_mean(raw.t, raw.y, dither_period) if final is None else np.full(len(raw.y), final)
     centre, width = steady, band * np.abs(steady - initial)
     if band_centre is BandCentre.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
     latest = raw.t[-1] - max(TAIL_SHARE * raw.t[-1], MIN_SETTLED_PERIODS * (dither_period or 0.0))
+    record = _to_step_record(
+        raw,
+        (smooth.y - reference_final) / size,
+        (steady - reference_final) / size,
+        _samples_since(t, control, start),
+        {n: values[:, _first_index_since(t, start) :] for n, values in (meter or {}).items()},
+        sample_time,
+        envelope,
+        is_step=scale is None,
+    )
     return {
         **_rise_metrics(smooth, initial, steady, only),
         "SettlingTime": _settling_times(smooth, centre, width, latest),
         **(_overshoot_metrics(smooth, steady, reference_final, initial, only) if scale is None else {}),
         **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
-        "SteadyStateError": 100 * np.abs(reference_final - steady) / abs(size),
         **({"Ripple": np.ptp(tail(raw.t, raw.y, dither_period)[1], axis=1)} if _wants(only, "Ripple") else {}),
-        **_error_integrals(smooth, reference_final, size, only),
-        **_envelope_metric(smooth, initial if scale is None else reference_final - size, size, envelope),
-        **_control_effort(t, control, start, sample_time, len(raw.y), only),
+        **{name: _largest(name, record) for name in ROW_METRICS if _wants(only, name) and _is_shown(name, record)},
     }
 
 
+def _to_step_record(
+    raw: "_Samples",
+    error: Array,
+    final_error: Array,
+    command: Array | None,
+    meter: Mapping[str, Array],
+    sample_time: float | None,
+    envelope: Envelope,
+    *,
+    is_step: bool,
+) -> StepRecord:
+    """The responses as readers of rows see them."""
+    return StepRecord(
+        raw.t,
+        without_slopes(error),
+        without_slopes(final_error[:, None]),
+        np.zeros((len(error), 0, 0)),
+        None if command is None else without_slopes(command),
+        {n: without_slopes(values) for n, values in meter.items()},
+        sample_time=sample_time,
+        envelope=envelope,
+        is_step=is_step,
+    )
+
+
+def _samples_since(t: Array, control: Array | None, start: float) -> Array | None:
+    if control is None:
+        return None
+    require(control.shape[-1:] == t.shape, f"t and control differ in shape: {t.shape} and {control.shape[-1:]}")
+    return control[:, _first_index_since(t, start) :]
+
+
+def _is_shown(name: str, record: StepRecord) -> bool:
+    return set(METRICS[name].channels) <= set(record.meter) and (
+        name != StepEnvelope.metric.name or bool(record.envelope)
+    )
+
+
+def _largest(name: str, record: StepRecord) -> Array:
+    metric = METRICS[name]
+    if metric.source is Source.COMMAND and record.command is None:
+        return np.full(len(record.error[0]), nan)
+    return metric.largest(record)
+
+
 @dataclass(frozen=True)
-class _StepRecord:
+class _Samples:
     """Samples from the step on, a row a response; t is counted from the step."""
 
     t: Array
     y: Array
 
 
-def _cut_record(t: Array, y: Array, start: float, band: float) -> _StepRecord:
+def _cut_record(t: Array, y: Array, start: float, band: float) -> _Samples:
     require(bool(np.all(np.diff(t) > 0)), "time must increase strictly")
     require(bool(np.all(np.isfinite(y))), "the response holds NaN or infinite values; a simulation that fails has none")
     require(0 < band < 1, f"band is a fraction between 0 and 1, got {band:g}; 2 % is 0.02")
     first = _first_index_since(t, start)
     require(len(t) - first >= 3, f"fewer than three samples after the step at {start:g} s")
-    return _StepRecord(t[first:] - start, y[:, first:])
+    return _Samples(t[first:] - start, y[:, first:])
 
 
 def _wants(only: Collection[str] | None, *metrics: str) -> bool:
@@ -226,7 +285,7 @@ def _first_index_since(t: Array, start: float) -> int:
     return int(np.searchsorted(t, start - 1e-12 * max(1.0, abs(start))))
 
 
-def _period_averages(record: _StepRecord, initial: float, period: float) -> Array:
+def _period_averages(record: _Samples, initial: float, period: float) -> Array:
     last = record.t[-1] - period / 2
     require(
         period > 0 and last > record.t[0] + period,
@@ -235,7 +294,7 @@ def _period_averages(record: _StepRecord, initial: float, period: float) -> Arra
     return period_mean(record.t, record.y, initial, period, record.t[record.t <= last])
 
 
-def _rise_metrics(record: _StepRecord, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:
+def _rise_metrics(record: _Samples, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:
     """Time from 10 to 90 %, and the range from there on; NaN where 90 % is never reached."""
     if not _wants(only, "RiseTime", "SettlingMin", "SettlingMax"):
         return {}
@@ -263,7 +322,7 @@ def _first_crossing_times(t: Array, z: Array, level: float) -> Array:
     return np.asarray(np.where(k == 0, t[0], between))
 
 
-def _settling_times(record: _StepRecord, centre: Array, width: Array, latest: float) -> Array:
+def _settling_times(record: _Samples, centre: Array, width: Array, latest: float) -> Array:
     """The last crossing of the band, linear between samples; NaN for one after `latest`."""
     t, y = record.t, record.y
     outside = np.abs(y - centre[:, None]) > width[:, None]
@@ -283,18 +342,16 @@ def _pick_samples(rows: Array, k: NDArray[np.intp]) -> Array:
 
 
 def _overshoot_metrics(
-    record: _StepRecord, steady: Array, reference: float, initial: float, only: Collection[str] | None
+    record: _Samples, steady: Array, reference: float, initial: float, only: Collection[str] | None
 ) -> dict[str, Array]:
-    size, change = reference - initial, steady - initial
     if not _wants(only, "OvershootFinal", "Undershoot", "Peak", "PeakTime"):
-        peak = record.y.max(axis=1) if size > 0 else record.y.min(axis=1)
-        return {"Overshoot": 100 * np.maximum(0.0, (peak - reference) / size)}
+        return {}
+    size, change = reference - initial, steady - initial
     k = np.argmax(record.y * np.sign(size), axis=1)
     peak = _pick_samples(record.y, k)
     with np.errstate(all="ignore"):
         beyond = np.where(change * size > 0, 100 * np.maximum(0.0, (peak - steady) / change), nan)
     return {
-        "Overshoot": 100 * np.maximum(0.0, (peak - reference) / size),
         "OvershootFinal": beyond,
         "Undershoot": 100 * np.maximum(0.0, np.max((initial - record.y) / size, axis=1)),
         "Peak": peak,
@@ -302,64 +359,10 @@ def _overshoot_metrics(
     }
 
 
-def _deviation_metrics(record: _StepRecord, reference: float, size: float) -> dict[str, Array]:
+def _deviation_metrics(record: _Samples, reference: float, size: float) -> dict[str, Array]:
     """What a response that should not move shows in place of rise and overshoot."""
     k = np.argmax(np.abs(record.y - reference), axis=1)
     peak, none = _pick_samples(record.y, k), np.zeros(len(record.y))
     beyond = 100 * np.abs(peak - reference) / abs(size)
-    found = {"Overshoot": beyond, "OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
+    found = {"OvershootFinal": beyond, "Peak": peak, "PeakTime": record.t[k]}
     return found | {"RiseTime": none, "Undershoot": none}
-
-
-def _error_integrals(
-    record: _StepRecord, reference: float, size: float, only: Collection[str] | None
-) -> dict[str, Array]:
-    """By the trapezoidal rule; its weights at the samples make the integrals products."""
-    if not _wants(only, *INTEGRAL_METRICS):
-        return {}
-    h, error = np.diff(record.t), np.abs(record.y - reference) / abs(size)
-    weights = 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
-    return {"IAE": error @ weights, "ISE": error**2 @ weights, "ITAE": error @ (weights * record.t)}
-
-
-def _envelope_metric(record: _StepRecord, initial: float, size: float, envelope: Envelope) -> dict[str, Array]:
-    if not envelope:
-        return {}
-    used, y = np.zeros(len(record.y)), (record.y - initial) / size
-    ends = [*(begin for begin, _, _ in envelope[1:]), np.inf]
-    for (begin, lower, upper), end in zip(envelope, ends, strict=True):
-        if begin < record.t[-1]:
-            part = _samples_between(record.t, y, begin, min(end, record.t[-1]))
-            used = np.maximum(used, np.max(np.abs(part - (lower + upper) / 2), axis=1) / ((upper - lower) / 2))
-    return {"StepEnvelope": used}
-
-
-def _samples_between(t: Array, y: Array, begin: float, end: float) -> Array:
-    """Samples in a span, and the values at its ends, linear between samples."""
-    at = np.array([begin, end])
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    ends = y[:, k] + (at - t[k]) / (t[k + 1] - t[k]) * (y[:, k + 1] - y[:, k])
-    return np.concatenate([ends, y[:, (t > begin) & (t < end)]], axis=1)
-
-
-def _control_effort(
-    t: Array, control: Array | None, start: float, sample_time: float | None, rows: int, only: Collection[str] | None
-) -> dict[str, Array]:
-    if control is None:
-        return {"PeakControl": np.full(rows, nan), "ControlRate": np.full(rows, nan)}
-    require(control.shape[-1:] == t.shape, f"t and control differ in shape: {t.shape} and {control.shape[-1:]}")
-    first = _first_index_since(t, start)
-    found = {"PeakControl": np.asarray(np.max(np.abs(control[:, first:]), axis=1))}
-    if _wants(only, "ControlRate"):
-        found["ControlRate"] = _control_rates(t[first:], control[:, first:], sample_time)
-    return found
-
-
-def _control_rates(t: Array, u: Array, sample_time: float | None) -> Array:
-    """A held command jumps within a sample of a finer grid: its rate is the jump over the controller's sample."""
-    if sample_time is None:
-        return np.asarray(np.max(np.abs(np.diff(u, axis=1)) / np.diff(t), axis=1))
-    begin = np.flatnonzero(t <= t[-1] - 0.999 * sample_time)
-    require(len(begin) > 0, f"the record of {t[-1] - t[0]:g} s is shorter than the controller's sample time")
-    end = np.searchsorted(t, t[begin] + 0.999 * sample_time)
-    return np.asarray(np.max(np.abs(u[:, end] - u[:, begin]), axis=1) / sample_time)

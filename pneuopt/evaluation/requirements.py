@@ -16,8 +16,22 @@ from typing import Any, TypeVar, final
 import numpy as np
 from numpy.typing import NDArray
 
+from pneuopt.evaluation.air import AIR_CHANNEL, air_rows
 from pneuopt.evaluation.metric import AtLeast, AtMost, Metric, Sense, Source
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
+from pneuopt.evaluation.step_record import (
+    StepRecord,
+    ValuesAndSlopes,
+    control_rate_rows,
+    envelope_rows,
+    iae_rows,
+    ise_rows,
+    itae_rows,
+    overshoot_rows,
+    peak_control_rows,
+    steady_state_rows,
+    without_slopes,
+)
 from pneuopt.quantities.errors import require
 
 Value = TypeVar("Value", float, NDArray[np.float64])
@@ -66,6 +80,7 @@ class Overshoot(AtMost):
         advice="5 % is 0.05",
         floor=0.0,
         headline=True,
+        slope=overshoot_rows,
         exact=True,
     )
 
@@ -83,6 +98,7 @@ class SteadyStateError(AtMost):
         advice="2 % is 0.02",
         floor=0.0,
         headline=True,
+        slope=steady_state_rows,
         exact=True,
     )
 
@@ -105,7 +121,7 @@ class StepEnvelope(Requirement):
     >>> tube = StepEnvelope(((0.0, -0.1, 1.1), (0.5, 0.95, 1.05)))
     """
 
-    metric = Metric("StepEnvelope", "1", Source.RESPONSE)
+    metric = Metric("StepEnvelope", "1", Source.RESPONSE, slope=envelope_rows)
     bounds: EnvelopeBounds
     max: float | None = 1.0
 
@@ -123,35 +139,35 @@ class StepEnvelope(Requirement):
 class IAE(AtMost):
     """Integral of the error's size from the step to the end of the horizon, over the step's size [s]."""
 
-    metric = Metric("IAE", "s", Source.RESPONSE)
+    metric = Metric("IAE", "s", Source.RESPONSE, slope=iae_rows)
 
 
 @final
 class ISE(AtMost):
     """Integral of the squared error from the step to the end of the horizon, over the square of the step's size [s]."""
 
-    metric = Metric("ISE", "s", Source.RESPONSE)
+    metric = Metric("ISE", "s", Source.RESPONSE, slope=ise_rows)
 
 
 @final
 class ITAE(AtMost):
     """Integral of the error's size times the time since the step, over the step's size [s^2]."""
 
-    metric = Metric("ITAE", "s^2", Source.RESPONSE)
+    metric = Metric("ITAE", "s^2", Source.RESPONSE, slope=itae_rows)
 
 
 @final
 class PeakControl(AtMost):
     """Largest absolute command, dither included [the command's unit]."""
 
-    metric = Metric("PeakControl", "{command}", Source.COMMAND, headline=True, exact=True)
+    metric = Metric("PeakControl", "{command}", Source.COMMAND, headline=True, slope=peak_control_rows, exact=True)
 
 
 @final
 class ControlRate(AtMost):
     """Largest change of the command over time, dither included, the jump at the step left out [its unit/s]."""
 
-    metric = Metric("ControlRate", "{command}/s", Source.COMMAND)
+    metric = Metric("ControlRate", "{command}/s", Source.COMMAND, slope=control_rate_rows)
 
 
 @final
@@ -165,7 +181,7 @@ class Ripple(AtMost):
 class AirUse(AtMost):
     """What a pneumatic drive draws from its supply, from the step to the end of the horizon [l(ANR), ISO 8778]."""
 
-    metric = Metric("AirUse", "l(ANR)", Source.METER)
+    metric = Metric("AirUse", "l(ANR)", Source.METER, slope=air_rows, channels=(AIR_CHANNEL,))
 
 
 @final
@@ -241,11 +257,18 @@ REQUIREMENT_KINDS: tuple[type[Requirement], ...] = (
 
 ROBUSTNESS_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.source is Source.LINEAR_LOOP)
 
+
+def _travel_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The spool's way, to and fro."""
+    spool, _ = record.meter["spool"]
+    return without_slopes(np.abs(np.diff(spool, axis=1)).sum(axis=1)[:, None])
+
+
 _FIGURES = (
     Metric("LimitCycleAmplitude", "{measured}", Source.RESPONSE),
     Metric("LimitCycleFrequency", "Hz", Source.RESPONSE),
     Metric("StickShare", "1", Source.RESPONSE),
-    Metric("ValveTravel", "half travels", Source.METER),
+    Metric("ValveTravel", "half travels", Source.METER, slope=_travel_rows, channels=("spool",)),
     Metric("FrictionSlope", "N*s/m", Source.LINEAR_LOOP),
     Metric("SettlingMin", "{measured}", Source.RESPONSE, shown=False),
     Metric("SettlingMax", "{measured}", Source.RESPONSE, shown=False),

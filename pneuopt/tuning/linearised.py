@@ -14,20 +14,21 @@ from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
 from pneuopt.evaluation.requirements import (
+    REQUIREMENT_KINDS,
     ROBUSTNESS_REQUIREMENTS,
-    Overshoot,
+    Requirement,
     SettlingTime,
-    SteadyStateError,
     requirement_values,
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.tuning.readings import AIR_METRIC, CONTROL_OUTPUT, loop_pieces
-from pneuopt.tuning.rows import ROW_READERS, Lanes, reading_times
+from pneuopt.tuning.readings import CONTROL_OUTPUT, loop_pieces
+from pneuopt.tuning.rows import Lanes, reading_times
 from pneuopt.tuning.simulator import Simulator, is_sound
 from pneuopt.tuning.sqp import LinearisedPoint, RowGroups
 
-SMOOTH_REQUIREMENTS = (SettlingTime, *ROW_READERS, *ROBUSTNESS_REQUIREMENTS)
+ROW_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.slope is not None)
+SMOOTH_REQUIREMENTS: tuple[type[Requirement], ...] = (SettlingTime, *ROW_REQUIREMENTS, *ROBUSTNESS_REQUIREMENTS)
 """What gradients are there for."""
 PROGRAM_BAND_PENALTY = 50.0  # what leaving the band by the whole step costs at least, times the objective's scale
 PROGRAM_LIMIT_PENALTY = 2.0  # what a limit missed by its whole size costs, times the same
@@ -149,7 +150,7 @@ class LinearisedProblem:
             if weight > 0:
                 kinds.append((kind, 1.0, False))
                 weights.append(weight)
-                floors.append(0.0 if kind in (Overshoot, SteadyStateError) else -np.inf)
+                floors.append(kind.metric.floor)
             if limit < np.inf:
                 kinds.append((kind, limit, True))
                 weights.append(PROGRAM_LIMIT_PENALTY * self._scale)
@@ -224,9 +225,14 @@ class LinearisedProblem:
             [self._periods[k] for k in case.tolist()],
             self._strides[g],
             self._spec.envelope,
+            self._simulator.meter_channels,
         )
-        error, by_gain = lanes.error
-        rows_of = {kind: reader(lanes) for kind, reader in ROW_READERS.items() if self._spec.concerns(kind)}
+        error, by_gain = lanes.record.error
+        rows_of: dict[type, tuple[Array, Array]] = {
+            kind: kind.metric.slope(lanes.record)
+            for kind in ROW_REQUIREMENTS
+            if kind.metric.slope is not None and self._spec.concerns(kind)
+        }
         if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
             ends = self._simulator.operating_points(
                 p[sound], case[sound], found.x_end[sound], found.y[sound, -1, CONTROL_OUTPUT]
@@ -278,7 +284,7 @@ class LinearisedProblem:
         nudged = [p, *(p + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping)]
         tiled = np.tile(ends[0], (len(nudged), 1)), np.tile(ends[1], len(nudged))
         stacked = np.concatenate([q[sound] for q in nudged])
-        metrics = requirement_values(self._simulator.robustness(stacked, *tiled, [k.__name__ for k in kinds]))
+        metrics = requirement_values(self._simulator.robustness(stacked, *tiled, [k.metric.name for k in kinds]))
         factors = np.array([c.slopes(names) for c in self._simulator.cases])[case[sound]]
         rates = self._space.from_unit_slope(points[sound]) * factors
         for kind, (values, slopes) in found.items():
@@ -295,7 +301,7 @@ def sensitivity_rollout(simulator: Simulator) -> Rollout:
     order, names = list(simulator.loop.parameters), simulator.space.names
     through_start = any(simulator.starts_vary(k) for k in range(len(simulator.cases)))
     return Rollout(
-        loop_pieces(simulator.loop, with_meter=AIR_METRIC in simulator.response_metrics),
+        loop_pieces(simulator.loop, simulator.meter_channels),
         [order.index(n) for n in names],
         start=through_start,
     )

@@ -12,17 +12,14 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.air import air_consumption, meter_outputs
 from pneuopt.evaluation.dither_mean import DitherPeriodMean
+from pneuopt.evaluation.meter import meter_outputs
 from pneuopt.evaluation.metrics import BandCentre, Envelope, batch_metrics
 from pneuopt.evaluation.response import MAX_READINGS_A_SAMPLE
 from pneuopt.quantities.arrays import Array
 
-SIGNAL_OUTPUT, CONTROL_OUTPUT, FLOW_OUTPUT, SPOOL_OUTPUT = range(
-    4
-)  # outputs that are run, the last two for `AIR_METRIC` only
+SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT = range(3)  # outputs that are run; the meter's channels follow one another
 INTEGRAL_OUTPUT = -1  # under dither the last output, and the last state, is the signal's integral
-AIR_METRIC = "AirUse"
 WORST_MERIT = 1e6
 
 
@@ -58,15 +55,10 @@ class ReferenceGrid:
         return self.u[k], self.t[k], np.where(np.arange(n) < len(self.t) - 1, self.spacing, 0.0)
 
 
-def loop_pieces(loop: ClosedLoop, *, with_meter: bool = False) -> Pieces:
-    """The loop's sampled step with no outputs but the measured signal and the command, and what a meter shows.
+def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
+    """The loop's sampled step with no outputs but the measured signal, the command and channels of the meter.
 
     Under dither the signal's integral, from zero on, is one more state and the last output.
-
-    Raises
-    ------
-    InputError
-        If a plant without a meter shall be metered.
     """
     discrete, outputs = loop.discrete(), names(loop.outputs)
     ode = (loop.system() if loop.pid.sample_time is None else loop.hold_system()).ode
@@ -79,8 +71,8 @@ def loop_pieces(loop: ClosedLoop, *, with_meter: bool = False) -> Pieces:
         x = z[: len(loop.states)]
         xdot, y = ode(t, x, u, p)
         shown = y[kept]
-        if with_meter:
-            shown = ca.vertcat(shown, meter_outputs(loop, x, u, p, shown[CONTROL_OUTPUT]))
+        if channels:
+            shown = ca.vertcat(shown, *meter_outputs(loop, channels, x, u, p, shown[CONTROL_OUTPUT]))
         grown = [] if total.is_empty() else [shown[SIGNAL_OUTPUT]]
         return ca.vertcat(xdot, *grown), ca.vertcat(shown, z[len(loop.states) :])
 
@@ -113,6 +105,7 @@ def read_metrics(
     period: float | None,
     only: Collection[str],
     envelope: Envelope,
+    channels: Sequence[str] = (),
 ) -> dict[str, Array]:
     """The metrics `only` of sound responses y, shape (m, n, n_watched).
 
@@ -135,17 +128,20 @@ def read_metrics(
     settings["sample_time"] = grid.sample_time
     settings["scale"] = None if reference.is_step else reference.nominal_size
     given = (grid.t, signal, reference.final, reference.initial)
-    control = y[:, :, CONTROL_OUTPUT]
-    found = batch_metrics(*given, band=bands[0], control=control, envelope=envelope, only=only, **settings)
+    settings["control"], meter = y[:, :, CONTROL_OUTPUT], metered(y, channels)
+    found = batch_metrics(*given, band=bands[0], envelope=envelope, only=only, meter=meter, **settings)
     if len(bands) > 1:
         more = (batch_metrics(*given, band=band, only=("SettlingTime",), **settings) for band in bands[1:])
         times = [found["SettlingTime"], *(wider["SettlingTime"] for wider in more)]
         most = penalty_settling_time(reference.horizon - reference.at, excess)
         found["SettlingTime"] = np.mean([np.where(np.isnan(t), most, t) for t in times], axis=0)
-    if AIR_METRIC in only:
-        found |= air_consumption(grid.t, y[:, :, FLOW_OUTPUT], y[:, :, SPOOL_OUTPUT], reference.at)
     found["Excess"] = excess
     return {n: found[n] for n in only}
+
+
+def metered(y: Array, channels: Sequence[str]) -> dict[str, Array]:
+    """What the meter shows among outputs that are the last axis of y."""
+    return {channel: y[..., METER_OUTPUT + k] for k, channel in enumerate(channels)}
 
 
 def penalty_settling_time(scale: float, excess: Array) -> Array:

@@ -12,6 +12,7 @@ from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.cases import TuningCase, cases
+from pneuopt.evaluation.meter import check_channels, needed_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS, larger_is_better, requirement_values
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, loop_inputs, readings_a_sample, sample_spacing
@@ -19,7 +20,7 @@ from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.readings import AIR_METRIC, CONTROL_OUTPUT, ReferenceGrid, has_integral, loop_pieces, read_metrics
+from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, has_integral, loop_pieces, read_metrics
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
 RUNAWAY_LEVEL = 1e12
@@ -52,8 +53,10 @@ class Simulator:
     Attributes
     ----------
     cases : tuple of Case
-    read, margins : tuple of str
+    response_metrics, margin_metrics : tuple of str
         The metrics read off the responses, and off the loop linearised about their ends.
+    meter_channels : tuple of str
+        Of the plant's meter, that are run for them.
     """
 
     def __init__(
@@ -72,7 +75,9 @@ class Simulator:
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
         self._rest = [_gain_independent_rest(case, loop, space) for case in self.cases]
-        self._rollout = Rollout(loop_pieces(loop, with_meter=AIR_METRIC in self.response_metrics))
+        check_channels(loop.plant, self.response_metrics)
+        self.meter_channels = needed_channels(self.response_metrics)
+        self._rollout = Rollout(loop_pieces(loop, self.meter_channels))
         self.grids = _grids(loop, references, space.parameters)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
@@ -250,7 +255,13 @@ class Simulator:
             out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
             for period, rows in self.lanes_by_dither_period(p[own], sound):
                 metrics = read_metrics(
-                    grid, _select_rows(y, rows), (band, *self._wider), period, self.response_metrics, self._envelope
+                    grid,
+                    _select_rows(y, rows),
+                    (band, *self._wider),
+                    period,
+                    self.response_metrics,
+                    self._envelope,
+                    self.meter_channels,
                 )
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value

@@ -8,9 +8,10 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.evaluation.air import ANR_DENSITY, air_consumption
+from pneuopt.evaluation.air import ANR_DENSITY
 from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.requirements import AirUse, SettlingTime
+from pneuopt.evaluation.meter import metered_record
+from pneuopt.evaluation.requirements import METRICS, AirUse, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.models.linear import FirstOrder
@@ -20,6 +21,12 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.readings import loop_pieces
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
+
+
+def metered(t: np.ndarray, flow: np.ndarray, spool: np.ndarray, start: float) -> dict[str, float]:
+    record = metered_record(t, {"air": flow, "spool": spool}, start)
+    return {n: METRICS[n].largest(record).item() for n in ("AirUse", "ValveTravel")}
+
 
 STEP = Step(0.1, horizon=0.4, start={"position": 0.2, "pressure_b": 3.5e5})
 
@@ -43,8 +50,8 @@ def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave() -
     run = simulate(plant, Trajectory(t, {"valve_voltage": np.full(len(t), 1.0)}), p, initial=start)
     full = (plant.parameters | p).select(plant.parameters)
     states, u = run.matrix([q.name for q in plant.states]).T, np.full((1, len(t)), 1.0)
-    flow, spool = (np.asarray(r) for r in plant.meter.map(len(t))(0, states, u, [full.value(n) for n in full]))
-    litres = air_consumption(t, flow, spool, 0.0)["AirUse"][0]
+    flow, spool = (np.array(r) for r in plant.meter.map(len(t))(0, states, u, [full.value(n) for n in full]))
+    litres = metered(t, flow, spool, 0.0)["AirUse"]
     area = np.pi / 4 * p.value("cylinder.bore") ** 2
     volume = p.value("cylinder.dead_volume_a") + area * run["position"][-1]
     gained = (run["pressure_a"][-1] - run["pressure_a"][0]) * volume / (287.0 * p.value("ambient.temperature"))
@@ -55,10 +62,10 @@ def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave() -
 
 def test_a_closed_valve_draws_nothing_and_travel_counts_to_and_fro() -> None:
     t = np.linspace(0.0, 1.0, 1001)
-    found = air_consumption(t, np.zeros((1, 1001)), 0.1 * np.sin(2 * np.pi * 5 * t)[None], 0.0)
-    assert found["AirUse"][0] == 0.0
-    assert found["ValveTravel"][0] == pytest.approx(4 * 0.1 * 5, rel=1e-4)
-    later = air_consumption(t, np.ones((1, 1001)), np.zeros((1, 1001)), 0.5)["AirUse"][0]
+    found = metered(t, np.zeros((1, 1001)), 0.1 * np.sin(2 * np.pi * 5 * t)[None], 0.0)
+    assert found["AirUse"] == 0.0
+    assert found["ValveTravel"] == pytest.approx(4 * 0.1 * 5, rel=1e-4)
+    later = metered(t, np.ones((1, 1001)), np.zeros((1, 1001)), 0.5)["AirUse"]
     assert later == pytest.approx(0.5e3 / ANR_DENSITY)
 
 
@@ -83,13 +90,13 @@ def test_dither_costs_air_and_travel() -> None:
 def test_the_meter_is_no_output_and_watched_only_where_air_is_asked_for() -> None:
     loop, p = driven()
     assert set(respond(loop, STEP, p).names) == {q.name for q in (*loop.states, *loop.outputs)}
-    plain, metered = (loop_pieces(loop, with_meter=asked).step for asked in (False, True))
+    plain, metered = (loop_pieces(loop, asked).step for asked in ((), ("air", "spool")))
     assert metered.numel_out(1) - plain.numel_out(1) == 2
 
 
 def test_air_of_a_plant_that_draws_none_is_refused() -> None:
     loop = ClosedLoop(FirstOrder().system(), PID())
     given = loop.parameters.with_bounds({"pid.Kp": (0.5, 2.0)}).freed("pid.Kp")
-    with pytest.raises(InputError, match="AirUse counts the supply's air, and this plant has none"):
+    with pytest.raises(InputError, match="AirUse counts the plant's air, and this plant has no meter"):
         Simulator(loop, [Step(1.0)], search_space(loop, given), spec=specify(AirUse(max=1.0)))
     assert "AirUse" not in evaluate(loop, Step(1.0), given).index

@@ -273,4 +273,4 @@ def test_what_is_not_asked_for_is_left_out() -> None:
     all_ = batch_metrics(T, rows, 1.0, 0.0, control=rows)
     assert set(all_) - set(few) >= {"IAE", "ISE", "ITAE", "ControlRate", "RiseTime", "Ripple"}
     assert all(few[n] == all_[n] for n in few)
-    assert set(batch_metrics(T, rows, 1.0, 0.0, control=rows, only=("ISE",))) >= {"IAE", "ISE", "ITAE"}
+    assert "ISE" in batch_metrics(T, rows, 1.0, 0.0, control=rows, only=("ISE",))

@@ -246,7 +246,8 @@ class PneumaticDrive:
         x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
         through = self._edge_flows(x, u, p)
         drawn = [through.supply_a + through.supply_b, self._spool_position(x, u, p)]
-        return ca.Function("meter", [ca.SX.sym("t"), *map(stack, (x, u, p))], drawn)
+        given = [ca.SX.sym("t"), *map(stack, (x, u, p))]
+        return ca.Function("meter", given, drawn, ["t", "x", "u", "p"], ["air", "spool"])
 
     @cached_property
     def _balance_function(self) -> ca.Function:

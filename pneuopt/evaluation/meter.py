@@ -1,0 +1,100 @@
+"""What a plant's meter shows of a response: air, the spool's travel, power, as metrics."""
+
+from collections.abc import Collection, Mapping
+
+import casadi as ca
+import numpy as np
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.system import System, names
+from pneuopt.evaluation.requirements import METRICS
+from pneuopt.evaluation.step_record import StepRecord, without_slopes
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
+
+
+def meter_channels(plant: System) -> tuple[str, ...]:
+    """What a plant's meter shows: "air" [kg/s], "spool" [half travels], "power" [W]; nothing without a meter."""
+    return () if plant.meter is None else tuple(plant.meter.name_out())
+
+
+def needed_channels(metrics: Collection[str]) -> tuple[str, ...]:
+    """The channels of a meter that metrics are read from."""
+    return tuple(dict.fromkeys(c for name in metrics if name in METRICS for c in METRICS[name].channels))
+
+
+def check_channels(plant: System, metrics: Collection[str]) -> None:
+    """Refuse a metric that the plant's meter does not show.
+
+    Raises
+    ------
+    InputError
+        It names the metric and the channel.
+    """
+    shown = meter_channels(plant)
+    for name in metrics:
+        for channel in needed_channels([name]):
+            if channel not in shown:
+                has = f"shows only {', '.join(shown)}" if shown else "has no meter"
+                raise InputError(f"{name} counts the plant's {channel}, and this plant {has}; leave it out")
+
+
+def meter_outputs(
+    loop: ClosedLoop, channels: Collection[str], x: ca.SX, u: ca.SX, p: ca.SX, control: ca.SX
+) -> list[ca.SX]:
+    """Channels of the plant's meter, of a loop's vectors."""
+    plant = loop.plant
+    if plant.meter is None:
+        return []
+    order, signals = list(loop.parameters), names(loop.inputs)
+    inputs = [control if q.name == loop.command.name else u[signals.index(q.name)] for q in plant.inputs]
+    own = ca.vertcat(*(p[order.index(n)] for n in plant.parameters))
+    found = plant.meter(0, x[: len(plant.states)], ca.vertcat(*inputs), own)
+    shown = dict(zip(meter_channels(plant), [found] if plant.meter.n_out() == 1 else found, strict=True))
+    return [ca.SX(shown[channel]) for channel in channels]
+
+
+def metered_record(t: Array, channels: Mapping[str, Array], start: float) -> StepRecord:
+    """What a meter showed of many responses on one grid from `start` on; of the signal nothing.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        [s]
+    channels : mapping of str to ndarray, shape (m, n)
+    start : float
+        [s]
+    """
+    kept = t >= start
+    shown = {n: without_slopes(np.asarray(values)[:, kept]) for n, values in channels.items()}
+    m = len(next(iter(channels.values())))
+    none = without_slopes(np.zeros((m, 0)))
+    return StepRecord(t[kept], none, none, np.zeros((m, 0, 0)), meter=shown)
+
+
+def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory, start: float) -> dict[str, float]:
+    """The metrics that the plant's meter shows of one response, AirUse [l(ANR)] say; none of a plant without a meter.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+    response : Trajectory
+        The plant's states, "control", and the loop's inputs where the plant has more than the command.
+    start : float
+        From when on is counted [s].
+    """
+    plant, shown = loop.plant, meter_channels(loop.plant)
+    if plant.meter is None:
+        return {}
+    p = loop.parameter_vector(parameters)[[list(loop.parameters).index(n) for n in plant.parameters]]
+    given = {q.name: response[q.name] if q.name in response else np.zeros(len(response)) for q in plant.inputs}
+    inputs = np.array([*(given | {loop.command.name: response["control"]}).values()])
+    states = response.matrix(names(plant.states)).T
+    found = plant.meter.map(len(response))(0, states, inputs, p)
+    rows = dict(zip(shown, [found] if len(shown) == 1 else found, strict=True))
+    record = metered_record(response.t, {n: np.array(row) for n, row in rows.items()}, start)
+    readable = (m for m in METRICS.values() if m.channels and set(m.channels) <= set(shown))
+    return {metric.name: float(metric.largest(record)[0]) for metric in readable}
