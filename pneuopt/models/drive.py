@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from pneuopt.dynamics.system import Axis, Symbols, System, define
+from pneuopt.dynamics.system import Axis, Symbols, System, define, names
 from pneuopt.models.declaration import DriveKind, flag
 from pneuopt.models.friction import FrictionModel, law_inputs
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
@@ -60,7 +60,7 @@ class ForceDrive:
         starts = partial(force_starts, self.friction)
         system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, starts)
         excitation = self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION
-        return replace(system, excitation=excitation, axis=Axis())
+        return replace(system, excitation=excitation, axis=Axis(), meter=_power_meter(system))
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,16 @@ AMBIENT_PARAMETERS = ParameterSet(
     }
 )
 _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
+
+
+def _power_meter(system: System) -> ca.Function:
+    """``(t, x, u, p)`` to what the motor draws [W]: the force's power where it drives, nothing where it brakes.
+
+    A servo drive without recovery burns in its brake resistor what comes back.
+    """
+    t, x, u, p = (ca.SX.sym(n, system.ode.size1_in(i)) for i, n in enumerate("txup"))
+    force, speed = (u[names(system.inputs).index("force")], x[names(system.states).index("speed")])
+    return ca.Function("meter", [t, x, u, p], [ca.fmax(force * speed, 0)], ["t", "x", "u", "p"], ["power"])
 
 
 def _ambient_parameters(friction: FrictionModel) -> ParameterSet:

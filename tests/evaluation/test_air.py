@@ -50,7 +50,7 @@ def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave() -
     run = simulate(plant, Trajectory(t, {"valve_voltage": np.full(len(t), 1.0)}), p, initial=start)
     full = (plant.parameters | p).select(plant.parameters)
     states, u = run.matrix([q.name for q in plant.states]).T, np.full((1, len(t)), 1.0)
-    flow, spool = (np.array(r) for r in plant.meter.map(len(t))(0, states, u, [full.value(n) for n in full]))
+    flow, spool, _ = (np.array(r) for r in plant.meter.map(len(t))(0, states, u, [full.value(n) for n in full]))
     litres = metered(t, flow, spool, 0.0)["AirUse"]
     area = np.pi / 4 * p.value("cylinder.bore") ** 2
     volume = p.value("cylinder.dead_volume_a") + area * run["position"][-1]

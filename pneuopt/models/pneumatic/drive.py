@@ -242,12 +242,18 @@ class PneumaticDrive:
         return self.valve.position(u["valve_voltage"], without_prefix(x, "valve"), without_prefix(p, "valve"))
 
     def _meter_function(self) -> ca.Function:
-        """``(t, x, u, p)`` to the air that both edges draw from the supply [kg/s], and the spool's position."""
+        """``(t, x, u, p)`` to the air that both edges draw from the supply [kg/s], the spool's position, and air power.
+
+        Air power [W] is what that air could do in an isothermal expansion to ambient pressure, ``m' R T ln(p_s/p_o)``:
+        Cai, Kawashima, Kagawa: Power assessment of flowing compressed air, J. Fluids Eng. 128 (2006) 402-405.
+        """
         x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
         through = self._edge_flows(x, u, p)
-        drawn = [through.supply_a + through.supply_b, self._spool_position(x, u, p)]
+        air, expansion = through.supply_a + through.supply_b, ca.log(p["supply.pressure"] / p["ambient.pressure"])
+        power = air * p["gas.constant"] * p["ambient.temperature"] * expansion
+        drawn = [air, self._spool_position(x, u, p), power]
         given = [ca.SX.sym("t"), *map(stack, (x, u, p))]
-        return ca.Function("meter", given, drawn, ["t", "x", "u", "p"], ["air", "spool"])
+        return ca.Function("meter", given, drawn, ["t", "x", "u", "p"], ["air", "spool", "power"])
 
     @cached_property
     def _balance_function(self) -> ca.Function:
