@@ -92,6 +92,7 @@ _HOME = {
     "pneuopt.identification.result": ("IdentificationResult", "Verdict"),
     "pneuopt.identification.profiles": ("Profile", "profile"),
     "pneuopt.identification.propagation": ("PropagatedValue", "propagate_error"),
+    "pneuopt.evaluation.energy": ("EnergyUse",),
     "pneuopt.evaluation.requirements": (
         "IAE",
         "ISE",

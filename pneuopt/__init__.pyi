@@ -24,6 +24,7 @@ from pneuopt.dynamics.simulate import StickSlipResult, contacts, simulate, simul
 from pneuopt.dynamics.stick_slip import EventKind
 from pneuopt.dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
+from pneuopt.evaluation.energy import EnergyUse
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from pneuopt.evaluation.margins import Margins, frequency_response, margins
@@ -129,6 +130,7 @@ __all__ = [
     "Dither",
     "DitherVerdict",
     "Encoder",
+    "EnergyUse",
     "EventKind",
     "Experiment",
     "Factor",

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.evaluation.air import AIR_CHANNEL, air_rows
+from pneuopt.evaluation.energy import EnergyUse
 from pneuopt.evaluation.metric import AtLeast, AtMost, Metric, Sense, Source
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
 from pneuopt.evaluation.step_record import (
@@ -247,6 +248,7 @@ REQUIREMENT_KINDS: tuple[type[Requirement], ...] = (
     ControlRate,
     Ripple,
     AirUse,
+    EnergyUse,
     MaxSensitivity,
     MaxComplementarySensitivity,
     GainMargin,

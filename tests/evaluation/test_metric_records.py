@@ -52,6 +52,7 @@ ROWS = {
     "ControlRate": Row(1.0, '"2 kN/s"', 2000.0),
     "Ripple": Row(0.0, '"2 mm/s"', 0.002),
     "AirUse": Row(4e-3 / 1.185e-3, '"2 l(ANR)"', 2.0),
+    "EnergyUse": Row(100.0, '"25 J"', 25.0),
     "MaxSensitivity": Row(1.0, "1.6", 1.6),
     "MaxComplementarySensitivity": Row(1.0, "1.3", 1.3),
     "GainMargin": Row(np.inf, "2.5", 2.5),

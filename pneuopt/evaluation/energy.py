@@ -1,0 +1,36 @@
+"""`EnergyUse`: the energy that a drive draws from its source, air or electricity, while it follows a step."""
+
+from typing import final
+
+from pneuopt.evaluation.metric import AtMost, Metric, Source
+from pneuopt.evaluation.step_record import StepRecord, ValuesAndSlopes
+
+POWER_CHANNEL = "power"  # of a meter: drawn from the plant's source [W]
+
+
+def energy_rows(record: StepRecord) -> ValuesAndSlopes:
+    """The integral of the power from the step to the end [J]."""
+    return record.metered_integral(POWER_CHANNEL)
+
+
+@final
+class EnergyUse(AtMost):
+    """Energy drawn from the plant's source, from the step to the end of the horizon [J].
+
+    Which power counts is what the plant's meter shows. Of a pneumatic drive it is the air power: the work that the air
+    drawn could do in an isothermal expansion from supply to ambient pressure, ``m' R T ln(p_s/p_o)``, or for its volume
+    V at the supply's state ``p_s V ln(p_s/p_o)``, both pressures absolute; a compressor takes more by its own losses.
+    Of an axis pushed by a force it is the motor's mechanical power where the motor drives, ``max(F v, 0)``: what comes
+    back in braking goes into the brake resistor, as drives without recovery do, and earns nothing.
+
+    Parameters
+    ----------
+    max : float, optional
+        [J]
+
+    References
+    ----------
+    Cai, Kawashima, Kagawa: Power assessment of flowing compressed air, J. Fluids Eng. 128 (2006) 402-405.
+    """
+
+    metric = Metric("EnergyUse", "J", Source.METER, slope=energy_rows, channels=(POWER_CHANNEL,))
