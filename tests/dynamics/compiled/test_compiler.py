@@ -175,7 +175,8 @@ def test_an_interrupted_compilation_leaves_nothing_behind(
 @needs_compiler
 def test_two_processes_may_build_the_same_at_once(tmp_path: Path) -> None:
     source = "int answer(void) { return 42; }"
-    program = f"from pneuopt.dynamics.compiled.compiler import build; assert build({source!r}).answer() == 42"
+    program = "from pneuopt.dynamics.compiled.compiler import compile_library\n"
+    program += f"assert compile_library({source!r}).answer() == 42"
     settings = {**os.environ, "PNEUOPT_CACHE": str(tmp_path)}
     running = [subprocess.Popen([sys.executable, "-c", program], env=settings) for _ in range(2)]
     assert [process.wait(60) for process in running] == [0, 0]
