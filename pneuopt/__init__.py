@@ -51,6 +51,7 @@ _HOME = {
     "pneuopt.models.karnopp": ("Karnopp",),
     "pneuopt.models.load": ("Load",),
     "pneuopt.models.drive": ("ForceDrive", "MotionDrive"),
+    "pneuopt.models.rotary": ("RotaryDrive",),
     "pneuopt.models.linear": ("FirstOrder", "Integrator", "SecondOrder"),
     "pneuopt.models.pneumatic.gas": ("IsentropicNozzle", "Iso6358"),
     "pneuopt.models.pneumatic.valve": ("ProportionalValve", "Spool"),

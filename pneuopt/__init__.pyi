@@ -81,6 +81,7 @@ from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Iso6358
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
+from pneuopt.models.rotary import RotaryDrive
 from pneuopt.models.sensing import coarse_delay, with_sensors
 from pneuopt.plotting import (
     plot_bode,
@@ -179,6 +180,7 @@ __all__ = [
     "Rig",
     "Ripple",
     "RiseTime",
+    "RotaryDrive",
     "Screening",
     "SecondOrder",
     "Sensor",

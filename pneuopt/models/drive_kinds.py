@@ -6,6 +6,7 @@ from pneuopt.models.declaration import DriveKind
 from pneuopt.models.drive import FORCE_KIND, MOTION_KIND
 from pneuopt.models.linear import LINEAR_KIND
 from pneuopt.models.pneumatic.drive_file import PNEUMATIC_KIND
+from pneuopt.models.rotary import ROTARY_KIND
 
 DRIVE_KINDS: Mapping[str, DriveKind] = {
     kind.name: kind
@@ -14,5 +15,6 @@ DRIVE_KINDS: Mapping[str, DriveKind] = {
         FORCE_KIND,
         MOTION_KIND,
         LINEAR_KIND,
+        ROTARY_KIND,
     )
 }

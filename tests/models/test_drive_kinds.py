@@ -32,6 +32,7 @@ ROWS: dict[str, str] = {
     "pneumatic": "[cylinder]\n[valve]\n[chamber]\n[load]\n[friction]\nmodel = 'stribeck'",
     "force": "[load]\n[friction]\nmodel = 'lugre'",
     "motion": "[rig]\n[friction]\nmodel = 'coulomb'",
+    "rotary": "[load]\n[friction]\nmodel = 'stribeck'",
     "linear": "[plant]\nmodel = 'second_order'\npade_order = 1\n[friction]\nmodel = 'coulomb'",
 }
 
