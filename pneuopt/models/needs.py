@@ -1,6 +1,7 @@
 """What motion the parameters of drives and friction laws need in a log, and the runs that separate them from others."""
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +20,9 @@ STRIBECK_CURVE = FRICTION_LEVELS | {"stribeck_velocity"}
 BRISTLES = frozenset({"bristle_stiffness", "bristle_damping", "damping_velocity"})
 CONSTANT_FORCES = frozenset({"load.force", "rig.force_offset"})
 """Parameters of drives that push one way whatever the speed."""
+ALIKE_AT_EVERY_SPEED = (
+    "they act alike at every speed: fix one, measure the offset with the load uncoupled, or turn the axis round"
+)
 
 
 def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
@@ -27,12 +31,13 @@ def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     speed = np.abs(seen.speed)
     below = int(np.count_nonzero((speed > 0.1 * stribeck) & (speed < stribeck)))
     slowest, fastest = 0.1 * stribeck, VISCOUS_SPEED_RATIO * stribeck
-    run = f"constant speeds, or slow ramps, from {slowest:.1g} to {fastest:.1g} m/s"
+    unit = _speed_unit(seen)
+    run = f"constant speeds, or slow ramps, from {slowest:.1g} to {fastest:.1g} {unit}"
     if seen.fast < MIN_SPEED_RATIO * seen.slow:
-        message = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} m/s, where friction is one level"
-        return Lack(message, f"log {run}")
+        speeds = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}"
+        return Lack(f"{speeds}, where friction is one level", f"log {run}")
     if below < MIN_SLOW_SAMPLES:
-        message = f"only {below} samples are slower than the Stribeck velocity, {stribeck:.2g} m/s"
+        message = f"only {below} samples are slower than the Stribeck velocity, {stribeck:.2g} {unit}"
         return Lack(message, f"log {run}")
     return None
 
@@ -40,8 +45,9 @@ def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
 def lacks_speed_range(seen: LoggedMotion) -> Lack | None:
     """What a slope over speed needs: speeds that differ."""
     if seen.fast < MIN_SPEED_RATIO * seen.slow:
-        message = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} m/s, too near for a slope"
-        return Lack(message, f"log speeds from {seen.slow:.2g} to beyond {VISCOUS_SPEED_RATIO * seen.fast:.2g} m/s")
+        unit, beyond = _speed_unit(seen), VISCOUS_SPEED_RATIO * seen.fast
+        message = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}, too near for a slope"
+        return Lack(message, f"log speeds from {seen.slow:.2g} to beyond {beyond:.2g} {unit}")
     return None
 
 
@@ -64,13 +70,13 @@ def lacks_presliding(seen: LoggedMotion) -> Lack | None:
     return None
 
 
-def lacks_acceleration(seen: LoggedMotion) -> Lack | None:
-    """What a mass needs: inertia that shows beside friction; of two masses known, the larger counts."""
-    force = _largest("load.mass", math.nan, seen.values, seen.given) * seen.acceleration
+def lacks_acceleration(inertia: str, remedy: str, seen: LoggedMotion) -> Lack | None:
+    """What the parameter `inertia` needs: a force that shows beside friction; of two known values the larger counts."""
+    force = _largest(inertia, math.nan, seen.values, seen.given) * seen.acceleration
     friction = _largest("friction.coulomb", math.nan, seen.values)
     if force < MIN_INERTIA_SHARE * friction:
-        message = f"inertia takes {force:.2g} N (rms), nothing beside {friction:.2g} N of friction"
-        return Lack(message, "weigh the load and fix its mass, or log steps of force")
+        unit = _known_unit(seen, "friction.coulomb")
+        return Lack(f"inertia takes {force:.2g} {unit} (rms), nothing beside {friction:.2g} {unit} of friction", remedy)
     return None
 
 
@@ -115,24 +121,50 @@ ASYMMETRY_EXCITATION = Excitation(
         SeparatingRun(
             CONSTANT_FORCES,
             frozenset({"coulomb_asymmetry"}),
-            "they act alike at every speed: "
-            "fix one, measure the offset with the load uncoupled, or turn the axis round",
+            ALIKE_AT_EVERY_SPEED,
         ),
     ),
 )
 _LEVELS = frozenset(f"friction.{n}" for n in FRICTION_LEVELS)
-LOAD_EXCITATION = Excitation(
-    {"load.force": Need(lacks_directions, _LEVELS), "load.mass": Need(lacks_acceleration)},
-    (
-        SeparatingRun(
-            frozenset({"load.mass"}),
-            frozenset(f"friction.{n}" for n in {"viscous", *BRISTLES}),
-            "log more acceleration: steps of force",
-        ),
-    ),
-)
+
+
+def load_excitation(inertia: str, force: str, push: str, remedy: str) -> Excitation:
+    """What the load of a drive needs.
+
+    Parameters
+    ----------
+    inertia, force : str
+        Its parameters: what resists acceleration, and what pushes one way whatever the speed.
+    push : str
+        What the drive pushes with, in words: "force", "torque".
+    remedy : str
+        How the inertia becomes known without a log, in words.
+    """
+    lacks = partial(lacks_acceleration, inertia, f"{remedy}, or log steps of {push}")
+    asymmetry, slope = (
+        frozenset({"friction.coulomb_asymmetry"}),
+        {"friction.viscous", *(f"friction.{n}" for n in BRISTLES)},
+    )
+    runs = (
+        SeparatingRun(frozenset({inertia}), frozenset(slope), f"log more acceleration: steps of {push}"),
+        SeparatingRun(frozenset({force}), asymmetry, ALIKE_AT_EVERY_SPEED),
+        SeparatingRun(frozenset({force}), _LEVELS, "log both directions"),
+    )
+    return Excitation({force: Need(lacks_directions, _LEVELS), inertia: Need(lacks)}, runs)
+
+
+LOAD_EXCITATION = load_excitation("load.mass", "load.force", "force", "weigh the load and fix its mass")
 RIG_EXCITATION = Excitation({"rig.force_offset": Need(lacks_directions, _LEVELS)})
 
 
 def _largest(name: str, default: float, *known: ParameterSet) -> float:
     return max((values.value(name) for values in known if name in values), default=default)
+
+
+def _speed_unit(seen: LoggedMotion) -> str:
+    return _known_unit(seen, "friction.stribeck_velocity", "friction.smoothing") or "m/s"
+
+
+def _known_unit(seen: LoggedMotion, *names: str) -> str:
+    """The unit of the first parameter that is known; empty where none is."""
+    return next((known[n].unit for n in names for known in (seen.given, seen.values) if n in known), "")

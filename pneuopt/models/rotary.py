@@ -11,6 +11,7 @@ from pneuopt.dynamics.system import Axis, Symbols, System, define
 from pneuopt.models.declaration import DriveKind
 from pneuopt.models.friction import Coulomb, FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
+from pneuopt.models.needs import load_excitation
 from pneuopt.models.starts.friction import force_starts
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
@@ -25,6 +26,9 @@ SPEED = Quantity("speed", "rad/s", nominal=0.5 / RADIUS)
 TORQUE = Quantity("torque", "N*m", nominal=100.0 * RADIUS)
 INERTIA = Parameter(5.0 * RADIUS**2, "kg*m^2", lower=1e-9, upper=1e5, log=True)
 LOAD_TORQUE = Parameter(0.0, "N*m", lower=-1e5, upper=1e5)
+_LOAD_EXCITATION = load_excitation(
+    "load.inertia", "load.torque", "torque", "take the inertia from drawings or data sheets and fix it"
+)
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ class RotaryDrive:
 
         starts = _RotaryStarts(self.friction)
         system = define((ANGLE, SPEED, *inner), (TORQUE,), (ANGLE, SPEED), self.parameters, rhs, starts)
-        excitation = self.friction.excitation.with_prefix("friction")
+        excitation = self.friction.excitation.with_prefix("friction") | _LOAD_EXCITATION
         return replace(system, axis=Axis("angle", "speed", "load.inertia", "N*m"), excitation=excitation)
 
 

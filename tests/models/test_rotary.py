@@ -6,6 +6,7 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.excitation import LoggedMotion
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime
 from pneuopt.files.drive import read_drive
@@ -79,6 +80,17 @@ def test_its_speed_loop_is_tuned_in_radians_per_second(servo: tuple[RotaryDrive,
     assert peak <= 5.0
     # A step of 50 rad/s that takes 5 N*m has Kp = 0.1 N*m*s/rad, with which 2e-3 kg*m^2 are 2 % off after 4 J/Kp.
     assert settled < 4 * 2e-3 / 0.1
+
+
+def test_advice_speaks_in_the_axis_units() -> None:
+    given = RotaryDrive().parameters
+    slow = LoggedMotion(10.0, 12.0, 0.5, 9, 1e-3, np.array([10.0, 12.0]), given, given)
+    needs = RotaryDrive().system().excitation.needs
+    viscous, inertia = (needs[n].lack(slow) for n in ("friction.viscous", "load.inertia"))
+    assert viscous is not None
+    assert viscous.remedy == "log speeds from 10 to beyond 60 rad/s"
+    assert inertia is not None
+    assert inertia.reason == "inertia takes 5e-07 N*m (rms), nothing beside 0.3 N*m of friction"
 
 
 def test_a_friction_that_needs_pressures_is_refused() -> None:
