@@ -143,9 +143,13 @@ def _show_design(console: "Console", task: Tuning, before: ParameterSet, result:
     show_metrics(console, result.certified, task.loop, before=_initial_metrics(task, before), limits=task.subject_to)
     show_requirements(console, result.requirements, result.active, task.loop)
     slopes = [v for n, v in result.stats.items() if n.startswith("friction_slope")]
-    if slopes:
+    axis = task.loop.plant.axis
+    if slopes and axis is not None:
+        length = next(q.unit for q in task.loop.plant.states if q.name == axis.position)
         ends = " to ".join(dict.fromkeys(f"{v:.4g}" for v in (min(slopes), max(slopes))))
-        console.print(f"margins are read with the slope that friction has where a step ends: {ends} N*s/m")
+        console.print(
+            f"margins are read with the slope that friction has where a step ends: {ends} {axis.force}*s/{length}"
+        )
     tables: dict[str, Any] = {}
     validation = _validate_on_new_plants(task, before, result)
     if validation is not None:
@@ -190,7 +194,8 @@ def _simulate_responses(task: Tuning, parameters: ParameterSet, before: Paramete
     for reference in task.references:
         run = _simulate_response(loop, reference, parameters)
         earlier = None if before is None else _simulate_initial_response(loop, reference, before)
-        found.append(Response(run, reference, loop.feedback.name, units, earlier, loop.dither_period(parameters)))
+        period, push = loop.dither_period(parameters), loop.plant.axis.force if loop.plant.axis else "N"
+        found.append(Response(run, reference, loop.feedback.name, units, earlier, period, push))
     return found
 
 

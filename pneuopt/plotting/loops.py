@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DRIVE_SIGNALS = {"valve.spool": ("valve [%]", 100.0), "friction.force": ("friction [N]", 1.0)}
+DRIVE_SIGNALS = {"valve.spool": ("valve [%]", 100.0), "friction.force": ("friction [{force}]", 1.0)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Response:
     Attributes
     ----------
     run : Trajectory
-        With the measured signal and "control"; "valve.spool" [1] and "friction.force" [N] are drawn where it has them.
+        With the measured signal and "control"; "valve.spool" [1] and "friction.force" are drawn where it has them.
     reference : Step
     measured : str
         Column of the signal that follows the reference.
@@ -37,6 +37,8 @@ class Response:
         The same step with the gains before tuning.
     dither_period : float, optional
         Time over which the metrics average [s] (`ClosedLoop.dither_period`): the average is drawn, the signal faintly.
+    force_unit : str
+        Of "friction.force".
     """
 
     run: Trajectory
@@ -45,6 +47,7 @@ class Response:
     units: tuple[str, str]
     before: Trajectory | None = None
     dither_period: float | None = None
+    force_unit: str = "N"
 
 
 def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure":
@@ -68,7 +71,8 @@ def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure"
         _draw_tracking(top, response, band)
         _draw_signal(others[0], response, "control", f"command [{response.units[1]}]", 1.0)
         for axes, name in zip(others[1:], inside, strict=True):
-            _draw_signal(axes, response, name, *DRIVE_SIGNALS[name])
+            label, factor = DRIVE_SIGNALS[name]
+            _draw_signal(axes, response, name, label.format(force=response.force_unit), factor)
         others[-1].set_xlabel("time [s]")
     for row in grid:
         for axes in row[1:]:
