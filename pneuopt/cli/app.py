@@ -1,7 +1,7 @@
 """The command line: `pneuopt identify | tune | simulate | study | info`.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 130
-interrupted. Whatever is heavy is imported by the command that needs it, so that help is quick.
+interrupted. Each command imports what it needs, so that `--help` waits for no heavy import.
 """
 
 import sys
@@ -13,9 +13,8 @@ from typing import Annotated
 
 import typer
 
+from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
-
-EXIT_FAILURE, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 app = typer.Typer(
     name="pneuopt",
@@ -57,7 +56,7 @@ def identify_command(
         Path, typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is identified.")
     ],
     logs: Annotated[
-        list[Path], typer.Argument(metavar="LOGS", help="CSV files, each with its sidecar .toml if it has one.")
+        list[Path], typer.Argument(metavar="LOGS", help="Log files, each with its sidecar .toml if it has one.")
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write fit.toml.")] = None,
     json: Json = None,
@@ -145,7 +144,7 @@ def study_command(
 
 @app.command("info")
 def info_command() -> None:
-    """Show versions, compiler and cache: say them when asking for help."""
+    """Show versions, compiler and cache, to be quoted in a question or a bug report."""
     import os
     import platform
     from importlib.metadata import version
@@ -166,7 +165,7 @@ def info_command() -> None:
 
 @contextmanager
 def _report_errors() -> Iterator[None]:
-    """Turn what a user can mend into one message and an exit status, and a warning of the physics into one line."""
+    """Turn an error that a user can mend into one message and an exit status, and a `PhysicsWarning` into one line."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", PhysicsWarning)
@@ -184,20 +183,20 @@ def _report_errors() -> Iterator[None]:
 
 
 def _warning_printer() -> Callable[..., None]:
-    """What shows a warning, once, as soon as it comes."""
-    told: set[str] = set()
+    """A function that prints each warning once, as soon as it comes."""
+    printed: set[str] = set()
 
     def print_warning(message: Warning | str, *_: object) -> None:
         line = f"warning: {message}"
-        if line not in told:
-            told.add(line)
+        if line not in printed:
+            printed.add(line)
             typer.echo(line, err=True)
 
     return print_warning
 
 
 def _expand_patterns(paths: Sequence[Path]) -> list[Path]:
-    """Patterns that the shell has left alone, as on Windows."""
+    """Expand the patterns that the shell has left alone, as on Windows."""
     found: list[Path] = []
     for path in paths:
         is_pattern = any(c in path.name for c in "*?[") and not path.exists()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.terminal import make_console, show_output_files
 from pneuopt.evaluation.requirements import EnvelopeBounds, SettlingTime, StepEnvelope
 from pneuopt.files.drive import read_drive, read_status
@@ -25,7 +26,6 @@ from pneuopt.tuning.tune import TuningResult
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-EXIT_SUCCESS, EXIT_FAILURE, EXIT_INTERRUPTED = 0, 1, 130
 Columns = Mapping[str, tuple[str, str]]
 Writers = dict[Path, Callable[[], None]]
 

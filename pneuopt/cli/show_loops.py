@@ -91,7 +91,7 @@ def show_metrics(
     for metric in (m for m in units if m in metrics.index and _is_relevant(m, metrics, loop)):
         now, was = (_metric_values(frame, metric, several) for frame in (metrics, before))
         cells = [
-            _format_metric(metric, v) + (f" (was {_format_metric(metric, was[k])})" if was else "")
+            _metric_cell(metric, v) + (f" (was {_metric_cell(metric, was[k])})" if was else "")
             for k, v in enumerate(now)
         ]
         limit = [allowed.get(metric, "")] if allowed else []
@@ -116,7 +116,7 @@ def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[
     for row in table.reset_index(names="requirement").to_dict(orient="records"):
         metric = str(row["requirement"])
         values = [percent_factor(metric) * row[n] for n in ("claimed", "certified", "allowed")]
-        figures = [_format_metric(metric, v) for v in values[:2]] + [format_number(values[2], 4)]
+        figures = [_metric_cell(metric, v) for v in values[:2]] + [format_number(values[2], 4)]
         room = "-" if math.isnan(row["room"]) else f"{100 * row['room']:.3g} %"
         grid.add_row(metric, *figures, room, "active" if row["active"] else "", units[metric])
     console.print(grid)
@@ -149,7 +149,7 @@ def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop)
     table = new_table("fresh plants", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
     for row in found.summary.reset_index(names="metric").to_dict(orient="records"):
         metric = str(row["metric"])
-        figures = [_format_metric(metric, row[n]) for n in ("median", "p95", "worst", "certified")]
+        figures = [_metric_cell(metric, row[n]) for n in ("median", "p95", "worst", "certified")]
         limit = "" if math.isnan(row["limit"]) else format_number(row["limit"], 4)
         table.add_row(metric, *figures, limit, str(row["violations"]), units[metric])
     console.print(table)
@@ -180,7 +180,7 @@ def show_cases(console: Console, table: "pd.DataFrame", axes: Mapping[str, str],
     shown = table if len(table) <= MAX_CASE_ROWS else ordered.head(MAX_CASE_ROWS)
     grid = new_table(*(f"{n}\n[{unit}]" if unit not in ("", "1") else n for n, unit in {**axes, **metrics}.items()))
     for row in shown.to_dict(orient="records"):
-        figures = [_format_metric(m, row[m]) for m in metrics]
+        figures = [_metric_cell(m, row[m]) for m in metrics]
         if row["error"]:
             figures = ["failed" if row["error"] != INTERRUPTED_CASE else INTERRUPTED_CASE] + [""] * (len(metrics) - 1)
         grid.add_row(*(format_number(row[n], 6) for n in axes), *figures)
@@ -277,5 +277,5 @@ def _format_limit(requirement: Requirement) -> str:
     return "" if limit is None else f"{relation} {format_number(requirement.metric.factor * limit, 4)}"
 
 
-def _format_metric(metric: str, value: float) -> str:
+def _metric_cell(metric: str, value: float) -> str:
     return "never" if metric == "SettlingTime" and math.isnan(value) else format_number(value, 4)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pneuopt.cli.exit_status import EXIT_INTERRUPTED
 from pneuopt.cli.shared import (
-    EXIT_INTERRUPTED,
     Columns,
     Outputs,
     Writers,

@@ -15,7 +15,14 @@ from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import specify
-from pneuopt.files.loop import LOOP_SECTIONS, TUNABLE_SECTIONS, construct_at, read_fixed_value, read_loop_sections
+from pneuopt.files.loop import (
+    LOOP_SECTIONS,
+    TUNABLE_SECTIONS,
+    TuningSections,
+    construct_at,
+    read_fixed_value,
+    read_loop_sections,
+)
 from pneuopt.files.method import read_method
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
 from pneuopt.files.scenarios import read_scenarios, read_validation_scenarios
@@ -29,7 +36,6 @@ from pneuopt.tuning.method import Method
 if TYPE_CHECKING:
     from pneuopt.tuning.result import TuningResult
 
-TuningSections = Mapping[str, Any]
 
 TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""

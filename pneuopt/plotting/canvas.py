@@ -17,8 +17,14 @@ if TYPE_CHECKING:
 
 FIGURE_SUFFIXES = ("png", "pdf", "svg")
 GREY, BLUE, ORANGE, RED = "0.55", "#1f6fb2", "#e07b00", "#c0392b"
-PLOT_UNITS = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}  # SI units are too coarse or too fine for these
-MAX_PLOT_COLUMNS = 3  # that can still be read at 1000 pixels
+PLOT_UNITS = {"m": (1e3, "mm"), "Pa(a)": (1e-5, "bar(a)")}
+"""SI units that would give an axis many zeros, with the factor and the unit that are drawn in their place."""
+MAX_PLOT_COLUMNS = 3
+"""Columns of axes beside each other: more cannot be read at 1000 pixels, fewer leave logs out."""
+MAX_PLOT_POINTS = 4000
+"""Points of a measured line or cloud: more make a vector figure slow to open, fewer hide short events."""
+NORMAL_QUANTILE_95 = 1.96
+"""Half width of a band that holds 95 % of a normal distribution [standard deviations]."""
 
 
 def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
@@ -44,7 +50,7 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
 
 
 def check_figure_path(path: str | Path) -> None:
-    """Raise `InputError` unless the file's suffix is one that a figure can be written as."""
+    """Raise `InputError` unless a figure can be written in the format of the file's suffix."""
     suffix = Path(path).suffix.lower().removeprefix(".")
     require(
         suffix in FIGURE_SUFFIXES,
@@ -67,7 +73,7 @@ def plot_unit(experiments: Sequence[Experiment], channel: str) -> tuple[float, s
 def axes_grid(
     rows: int, columns: int, heights: Sequence[float], *, sharex: Literal["col"] | bool = False, width: float = 10.0
 ) -> tuple["Figure", list[list["Axes"]]]:
-    """A figure of so many inches, and its axes."""
+    """A figure of `width` by the sum of `heights` [inch], and its axes, a list a row."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, 0.9 + sum(heights)), layout="constrained")
@@ -78,8 +84,13 @@ def axes_grid(
     return figure, [list(row) for row in grid]
 
 
+def axis_label(name: str, unit: str) -> str:
+    """Name and unit of an axis, the name alone where there is no unit."""
+    return name if unit in ("", "1") else f"{name} [{unit}]"
+
+
 def legend_above(figure: "Figure", *sources: "Axes", columns: int = 4) -> None:
-    """One legend for all axes, outside of them: it hides nothing."""
+    """Put one legend for all axes outside of them, where it hides nothing."""
     from matplotlib.lines import Line2D
 
     pairs = [pair for axes in sources for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
@@ -93,6 +104,6 @@ def legend_above(figure: "Figure", *sources: "Axes", columns: int = 4) -> None:
 
 
 def note_omissions(figure: "Figure", shown: int, available: int, what: str) -> None:
-    """Say so where a figure leaves some out."""
+    """Write in the corner how many of the available items a figure shows, where it leaves some out."""
     if shown < available:
         figure.text(0.995, 0.005, f"{shown} of {available} {what}", ha="right", fontsize=8, color=GREY)

@@ -10,7 +10,18 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.statistics import correlation, ljung_box
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment
-from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, common_channels, note_omissions, plot_unit
+from pneuopt.plotting.canvas import (
+    BLUE,
+    GREY,
+    MAX_PLOT_POINTS,
+    NORMAL_QUANTILE_95,
+    ORANGE,
+    RED,
+    axes_grid,
+    common_channels,
+    note_omissions,
+    plot_unit,
+)
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -21,9 +32,7 @@ if TYPE_CHECKING:
 
 MAX_CORRELATION_LAG = 40  # samples
 MAX_PLOT_CHANNELS = 4
-MAX_PLOT_POINTS = 4000
 MAX_NUMBERED_PARAMETERS = 12  # parameters whose correlations have room for a figure
-NORMAL_QUANTILE_95 = 1.96  # standard deviations, 95 %
 
 
 def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> "Figure":

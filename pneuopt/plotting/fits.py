@@ -11,6 +11,7 @@ from pneuopt.plotting.canvas import (
     BLUE,
     GREY,
     MAX_PLOT_COLUMNS,
+    MAX_PLOT_POINTS,
     ORANGE,
     axes_grid,
     common_channels,
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Pairs = Sequence[tuple[Trajectory, Trajectory]]
-MAX_PLOT_POINTS = 4000  # of a measured line or cloud
 
 
 def plot_fit(result: IdentificationResult, experiments: Sequence[Experiment]) -> "Figure":

@@ -11,8 +11,7 @@ from pneuopt.dynamics.system import Axis, System, names, parameter_vector
 from pneuopt.identification.propagation import propagate_deviations
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment, differentiate
-from pneuopt.plotting.canvas import BLUE, GREY, axes_grid, legend_above
-from pneuopt.plotting.fits import MAX_PLOT_POINTS
+from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_POINTS, NORMAL_QUANTILE_95, axes_grid, legend_above
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NORMAL_QUANTILE_95 = 1.96  # standard deviations, 95 %
 SLOPE_SAMPLES = 20  # of a local derivative
 
 

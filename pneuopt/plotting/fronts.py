@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from pneuopt.plotting.canvas import BLUE, RED, axes_grid, legend_above
+from pneuopt.plotting.canvas import BLUE, RED, axes_grid, axis_label, legend_above
 from pneuopt.quantities.errors import check_names, require
 
 if TYPE_CHECKING:
@@ -38,10 +38,6 @@ def plot_front(table: "pd.DataFrame", requirements: Mapping[str, str]) -> "Figur
     failed = table.loc[table["error"] != "", "limit"].dropna()
     for k, limit in enumerate(failed):
         axes.axvline(float(limit), color=RED, lw=1.0, ls=":", label=None if k else "no design certified")
-    axes.set(xlabel=_axis_label(second, along), ylabel=_axis_label(first, up))
+    axes.set(xlabel=axis_label(second, along), ylabel=axis_label(first, up))
     legend_above(figure, axes)
     return figure
-
-
-def _axis_label(name: str, unit: str) -> str:
-    return name if unit in ("", "1") else f"{name} [{unit}]"

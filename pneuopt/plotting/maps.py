@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.plotting.canvas import BLUE, MAX_PLOT_COLUMNS, RED, axes_grid, note_omissions
+from pneuopt.plotting.canvas import BLUE, MAX_PLOT_COLUMNS, RED, axes_grid, axis_label, note_omissions
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.studies.outcome import INTERRUPTED_CASE
@@ -49,11 +49,11 @@ def plot_map(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[st
     shown = dict(list(metrics.items())[:MAX_PLOT_COLUMNS])
     width = min(10.0, 1.5 + 4.0 * len(shown))
     figure, (row,) = axes_grid(1, len(shown), [3.4], width=width)
-    labels = [_axis_label(name, unit) for name, unit in axes.items()]
+    labels = [axis_label(name, unit) for name, unit in axes.items()]
     draw = _draw_lines if len(axes) == 1 else _draw_map
     for panel, (metric, unit) in zip(row, shown.items(), strict=True):
         draw(panel, table, axes, metric)
-        panel.set_title(_axis_label(metric, unit), fontsize=10)
+        panel.set_title(axis_label(metric, unit), fontsize=10)
         panel.set_xlabel(labels[0])
     if len(axes) == 2:
         row[0].set_ylabel(labels[1])
@@ -113,7 +113,3 @@ def _failure_word(metric: str, error: str) -> str:
     if error:
         return "failed" if error != INTERRUPTED_CASE else error
     return "never" if metric == "SettlingTime" else "none"
-
-
-def _axis_label(name: str, unit: str) -> str:
-    return name if unit in ("", "1") else f"{name} [{unit}]"

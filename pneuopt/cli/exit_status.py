@@ -1,0 +1,9 @@
+"""How a command ends: the exit statuses of `pneuopt`, which scripts may rely on."""
+
+EXIT_SUCCESS = 0
+EXIT_FAILURE = 1
+"""Not converged or not certified; in a study, a case failed or never settles."""
+EXIT_BAD_INPUT = 2
+"""Something that the user gave cannot be used. Typer ends with the same number where an option is wrong."""
+EXIT_INTERRUPTED = 130
+"""Ctrl-C: 128 + the number of SIGINT, as shells have it."""
