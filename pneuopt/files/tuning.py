@@ -1,6 +1,6 @@
 """tuning.toml: the controller, what may be tuned, the steps to follow and what counts; tuned.toml is made from it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
-from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.loop import (
     LOOP_SECTIONS,
@@ -25,9 +25,8 @@ from pneuopt.files.loop import (
 )
 from pneuopt.files.method import read_method
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
-from pneuopt.files.scenarios import read_scenarios, read_validation_scenarios
 from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
-from pneuopt.quantities.errors import check_names, require
+from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_value
@@ -41,6 +40,10 @@ TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
 _TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method")
+SCENARIO_KINDS = ("corners", "samples", "tolerances")
+VALIDATION_PLANTS = 100
+"""Plants of each kind that a design is validated on: more take longer, fewer leave the 95th percentile to chance."""
+_SAMPLE_DEFAULTS = (("count", 20), ("seed", 0))
 _EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
 
@@ -141,6 +144,36 @@ def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") ->
     write_text(path, tomlkit.dumps(document))
 
 
+def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
+    """Read [scenarios]: corners and samples of the plant, and tolerances of the gains, in one mapping.
+
+    Parameters
+    ----------
+    table : mapping
+        The section, by kind: names or patterns to "30 %", or to ["3 kg", "7 kg"]; under samples also count, and seed.
+    where : str
+        The file.
+    parameters : ParameterSet
+        The nominal values.
+
+    Returns
+    -------
+    mapping of str to mapping
+
+    Raises
+    ------
+    InputError
+        The message names file, section and key.
+    """
+    return {name: values for part in _read_kinds(table, where, parameters, None) for name, values in part.items()}
+
+
+def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
+    """Draw plants and tolerances from the boxes of [scenarios], others than `read_scenarios` gives: "fresh 1", ..."""
+    drawn = (values for part in _read_kinds(table, where, parameters, VALIDATION_PLANTS) for values in part.values())
+    return {f"fresh {number}": values for number, values in enumerate(drawn, 1)}
+
+
 def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
     entries = table.get("reference", [])
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
@@ -239,3 +272,46 @@ def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: st
                 found = tuned[f"{section}.{key}"]
                 given = read_parameter(entry, replace(found, free=True), f"{source}: [{section}] {key}")
                 write_parameter(document, f"{section}.{key}", replace(given, value=found.value), given)
+
+
+def _read_kinds(
+    table: Mapping[str, Any], where: str, parameters: ParameterSet, fresh: int | None
+) -> Iterator[Scenarios]:
+    check_names("kind", table, SCENARIO_KINDS, f"{where}: [scenarios]")
+    for kind, given in table.items():
+        spot = f"{where}: [scenarios.{kind}]"
+        require(isinstance(given, dict), f'{spot} must be a section, with "load.mass" = "30 %" in it')
+        yield _read_kind(kind, given, spot, parameters, fresh)
+
+
+def _read_kind(
+    kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet, fresh: int | None
+) -> Scenarios:
+    entries = dict(given)
+    count, seed = (entries.pop(key, default) if kind == "samples" else 0 for key, default in _SAMPLE_DEFAULTS)
+    require(isinstance(count, int) and isinstance(seed, int), f"{where} count and seed are whole numbers")
+    try:
+        spreads = _read_spreads(entries, where, parameters)
+        if kind == "corners" and fresh is None:
+            return corners(parameters, spreads)
+        if kind != "tolerances":
+            return samples(parameters, spreads, fresh or count, seed=seed if fresh is None else seed + 1)
+        pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
+        require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
+        shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
+        return tolerances(parameters, shares, fresh)
+    except InputError as error:
+        raise error if where in str(error) else InputError(f"{where} {error}") from None
+
+
+def _read_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
+    found: dict[str, Spread] = {}
+    for pattern, given in entries.items():
+        if isinstance(given, list):
+            unit = parameters[parameters.match_names(pattern)[0]].unit
+            require(len(given) == 2, f'{where} {pattern}: write a fraction, "30 %", or two values, the least first')
+            low, high = (read_value(end, unit, where=f"{where} {pattern}") for end in given)
+            found[pattern] = (low, high)
+        else:
+            found[pattern] = read_value(given, "1", where=f"{where} {pattern}")
+    return found

@@ -8,9 +8,8 @@ from typer.testing import CliRunner
 
 from pneuopt.cli.app import app
 from pneuopt.evaluation.scenarios import Factor, Scenarios, Spread, corners, samples, tolerances
-from pneuopt.files.scenarios import read_scenarios, read_validation_scenarios
 from pneuopt.files.toml import read_toml
-from pneuopt.files.tuning import read_tuning
+from pneuopt.files.tuning import read_scenarios, read_tuning, read_validation_scenarios
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
