@@ -1,4 +1,4 @@
-"""What the commands share: the files that are wanted, and writing them once everything is computed."""
+"""What the commands share: their input, and the files they write once everything is computed."""
 
 import hashlib
 import math
@@ -53,7 +53,7 @@ class Outputs:
 
 
 def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status: Status | None) -> int:
-    """Write everything, now that everything is computed."""
+    """Write all files and say which; returns the exit status."""
     ended = {"status": {"code": status.code.value, "message": status.message}} if status else {}
     if outputs.json is not None:
         writers = {**writers, outputs.json: partial(write_json, outputs.json, {**ended, **tables})}
@@ -66,7 +66,7 @@ def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status
 
 
 def read_fit_and_tuning(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
-    """The loop, and all its numbers; of the plant nothing is free."""
+    """Read the loop and its parameters; those of the plant are fixed."""
     model, plant = read_drive(fit)
     task = read_tuning(tuning, model.system())
     warn_of_status(fit)
@@ -117,10 +117,10 @@ def write_csv(path: Path, run: Trajectory, columns: Columns) -> None:
 
 
 def stats_and_provenance(result: IdentificationResult | TuningResult) -> dict[str, Any]:
-    """What a JSON file holds beside the tables."""
+    """The statistics and the provenance of a result, which a JSON file holds beside the tables."""
     return {"stats": result.stats, "provenance": result.provenance}
 
 
 def file_hashes(*paths: Path) -> dict[str, str]:
-    """The files' contents, in short."""
+    """The SHA-256 of each file, for provenance."""
     return {f"sha256[{path.name}]": hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}

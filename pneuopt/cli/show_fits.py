@@ -1,4 +1,4 @@
-"""What an identification shows: estimates, what the logs do not tell, the models compared, the agreement."""
+"""What an identification shows: estimates, what is unidentifiable, the models compared, the agreement with logs."""
 
 import math
 from typing import TYPE_CHECKING
@@ -13,7 +13,8 @@ from pneuopt.identification.select_model import ModelSelection
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_FIT_ROWS = 12  # of a table of logs
+MAX_FIT_ROWS = 12
+"""Rows of a table of logs: of more, the median and the worst are easier to read."""
 
 
 def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
@@ -34,7 +35,7 @@ def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
 
 
 def show_verdict(console: Console, verdict: Verdict | None) -> None:
-    """What the logs do not tell, why, and what run would; nothing if nothing is amiss."""
+    """Which parameters are unidentifiable, why, and which run would help; nothing where all are identifiable."""
     for sentence in verdict.sentences if verdict else ():
         console.print(sentence, soft_wrap=True)
 
@@ -99,7 +100,7 @@ def _format_interval(value: float, spread: float, low: float, high: float) -> tu
 
 
 def _format_to_stderr(value: float, spread: float) -> str:
-    """As many digits as two of the standard error say."""
+    """The value with the digits that show two of its standard error."""
     if not 0 < spread < math.inf or value == 0 or not spread < abs(value):
         return format_number(value, 4)
     digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(spread)) + 2

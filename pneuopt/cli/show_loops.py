@@ -24,9 +24,12 @@ from pneuopt.tuning.validation import DesignValidation
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_REFERENCE_COLUMNS = 3  # beside each other
-MAX_CASE_ROWS, MAX_FAILURE_REASONS = 40, 5  # of a study
-MAX_GAIN_COLUMNS = 6  # of a front, on 80 columns
+MAX_REFERENCE_COLUMNS = 3
+"""References beside each other: more do not fit a terminal of 80 columns, so that the worst of all is shown."""
+MAX_CASE_ROWS, MAX_FAILURE_REASONS = 40, 5
+"""Rows and reasons that a study shows: more scroll the verdict away."""
+MAX_GAIN_COLUMNS = 6
+"""Gains that a front shows: more do not fit a terminal of 80 columns."""
 
 
 def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> None:
@@ -42,7 +45,7 @@ def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> N
 
 
 def show_rejection(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet, word: str) -> None:
-    """What stands when a tuning failed or was cut short, and what it had found.
+    """Say that the given gains remain when a tuning failed or was interrupted, and what it had found.
 
     Parameters
     ----------
@@ -100,7 +103,7 @@ def show_metrics(
 
 
 def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[str], loop: ClosedLoop) -> None:
-    """What is left of each limit, and what holds the design back.
+    """The room to each limit, and which limits and bounds are active.
 
     Parameters
     ----------
@@ -126,7 +129,7 @@ def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[
 
 
 def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
-    """What limits that contradict each other could give way to; nothing where there is no such table."""
+    """How far limits that contradict each other must be relaxed; nothing where there is no such table."""
     if table.empty:
         return
     grid = new_table("relaxed alone", "asked", "would do", "by")
@@ -143,10 +146,10 @@ def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
 
 
 def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop) -> None:
-    """A requirement a row: what it comes to on fresh plants, and how many break its limit."""
+    """A requirement a row: its value over new plants, and on how many of them its limit is broken."""
     units = metric_units(loop)
-    console.print(f"validated on {len(found.plants)} fresh plants, the worst of each requirement certified")
-    table = new_table("fresh plants", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
+    console.print(f"validated on {len(found.plants)} new plants, the worst of each requirement certified")
+    table = new_table("new plants", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
     for row in found.summary.reset_index(names="metric").to_dict(orient="records"):
         metric = str(row["metric"])
         figures = [_metric_cell(metric, row[n]) for n in ("median", "p95", "worst", "certified")]
@@ -156,7 +159,7 @@ def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop)
 
 
 def show_dither(console: Console, verdict: DitherVerdict) -> None:
-    """Whether a dither is worth having, and why, a sentence a line."""
+    """Whether a dither is useful, and why, a sentence a line."""
     colours = {Usefulness.USEFUL: "bold green", Usefulness.HARMFUL: "bold red", Usefulness.USELESS: "bold yellow"}
     head, *reasons = str(verdict).splitlines()
     console.print(Text(head, style=colours[verdict.usefulness]), soft_wrap=True)

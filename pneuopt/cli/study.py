@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def run_study(file: Path, outputs: Outputs, quiet: bool) -> int:
-    """What a study.toml asks for, a grid or a front; returns the exit status."""
+    """Compute what a study.toml asks for, a grid or a front; returns the exit status."""
     study = read_study(file)
     outputs.check([file, study.drive, study.tuning])
     run = run_grid if study.pareto is None else run_front
@@ -150,7 +150,7 @@ def _front_requirements(
 
 
 def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
-    """As the tuning has it, its bound included; else a plain one."""
+    """The requirement of the tuning, with its bound; else one without a bound."""
     kind: Any = REQUIREMENTS_BY_KEY[key]
     if kind.__name__ in given:
         return given[kind.__name__]
@@ -178,7 +178,7 @@ def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requi
 
 
 def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
-    """How a study went, and the exit status."""
+    """How many cases are certified, fail or never settle, and the exit status."""
     settling = table[[c for c in table if _metric_name(c) == "SettlingTime"]]
     good = table["error"] == ""
     counts = {
@@ -193,7 +193,7 @@ def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
 
 
 def _worst_of_references(table: "pd.DataFrame", axes: Sequence[Axis], metrics: Sequence[str]) -> "pd.DataFrame":
-    """What is shown of a study: the axes in the units of the file, each metric at its worst."""
+    """The table that is shown: the axes in the units of the file, each metric's worst over the references."""
     seen = table[["error"]].copy()
     for axis in axes:
         seen[axis.name] = axis.in_axis_unit(table[axis.name])
@@ -205,7 +205,7 @@ def _worst_of_references(table: "pd.DataFrame", axes: Sequence[Axis], metrics: S
 
 
 def _metric_name(column: Hashable) -> str:
-    """What "Overshoot[0 to 0.2]" is, as it is called where there are several references."""
+    """The metric's name in a column "Overshoot[0 to 0.2]", as columns are called with several references."""
     return str(column).partition("[")[0]
 
 

@@ -16,18 +16,18 @@ from pneuopt.quantities.status import ProgressCallback, Status
 
 
 def make_console(*, error: bool = False) -> Console:
-    """Standard output, or standard error; nothing is read as markup, for names of logs have brackets."""
+    """Standard output, or standard error; no text is read as markup, because names of columns have brackets."""
     return Console(file=sys.stderr if error else sys.stdout, markup=False, highlight=False, emoji=False)
 
 
 @contextmanager
 def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
-    """A line that shows the latest news and the time; nothing where standard error is no terminal, or if quiet.
+    """Show the latest report and the time in one line; nothing if quiet, or where standard error is no terminal.
 
     Parameters
     ----------
     label : str
-        Shown until there is news.
+        Shown until there is a report.
     quiet : bool
 
     Yields
@@ -46,7 +46,7 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
 
 
 def show_status(console: Console, status: Status) -> None:
-    """How it ended, before anything else."""
+    """How a computation ended."""
     console.print(Text(str(status), style="bold green" if status.converged else "bold red"), soft_wrap=True)
 
 
@@ -57,7 +57,7 @@ def show_output_files(console: Console, paths: Sequence[Any]) -> None:
 
 
 def show_pairs(console: Console, pairs: Mapping[str, object]) -> None:
-    """Names and what they are, a line each."""
+    """Names and their values, a line each."""
     width = max(len(n) for n in pairs)
     for key, value in pairs.items():
         console.print(f"{key:<{width}}  {value}", soft_wrap=True)
@@ -70,7 +70,7 @@ def new_table(*columns: str) -> Table:
         text = column in (
             "parameter",
             "requirement",
-            "fresh plants",
+            "new plants",
             "relaxed alone",
             "model",
             "contains",
@@ -83,7 +83,7 @@ def new_table(*columns: str) -> Table:
             "in log",
             "",
         )
-        whole = column in ("certified", "rejected", "best so far", "fresh plants")
+        whole = column in ("certified", "rejected", "best so far", "new plants")
         table.add_column(column, justify="left" if text else "right", overflow="fold", no_wrap=whole)
     return table
 

@@ -123,9 +123,9 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
 
 
 def _validate_on_new_plants(task: Tuning, parameters: ParameterSet, result: TuningResult) -> DesignValidation | None:
-    """Fresh plants from the boxes of the scenarios; None without scenarios."""
-    fresh = task.validation_scenarios(parameters)
-    if not fresh:
+    """Validate a design on new plants from the boxes of the scenarios; None without scenarios."""
+    plants = task.validation_scenarios(parameters)
+    if not plants:
         return None
     return validate_design(
         task.loop,
@@ -133,12 +133,12 @@ def _validate_on_new_plants(task: Tuning, parameters: ParameterSet, result: Tuni
         result.parameters,
         minimise=task.minimise,
         subject_to=task.subject_to,
-        scenarios=fresh,
+        scenarios=plants,
     )
 
 
 def _show_design(console: "Console", task: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
-    """Gains, metrics, fresh plants, and whether the dither is worth it; the last two as tables."""
+    """Show gains, metrics, the validation on new plants and the dither's verdict; returns the last two as tables."""
     show_gains(console, before, result.parameters)
     show_metrics(console, result.certified, task.loop, before=_initial_metrics(task, before), limits=task.subject_to)
     show_requirements(console, result.requirements, result.active, task.loop)
@@ -163,11 +163,11 @@ def _show_design(console: "Console", task: Tuning, before: ParameterSet, result:
 
 
 def _show_dither_verdict(console: "Console", task: Tuning, parameters: ParameterSet) -> dict[str, Any]:
-    """The dither's verdict; without it the loop may be one that cannot be simulated."""
+    """Show the dither's verdict; returns nothing where the loop cannot be simulated without dither."""
     try:
         verdict = judge_dither(task.loop, task.references, parameters, band=settling_band(task))
     except ConvergenceError as error:
-        console.print(f"the dither is not judged: {error}", soft_wrap=True)
+        console.print(f"no verdict on the dither: {error}", soft_wrap=True)
         return {}
     show_dither(console, verdict)
     return {"dither": {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons)}}

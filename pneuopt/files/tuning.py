@@ -169,9 +169,9 @@ def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSe
 
 
 def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
-    """Draw plants and tolerances from the boxes of [scenarios], others than `read_scenarios` gives: "fresh 1", ..."""
+    """Draw plants and tolerances from the boxes of [scenarios], others than `read_scenarios` gives: "new 1", ..."""
     drawn = (values for part in _read_kinds(table, where, parameters, VALIDATION_PLANTS) for values in part.values())
-    return {f"fresh {number}": values for number, values in enumerate(drawn, 1)}
+    return {f"new {number}": values for number, values in enumerate(drawn, 1)}
 
 
 def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
@@ -275,31 +275,31 @@ def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: st
 
 
 def _read_kinds(
-    table: Mapping[str, Any], where: str, parameters: ParameterSet, fresh: int | None
+    table: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
 ) -> Iterator[Scenarios]:
     check_names("kind", table, SCENARIO_KINDS, f"{where}: [scenarios]")
     for kind, given in table.items():
         spot = f"{where}: [scenarios.{kind}]"
         require(isinstance(given, dict), f'{spot} must be a section, with "load.mass" = "30 %" in it')
-        yield _read_kind(kind, given, spot, parameters, fresh)
+        yield _read_kind(kind, given, spot, parameters, new_count)
 
 
 def _read_kind(
-    kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet, fresh: int | None
+    kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
 ) -> Scenarios:
     entries = dict(given)
     count, seed = (entries.pop(key, default) if kind == "samples" else 0 for key, default in _SAMPLE_DEFAULTS)
     require(isinstance(count, int) and isinstance(seed, int), f"{where} count and seed are whole numbers")
     try:
         spreads = _read_spreads(entries, where, parameters)
-        if kind == "corners" and fresh is None:
+        if kind == "corners" and new_count is None:
             return corners(parameters, spreads)
         if kind != "tolerances":
-            return samples(parameters, spreads, fresh or count, seed=seed if fresh is None else seed + 1)
+            return samples(parameters, spreads, new_count or count, seed=seed if new_count is None else seed + 1)
         pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
         require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
         shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
-        return tolerances(parameters, shares, fresh)
+        return tolerances(parameters, shares, new_count)
     except InputError as error:
         raise error if where in str(error) else InputError(f"{where} {error}") from None
 

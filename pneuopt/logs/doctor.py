@@ -1,4 +1,4 @@
-"""`examine`: what is wrong with a log, from the log alone: units, signs, zero points, sampling, silence."""
+"""`examine`: faults that a log shows without a model: units, signs, zero points, sampling, missing motion."""
 
 import math
 from collections.abc import Iterator
@@ -11,27 +11,27 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE
 
-MEAN_BLOCKS = 20  # of a log, whose means tell motion from noise
-MIN_PRESSURE_RATIO = 0.3  # of the atmosphere: no pneumatic chamber is exhausted further
-MAX_NET_TRAVEL_SHARE = 0.3  # of the path: a log that ends this near to its beginning does no net work on a load
-MIN_WORK_SHARE = -0.2  # of the power's absolute value: what a brake would take, not a drive
-ROD_AREA_RATIOS = (
-    0.7,
-    0.75,
-    0.8,
-    0.85,
-    0.9,
-    0.95,
-    1.0,
-)  # of the rod's side to the other: any real cylinder has one of these
-SPEED_SLOPE_RATIOS = (0.8, 1.25)  # of a speed over its position's slope
-MAX_COMMAND_LAG = 0.1  # [s] within which a drive's speed follows its valve
-WRONG_SIGN_CORRELATIONS = (
-    -0.6,
-    0.3,
-)  # correlations of command and speed: the least below, and the largest below that, is a wrong sign
-RECIPROCATING_TRAVEL_RATIO = 1.9  # times its range that a piston travels only if something commands it to come back
-CLIPPED_SHARE = 0.02  # share of the samples at exactly the largest value
+MEAN_BLOCKS = 20
+"""Blocks of a log whose means separate motion from noise: with more their means are noisy, with fewer hide motion."""
+MIN_PRESSURE_RATIO = 0.3
+"""Lowest pressure over the atmosphere [1] that counts as absolute: no chamber is exhausted further. A lower bound
+lets gauge readings pass, a higher one refuses sensors with an offset."""
+MAX_NET_TRAVEL_SHARE = 0.3
+"""Net travel over path [1] up to which a log counts as one that returns: higher blames lifts, lower skips most logs."""
+MIN_WORK_SHARE = -0.2
+"""Work over the integral of the absolute power [1] below which the sign is wrong: nearer to zero, noise is blamed."""
+ROD_AREA_RATIOS = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0)
+"""Areas of the rod's side over the other's [1]: one of these is near for real cylinders; more hide wrong signs."""
+SPEED_SLOPE_RATIOS = (0.8, 1.25)
+"""Speed over the position's slope [1] that passes: wider lets wrong units pass, narrower refuses filtered speeds."""
+MAX_COMMAND_LAG = 0.1
+"""Time [s] within which a drive's speed follows its valve: longer finds chance correlations, shorter misses drives."""
+WRONG_SIGN_CORRELATIONS = (-0.6, 0.3)
+"""The sign is wrong if the least correlation of command and speed is below the first, the largest below the second."""
+RECIPROCATING_TRAVEL_RATIO = 1.9
+"""Travel over range [1]: at 2 a piston has come back, so it is commanded; a lower bound blames overshoot."""
+CLIPPED_SHARE = 0.02
+"""Share of samples at the largest value [1] that looks clipped: lower blames rest, higher misses short clipping."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def examine(experiment: Experiment) -> tuple[Finding, ...]:
     Parameters
     ----------
     experiment : Experiment
-        Its noise, where given, tells motion from noise.
+        Its noise, where given, separates motion from noise.
 
     Returns
     -------
@@ -87,34 +87,34 @@ def examine(experiment: Experiment) -> tuple[Finding, ...]:
 
 
 def _check_has_motion(experiment: Experiment) -> Iterator[Finding]:
-    """Channels without motion."""
+    """Find channels without motion."""
     for name in ("position", "speed"):
         if name not in experiment.trajectory:
             continue
         y = experiment.trajectory[name]
         y, noise = y[np.isfinite(y)], experiment.noise.get(name, 0.0)
         if y.size and not np.any(np.diff(y)) and (name == "position" or y[0] == 0):
-            yield Finding(name, f"{name!r} is constant: without motion a log tells nothing about friction", True)
+            yield Finding(name, f"{name!r} is constant: without motion friction is unidentifiable", True)
         elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == "position" and _is_white(y))):
             message = f"{name!r} shows noise and no motion: log a run in which the drive moves"
             yield Finding(name, message, True)
 
 
 def _is_motionless(y: Array, noise: float) -> bool:
-    """Whether a channel stays where it is, to its noise, and so do its block means."""
+    """Whether a channel, and its block means, vary by no more than its noise."""
     size = y.size // MEAN_BLOCKS
     means = y[: MEAN_BLOCKS * size].reshape(MEAN_BLOCKS, size).mean(axis=1)
     return float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
 
 
 def _is_white(y: Array) -> bool:
-    """Whether neighbouring samples have nothing to do with each other, which no moving mass's position shows."""
+    """Whether neighbouring samples are uncorrelated, which the position of a moving mass never is."""
     e = y - y.mean()
     return abs(float(e[1:] @ e[:-1])) < 3 / math.sqrt(e.size) * float(e @ e)
 
 
 def _check_position_speed(log: Trajectory) -> Iterator[Finding]:
-    """Position and speed that do not belong together."""
+    """Find a speed that is not the slope of the position, in sign or in unit."""
     if "position" not in log or "speed" not in log:
         return
     slope, speed = _position_slope(log), log["speed"]
@@ -131,7 +131,7 @@ def _check_position_speed(log: Trajectory) -> Iterator[Finding]:
 
 
 def _check_work_sign(log: Trajectory) -> Iterator[Finding]:
-    """Whatever drives has to do work against friction, once the load is back where it was."""
+    """Find a force or pressures of the wrong sign: a drive does net work against friction once the load is back."""
     motion = _motion_speed(log)
     if motion is None:
         return
@@ -152,7 +152,7 @@ def _check_work_sign(log: Trajectory) -> Iterator[Finding]:
 
 
 def _check_command(log: Trajectory) -> Iterator[Finding]:
-    """A piston that does not do what its valve is told."""
+    """Find a piston that runs against its valve's command, or without one."""
     motion = _motion_speed(log)
     if motion is None or "valve_voltage" not in log:
         return
@@ -201,7 +201,7 @@ def _work_share(t: Array, push: Array, motion: Array, *, centred: bool) -> float
 
 
 def _check_pressures(experiment: Experiment) -> Iterator[Finding]:
-    """Zero points: gauge taken for absolute, or the reverse."""
+    """Find wrong zero points: gauge pressures taken for absolute ones, or the reverse."""
     log = experiment.trajectory
     supply = experiment.conditions.get("supply.pressure")
     if supply is None and "supply_pressure" in log:
@@ -219,7 +219,7 @@ def _check_pressures(experiment: Experiment) -> Iterator[Finding]:
 
 
 def _check_sampling(log: Trajectory) -> Iterator[Finding]:
-    """What blurs a log."""
+    """Find jitter, clipping and coarse resolution."""
     steps = np.diff(log.t)
     usual = float(np.median(steps))
     jitter = float(np.median(np.abs(steps - usual))) * 1.4826
@@ -241,7 +241,7 @@ def _check_sampling(log: Trajectory) -> Iterator[Finding]:
 
 
 def _motion_speed(log: Trajectory) -> Array | None:
-    """The speed, as logged or from the position."""
+    """The speed as logged, else the slope of the position; None without either."""
     return log["speed"] if "speed" in log else _position_slope(log) if "position" in log else None
 
 

@@ -116,8 +116,9 @@ def read_log(
     Parameters
     ----------
     path : str or Path
-        The suffix says the format: text (.csv, .txt, .tsv, .dat), with a first row that names the columns, which comma,
-        semicolon or tab keep apart, and with decimal point or comma. An empty cell is a missing sample.
+        Its suffix says the format: text (.csv, .txt, .tsv, .dat), .parquet or .mat (up to version 7). In a text, the
+        first row names the columns; a comma, semicolon or tab separates them; the decimal mark is a point or a comma;
+        an empty cell is a missing sample.
     columns : mapping, optional
         Channel to column, in place of the sidecar's [columns]: "t [ms]", or a mapping with `column`, `unit`,
         `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied, or an encoder's "8192 count/rev"). Without
@@ -139,14 +140,14 @@ def read_log(
     """
     path = Path(path)
     sha256 = hashlib.sha256(_read_bytes(path)).hexdigest()
-    side, said = _read_sidecar(path, sidecar)
-    entries, where = (columns, "columns") if columns is not None else (said.get("columns"), f"{side}: columns")
+    side, sections = _read_sidecar(path, sidecar)
+    entries, where = (columns, "columns") if columns is not None else (sections.get("columns"), f"{side}: columns")
     units = {} if plant is None else _plant_channels(plant)
     channels = {**CHANNELS, **units}
     values = read_channels(read_table(path), entries, where, channels)
     trajectory = Trajectory(values.pop("time"), values)
-    conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in said.get("conditions", {}).items()}
-    noise = _read_noise(said.get("noise", {}), trajectory, f"{side}: noise", channels)
+    conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
+    noise = _read_noise(sections.get("noise", {}), trajectory, f"{side}: noise", channels)
     own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
     return Experiment(trajectory, noise, conditions, path.stem, sha256, own)
 
@@ -198,7 +199,7 @@ def resample(experiment: Experiment, step: float) -> Experiment:
     ----------
     experiment : Experiment
     step : float
-        Of the new grid [s]. Nothing is filtered: a step far above the log's own folds its noise back.
+        Of the new grid [s]. Nothing is filtered, so a step much longer than the log's aliases its noise.
 
     Returns
     -------
@@ -295,15 +296,15 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
         return side, {}
     raw = _read_bytes(side)
     try:
-        said = tomllib.loads(raw.decode())
+        sections = tomllib.loads(raw.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise LogError(f"{side}: not valid TOML: {error}") from None
     other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
-    require(sidecar is not None or "drive" not in said, other, LogError)
-    check_names("key", said, ("columns", "noise", "conditions"), str(side))
-    for key, section in said.items():
+    require(sidecar is not None or "drive" not in sections, other, LogError)
+    check_names("key", sections, ("columns", "noise", "conditions"), str(side))
+    for key, section in sections.items():
         require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
-    return side, said
+    return side, sections
 
 
 def _plant_channels(plant: Plant) -> dict[str, str]:

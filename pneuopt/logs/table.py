@@ -1,4 +1,4 @@
-"""`Table`: a log as its file has it, named columns of numbers, before anybody asks what they mean."""
+"""`Table`: a log as its file has it: named columns of numbers that have no meaning yet."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

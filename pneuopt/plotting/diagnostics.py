@@ -1,4 +1,4 @@
-"""What a fit leaves: residuals and what is still in them; how its estimates hang together."""
+"""Diagnosis of a fit: its residuals, their correlations and distribution; the correlation of its estimates."""
 
 import math
 from collections.abc import Sequence
@@ -30,9 +30,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_CORRELATION_LAG = 40  # samples
+MAX_CORRELATION_LAG = 40
+"""Largest lag of a correlation [samples]: more crowd the axis, fewer hide slow dynamics."""
 MAX_PLOT_CHANNELS = 4
-MAX_NUMBERED_PARAMETERS = 12  # parameters whose correlations have room for a figure
+"""Channels below each other: more cannot be read, fewer leave channels out."""
+MAX_NUMBERED_PARAMETERS = 12
+"""Parameters up to which each cell has room for its number; with more, numbers overlap."""
 
 
 def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> "Figure":
@@ -71,7 +74,7 @@ def plot_residuals(runs: Sequence[Trajectory], experiments: Sequence[Experiment]
 
 
 def plot_correlation(result: IdentificationResult) -> "Figure":
-    """How the estimates hang together: a cell a pair, 1 or -1 where only a combination of both is known.
+    """The correlation of the estimates: a cell a pair, 1 or -1 where only a combination of both is identifiable.
 
     Parameters
     ----------

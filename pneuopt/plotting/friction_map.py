@@ -83,7 +83,7 @@ def has_friction_map(system: System) -> bool:
 
 
 def friction_force(system: System, run: Trajectory, parameters: ParameterSet) -> Array:
-    """What friction takes from the mass along a simulated run, shape (n,) [N].
+    """The friction force on the load along a simulated run, shape (n,) [N].
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def _draw_curve(
 
 
 def _steady_friction(system: System, parameters: ParameterSet, usual: Mapping[str, float], speeds: Array) -> Array:
-    """What speed alone takes from the mass, the bristles bent as far as it bends them.
+    """The friction force at a steady speed, with the bristles at their deflection for that speed.
 
     A bristle's rate is linear in its deflection: two points tell where it is zero.
     """

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
-MAX_NUMBERED_CELLS = 12  # cells along an axis that have room for their number
-LABELS_PER_LONG_AXIS = 6  # of an axis that has more
+MAX_NUMBERED_CELLS = 12
+"""Cells along an axis up to which each has room for its number; with more, numbers overlap."""
+LABELS_PER_LONG_AXIS = 6
+"""Labels along an axis of more cells than that: more overlap, fewer are hard to read between."""
 COLOUR_MAP = "viridis_r"
 
 

@@ -1,8 +1,8 @@
 """Studies: any function of a `ParameterSet` over named cases, in processes, as one tidy table.
 
 A case that fails is a row with its reason, even where its process dies; Ctrl-C keeps what is done. Processes are
-spawned anew on every system: the function travels by pickle, once to each of them, and so does what it holds on to
-(a `System`, a `ClosedLoop`); machine code comes from the cache.
+spawned, not forked, on every system: the function is pickled once for each of them, with all that it refers to (a
+`System`, a `ClosedLoop`); machine code comes from the cache.
 """
 
 import itertools
@@ -124,7 +124,7 @@ def sweep(
 
 
 def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
-    """The values with their labels; more digits only where six do not tell them apart."""
+    """The values with their labels, of six digits, or of 17 where two labels would be equal."""
     require(len(values) > 0, f"axis {name}: no values")
     require(len(set(values)) == len(values), f"axis {name}: a value is there twice; leave one out")
     for value in values:

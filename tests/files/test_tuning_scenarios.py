@@ -92,7 +92,7 @@ def test_the_commands_certify_every_scenario(tmp_path: Path, monkeypatch: pytest
     assert slow > 1.3 * fast
 
 
-def test_fresh_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> None:
+def test_new_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> None:
     path = tmp_path / "tuning.toml"
     text = '[scenarios.samples]\ncount = 3\n"load.mass" = "30 %"\n[scenarios.tolerances]\n"pid.Kp" = "1 %"'
     path.write_text(text, encoding="utf-8")
@@ -106,7 +106,7 @@ def test_fresh_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> Non
     assert not {v["load.mass"] for v in seen.values() if "load.mass" in v} & set(masses)
 
 
-def test_a_tuning_with_scenarios_is_validated_on_fresh_plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tuning_with_scenarios_is_validated_on_new_plants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     drive = '[drive]\nkind = "force"\n[load]\nmass = "5 kg"\n[friction]\nmodel = "viscous"\nviscous = "40 N*s/m"'
     gain = '{ value = "300 N*s/m", lower = "100 N*s/m", upper = "900 N*s/m", free = true }'
@@ -117,7 +117,7 @@ def test_a_tuning_with_scenarios_is_validated_on_fresh_plants(tmp_path: Path, mo
     Path("tuning.toml").write_text(f'{loop}\nhorizon = "0.3 s"\n{asked}\n{scenarios}', encoding="utf-8")
     result = CliRunner().invoke(app, ["tune", "drive.toml", "tuning.toml", "--json", "out.json"])
     assert result.exit_code == 0, result.output
-    assert "validated on 100 fresh plants" in result.output
+    assert "validated on 100 new plants" in result.output
     found = json.loads(Path("out.json").read_text(encoding="utf-8"))
     settling, overshoot = found["validation"]
     worst_corner = max(row["SettlingTime"] for row in found["certified"])
