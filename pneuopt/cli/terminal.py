@@ -46,8 +46,11 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
 
 
 def show_status(console: Console, status: Status) -> None:
-    """How a computation ended."""
-    console.print(Text(str(status), style="bold green" if status.converged else "bold red"), soft_wrap=True)
+    """How a computation ended: the verdict in bold, then its details, a line each."""
+    verdict, *details = str(status).splitlines()
+    console.print(Text(verdict, style="bold green" if status.converged else "bold red"), soft_wrap=True)
+    for detail in details:
+        console.print(detail, soft_wrap=True)
 
 
 def show_output_files(console: Console, paths: Sequence[Any]) -> None:
