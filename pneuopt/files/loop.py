@@ -23,7 +23,7 @@ Made = TypeVar("Made")
 
 LOOP_SECTIONS = ("loop", "sensor", "pid", "dither", "feedforward")
 TUNABLE_SECTIONS = ("pid", "dither", "feedforward")
-"""Those whose values may be free."""
+"""Sections whose values may be free."""
 
 _LOOP_STRUCTURE: Mapping[str, tuple[str, ...]] = {
     "loop": ("measured", "actuated"),
@@ -71,7 +71,7 @@ def read_fixed_value(entries: Mapping[str, Any], key: str, unit: str, where: str
 
 
 def construct_at(make: Callable[[], Made], where: str) -> Made:
-    """Say where, when what was read does not fit together."""
+    """Call `make`; an `InputError` that it raises gets the place in the file before its message."""
     try:
         return make()
     except InputError as error:

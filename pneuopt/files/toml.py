@@ -1,4 +1,4 @@
-"""What every TOML file of ours has: a value, or a table where it may be free; comments kept.
+"""What all TOML files share: a value, or a table where it may be free; the user's comments are kept.
 
 A value is "32 mm", or { value = "40 N", lower = "5 N", upper = "90 N", free = true }.
 """
@@ -52,7 +52,7 @@ def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
 
 @dataclass(frozen=True)
 class FileLocations:
-    """Where things stand in a TOML file, for messages; printed, it is the file's name.
+    """The lines of sections and keys in a TOML file, for messages; as text it is the file's name.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
 
 
 def toml_table(entries: Mapping[str, Any]) -> Table:
-    """A section."""
+    """A section made from a mapping."""
     table = tomlkit.table()
     table.update(entries)
     return table
@@ -174,7 +174,7 @@ def _field_differs(field: str, found: Parameter, given: Parameter) -> bool:
 
 
 def _format_value(value: float, parameter: Parameter) -> str:
-    """Nine digits, or all of them where rounding would cross a bound."""
+    """Round to nine digits, unless the rounded value would cross a bound."""
     text = write_value(value, parameter.unit, 9)
     inside = parameter.lower <= read_value(text, parameter.unit) <= parameter.upper
     return text if inside else write_value(value, parameter.unit, 17)

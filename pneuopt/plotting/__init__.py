@@ -1,6 +1,8 @@
 """Results as matplotlib figures: a fit beside its logs, its residuals, friction, step responses, a Bode plot, studies.
 
-No window is opened and no global state is touched: each function returns a `Figure`, `save_figure` writes it.
+No window is opened and no global state is touched: each function returns a `Figure`, `save_figure` writes it. This is
+the only room that imports matplotlib; `cli` may import it. A newcomer adds a figure as a function ``result ->
+Figure`` in a file of its subject, with what `canvas` shares.
 """
 
 from pneuopt.plotting.bode import plot_bode

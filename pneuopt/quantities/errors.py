@@ -1,4 +1,4 @@
-"""One tree of errors: what the user can mend (`InputError`), and what a solver could not do (`ConvergenceError`)."""
+"""One tree of errors: `InputError` for what the user can mend, `ConvergenceError` for what a solver could not do."""
 
 import difflib
 from collections.abc import Iterable
@@ -36,7 +36,7 @@ class ModelError(InputError):
 
 
 class HardwareError(InputError):
-    """A number that no hardware has; the message says what would be possible.
+    """A value that no hardware has; the message says which values are possible.
 
     Attributes
     ----------

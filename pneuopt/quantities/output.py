@@ -31,7 +31,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole or not at all: into a neighbour first, which then takes its place.
+    """Write a file whole or not at all: a temporary file beside it is written first, and then renamed.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
 
 
 def plain_value(value: Any) -> Any:
-    """What TOML and JSON can hold: NumPy's scalars as Python's, nothing for None, text for what is neither.
+    """Convert to what TOML and JSON can hold: NumPy's scalars to Python's, other objects to text; None is left out.
 
     Examples
     --------

@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def provenance(*options: object) -> dict[str, str]:
-    """Versions of what computed, and the options that were used.
+    """The versions of Python and of the packages that computed a result, and the options that were used.
 
     Parameters
     ----------
