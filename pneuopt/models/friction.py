@@ -160,7 +160,7 @@ class LuGre:
 
     .. math:: \dot z = v - \sigma_0 |v| z / g(v), \qquad F = \sigma_0 z + \sigma_1 e^{-(v/v_d)^2} \dot z + \sigma_2 v
 
-    The damping fades with speed (v_d), which keeps the model passive for any viscous friction (PHYSICS section 3).
+    The damping fades with speed (v_d), which keeps the model passive for any viscous friction.
     """
 
     excitation: ClassVar[Excitation] = BRISTLE_EXCITATION

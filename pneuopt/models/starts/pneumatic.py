@@ -2,8 +2,8 @@
 
 What is not logged (a pressure, the spool, a temperature) is integrated along the logged motion. A logged pressure's
 rate is linear in the valve's conductance and in conductance times leak; where no pressure is logged, the valve is
-searched with which the forces balance best. Friction is then the same regression as for a known force (NUMERICS
-section 3, steps 1 and 2).
+searched with which the forces balance best. Friction is then the same regression as for a known force (see
+`starts.friction`).
 """
 
 import functools
