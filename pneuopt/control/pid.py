@@ -24,8 +24,8 @@ class PID:
     ``w = v + added`` (feedforward and dither) and ``u = min(max(w, lower), upper)``: a hard clip, because that is what
     runs. The integral is kept in the unit of the command, so that ``Ki = 0`` needs no special case.
 
-    A sampled controller computes once a sample, h = `sample_time`, and holds u until the next one (backward Euler,
-    PHYSICS section 5); the suffix _ marks the previous sample::
+    A sampled controller computes once a sample, h = `sample_time`, and holds u until the next one (backward Euler:
+    s becomes ``(1 - 1/z)/h``); the suffix _ marks the previous sample::
 
         D = Tf/(Tf + h) D_ + Kd/(Tf + h) ((c r - y) - (c r - y)_)
         I = I_ + Ki h (r - y)

@@ -18,10 +18,12 @@ class EnergyUse(AtMost):
     """Energy drawn from the plant's source, from the step to the end of the horizon [J].
 
     Which power counts is what the plant's meter shows. Of a pneumatic drive it is the air power: the work that the air
-    drawn could do in an isothermal expansion from supply to ambient pressure, ``m' R T ln(p_s/p_o)``, or for its volume
-    V at the supply's state ``p_s V ln(p_s/p_o)``, both pressures absolute; a compressor takes more by its own losses.
-    Of an axis pushed by a force it is the motor's mechanical power where the motor drives, ``max(F v, 0)``: what comes
-    back in braking goes into the brake resistor, as drives without recovery do, and earns nothing.
+    drawn could do in an isothermal expansion from supply to ambient pressure. An ideal gas of mass m with p V = m R T
+    does ``integral of p dV = m R T ln(p_s/p_o)`` on that way, which is p_s V ln(p_s/p_o) for its volume V at the
+    supply's state, both pressures absolute; at ambient temperature it is the exergy of the compressed air. A compressor
+    takes more by its own losses. Of an axis pushed by a force it is the motor's mechanical power where the motor
+    drives, ``max(F v, 0)``: braking power goes into the brake resistor and counts nothing, as in drives that cannot
+    feed back.
 
     Parameters
     ----------
@@ -30,7 +32,8 @@ class EnergyUse(AtMost):
 
     References
     ----------
-    Cai, Kawashima, Kagawa: Power assessment of flowing compressed air, J. Fluids Eng. 128 (2006) 402-405.
+    M. J. Moran, H. N. Shapiro: Fundamentals of Engineering Thermodynamics, Wiley: work of an ideal gas at constant
+    temperature, and flow exergy.
     """
 
     metric = Metric("EnergyUse", "J", Source.METER, slope=energy_rows, channels=(POWER_CHANNEL,))

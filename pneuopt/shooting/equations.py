@@ -105,9 +105,10 @@ class NormalEquations:
     def covariance(self, keep: Mask, *, noisy_gaps: bool = False) -> Array | None:
         """Covariance of the parameters (own units, unit noise): the sandwich over true data noise only.
 
-        True gaps carry no noise, so the plain inverse is too wide (NUMERICS section 3, step 7); it is right for gaps
-        that stand for noise of the states. Rows of parameters that are not kept are NaN; None where the data do not
-        determine the kept ones.
+        True gaps carry no noise, so the plain inverse is too wide; with the sandwich (H. White, Econometrica 50 (1982)
+        1-25) 95 % intervals hold the truth 95 times in 100 (problems/identify/interval_coverage.py). The plain inverse
+        is right for gaps that stand for noise of the states. Rows of parameters that are not kept are NaN; None where
+        the data do not determine the kept ones.
         """
         reduced = self.arrow.eliminate(0.0)
         if reduced is None or self.unidentifiable_parameters(reduced, keep).size:

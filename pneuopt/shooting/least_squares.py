@@ -1,7 +1,8 @@
 """Soft-continuity multiple shooting: the gaps between segments are weighted residuals, solved by Levenberg-Marquardt.
 
 One nonlinear least squares in all nodes and parameters; each step is a banded Cholesky with an arrow, linear in the
-record's length. The gaps are tightened in stages, so that a bad start is never integrated through (NUMERICS section 3).
+record's length. The gaps are tightened in stages, so that a bad start is never integrated over the whole record,
+as single shooting does, which fails there (problems/speed/benchmark_identification.py).
 """
 
 import math

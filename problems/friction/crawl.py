@@ -159,7 +159,7 @@ def on_the_smooth_model(v: float) -> po.Trajectory:
 
 
 def screen() -> list[Claim]:
-    """Between which speeds the Stribeck curve falls faster than viscous friction rises (PHYSICS section 3)."""
+    """The speeds between which the Stribeck curve falls faster than viscous friction rises: crawl needs one of them."""
     _, p = lagging(po.Stribeck())
     F_c, F_s, v_s, viscous = (p.value(f"friction.{n}") for n in ("coulomb", "static", "stribeck_velocity", "viscous"))
 

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 STATIC, SPEED = 40.0, 0.04  # [N], [m/s]
 PAPERS, AT = 1e-3, 1000.0  # [V], [rad/s]
-TABLE = {  # of PHYSICS section 4: |F| [N/V], |v| [mm/s/V], |y| [um/V], volts for 40 N, volts for 40 mm/s
+# Worked out apart from this package, by rad/s: |F| [N/V], |v| [mm/s/V], |y| [um/V], volts for 40 N, volts for 40 mm/s.
+TABLE = {
     62.8: (12.1, 16.0, 250.0, 3.3, 2.5),
     125.7: (6.1, 4.0, 32.0, 6.6, 10.0),
     628.0: (1.21, 0.16, 0.26, 33.0, 248.0),

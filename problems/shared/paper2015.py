@@ -30,7 +30,7 @@ PRINTED_COEFFICIENTS = (1270.12, 17.5, 86.34)
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Rest at mid stroke, in the paper's symbols; the default is PHYSICS' set R25-eq16, which gives eq. (16).
+    """Rest at mid stroke, in the paper's symbols; the default is the set that gives the paper's eq. (16).
 
     Parameters
     ----------

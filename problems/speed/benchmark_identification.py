@@ -176,7 +176,7 @@ def rival(limit: float) -> dict[str, float]:
 
 
 def _rate(t: float, x: Array, u: Array, p: list[float]) -> list[float]:
-    """B32 by hand (NUMERICS section 3): spool, position, speed, pressures; p in the order of `WANTED`."""
+    """The equations of B32 (`catalog.b32`) by hand: spool, position, speed, pressures; p in the order of `WANTED`."""
     coulomb, static, stribeck, viscous, conductance, leak = p
     spool, s, v, a, b = x.tolist()
     area_a, area_b = math.pi / 4 * 0.032**2, math.pi / 4 * (0.032**2 - 0.012**2)

@@ -16,7 +16,7 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 
 GAINS = {"pid.Kp": 4.5, "pid.Ki": 24.6, "pid.Kd": 0.2, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.upper": 5.0}
-TABLE = {  # PHYSICS section 4, per volt: |F| [N], |v| [m/s], |y| [m]
+TABLE = {  # of `r25` linearised, per volt: |F| [N], |v| [m/s], |y| [m]; as problems/paper/paper_dither.py prints them
     62.8: (12.1, 1.6e-2, 2.5e-4),
     125.7: (6.1, 4.0e-3, 3.2e-5),
     628.0: (1.21, 1.6e-4, 2.6e-7),

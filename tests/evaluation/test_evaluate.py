@@ -139,7 +139,7 @@ def test_bad_input_is_named() -> None:
 
 
 def test_hunting_is_measured_and_a_ringing_that_dies_out_is_not() -> None:
-    """The paper's gains on its drive at 10 mm/s under LuGre friction: PHYSICS section 3."""
+    """The paper's gains hunt on its drive under LuGre friction at 10 mm/s, and settle at 50 mm/s."""
     drive, values = r25(lugre=True)
     loop = ClosedLoop(drive.system(), PID(), measured="speed")
     p = (loop.parameters | values).with_values({"pid.Kp": 4.5, "pid.Ki": 24.6, "pid.Kd": 0.2, "pid.Tf": 0.01})

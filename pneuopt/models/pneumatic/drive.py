@@ -244,8 +244,8 @@ class PneumaticDrive:
     def _meter_function(self) -> ca.Function:
         """``(t, x, u, p)`` to the air that both edges draw from the supply [kg/s], the spool's position, and air power.
 
-        Air power [W] is what that air could do in an isothermal expansion to ambient pressure, ``m' R T ln(p_s/p_o)``:
-        Cai, Kawashima, Kagawa: Power assessment of flowing compressed air, J. Fluids Eng. 128 (2006) 402-405.
+        Air power [W] is what that air could do in an isothermal expansion to ambient pressure: the integral of p dV of
+        an ideal gas, p V = m R T, per unit time, ``m' R T ln(p_s/p_o)``; at ambient temperature its flow exergy.
         """
         x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
         through = self._edge_flows(x, u, p)
