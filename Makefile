@@ -7,12 +7,15 @@ BIN := .venv/bin
 endif
 PY := $(BIN)/python
 
-.PHONY: demo test test-slow lint format clean
+.PHONY: demo test coverage test-slow lint format clean
 
 demo: .venv/installed
 	$(PY) problems/demo/rig_demo.py --out out
 
 test: .venv/installed lint
+	$(PY) -m pytest -n 2
+
+coverage: .venv/installed
 	$(PY) -m pytest -n 2 --cov --cov-report=term
 
 test-slow: .venv/installed

@@ -1,9 +1,13 @@
 """What several tests share."""
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import casadi as ca
+import hypothesis
 import numpy as np
 import pytest
 
@@ -17,6 +21,11 @@ from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.linearised import LinearisedProblem
+
+# a run of CI fails for what was changed, not for the examples that chance drew; at a desk each run draws new ones
+hypothesis.settings.register_profile("ci", derandomize=True)
+hypothesis.settings.register_profile("desk")
+hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "desk")
 
 CACHES = (
     compiler.compile_library,
@@ -63,6 +72,23 @@ def forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
     _forget()
     yield _forget
     _forget()
+
+
+@pytest.fixture
+def count_calls(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[int]]:
+    """Patch a module's `compile_function`; the list grows by a 1 at each call of what it makes."""
+
+    def patch(module: ModuleType) -> list[int]:
+        calls, compiled = list[int](), module.compile_function
+
+        def counted(function: ca.Function) -> Callable[..., Any]:
+            call = compiled(function)
+            return lambda *inputs: calls.append(1) or call(*inputs)
+
+        monkeypatch.setattr(module, "compile_function", counted)
+        return calls
+
+    return patch
 
 
 @pytest.fixture(scope="session")

@@ -29,8 +29,9 @@ def moved(model: FrictionModel, seed: int, n: int = 1500, values: Mapping[str, f
     v = np.sign(np.sin(np.arange(n) / 40)) * np.exp(rng.uniform(np.log(1e-3), np.log(0.3), n))
     drive = MotionDrive(model, chamber=False)
     truth = drive.parameters.with_values(values or {})
-    p = [truth.value(name) for name in drive.system().parameters]
-    force = np.array([float(drive.system().ode(0, [], [speed], p)[1]) for speed in v])
+    system = drive.system()
+    p = [truth.value(name) for name in system.parameters]
+    force = np.array([float(system.ode(0, [], [speed], p)[1]) for speed in v])
     t = np.arange(n) * 1e-3
     return Experiment(Trajectory(t, {"speed": v, "force": force + 0.5 * rng.standard_normal(n)}), {"force": 0.5})
 
@@ -132,6 +133,7 @@ def fast_channels(run: Experiment) -> dict[str, Array]:
     rng = np.random.default_rng(0)
     v = np.sign(run.trajectory["speed"]) * rng.uniform(0.3, 0.9, len(run.trajectory.t))
     drive = MotionDrive(STATIC["coulomb"], chamber=False)
-    p = [drive.parameters.value(name) for name in drive.system().parameters]
-    force = np.array([float(drive.system().ode(0, [], [speed], p)[1]) for speed in v])
+    system = drive.system()
+    p = [drive.parameters.value(name) for name in system.parameters]
+    force = np.array([float(system.ode(0, [], [speed], p)[1]) for speed in v])
     return {"speed": v, "force": force + 0.5 * rng.standard_normal(v.size)}

@@ -1,6 +1,5 @@
 """What no gains can mend is refused before anything is searched for, with the number and the remedy."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -56,10 +55,9 @@ def refusal(
     minimise: Requirement | None = None,
 ) -> str:
     loop, given = model
-    begun = time.perf_counter()
-    with pytest.raises(InputError) as error:
-        tune(loop, step, given, minimise=minimise or SettlingTime(), subject_to=limits, method=BRIEF)
-    assert time.perf_counter() - begun < 3.0
+    asked = minimise or SettlingTime()
+    with pytest.raises(InputError) as error:  # before the search: it says nothing
+        tune(loop, step, given, minimise=asked, subject_to=limits, method=BRIEF, progress=pytest.fail)
     return str(error.value)
 
 

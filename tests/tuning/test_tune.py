@@ -148,7 +148,7 @@ def test_impossible_limits_keep_the_given_gains() -> None:
             parameters,
             minimise=SettlingTime(0.001, max=0.05),
             subject_to=LIMITS,
-            method=TwoPhase(starts=1),
+            method=TwoPhase((20, 25), starts=1),
         )
     result = caught.value.solution
     assert result.status.code in {Code.INFEASIBLE, Code.ITERATION_LIMIT, Code.NOT_CONVERGED}
