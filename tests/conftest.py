@@ -83,7 +83,12 @@ def count_calls(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[
 
         def counted(function: ca.Function) -> Callable[..., Any]:
             call = compiled(function)
-            return lambda *inputs: calls.append(1) or call(*inputs)
+
+            def run(*inputs: Any) -> Any:
+                calls.append(1)
+                return call(*inputs)
+
+            return run
 
         monkeypatch.setattr(module, "compile_function", counted)
         return calls
