@@ -1,1 +1,6 @@
-"""Plants and their parts, symbolic in CasADi (SX); they know nothing of any optimisation problem."""
+"""Plants and their parts, symbolic in CasADi (SX); they know nothing of any optimisation problem.
+
+Friction laws, loads, drives, transfer functions, sensors, cited numbers, and how each plant starts from a log. `files`,
+`plotting`, `studies` and `cli` may import it; identification, tuning, shooting, evaluation and dynamics never do: they
+read what a plant declares. A newcomer adds a friction law, with its row in `friction_laws`, or a plant (`drive_kinds`).
+"""

@@ -1,1 +1,5 @@
-"""How `tune` searches: the exact two-phase problem for linear loops, compiled screening for the others."""
+"""From requirements to gains: `tune`, its methods, feasibility, relaxation, Pareto fronts, validation.
+
+What a search finds is certified by `evaluation` before it is handed out. `studies`, `files`, `plotting` and `cli` may
+import it; it never imports `models` or `identification`. A newcomer adds a method of search.
+"""

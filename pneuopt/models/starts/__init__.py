@@ -1,1 +1,4 @@
-"""How each plant starts from a log."""
+"""How each plant starts from a log: parameters and states over time, before any simulation.
+
+`System.starts` calls these; a fit begins at the best of them. A newcomer who adds a plant writes how it starts here.
+"""
