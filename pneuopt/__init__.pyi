@@ -1,10 +1,11 @@
-"""Types of the names that `__init__.py` loads lazily."""
+"""The public names and their homes, from which `__init__.py` loads them when they are first used."""
 
-from pneuopt.control.averaging import average_dither, mean_start, ripple
-from pneuopt.control.bumpless import bumpless_transfer
-from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.feedforward import Feedforward
-from pneuopt.control.forms import (
+from . import plotting
+from .control.averaging import average_dither, mean_start, ripple
+from .control.bumpless import bumpless_transfer
+from .control.dither import Dither, Waveform
+from .control.feedforward import Feedforward
+from .control.forms import (
     Form,
     ParallelForm,
     SeriesForm,
@@ -15,22 +16,22 @@ from pneuopt.control.forms import (
     to_series,
     to_standard,
 )
-from pneuopt.control.linear_loop import linear_plant, open_loop
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
-from pneuopt.control.reference import Step
-from pneuopt.control.sensor import Encoder, SensorLag
-from pneuopt.dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
-from pneuopt.dynamics.stick_slip import EventKind
-from pneuopt.dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
-from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
-from pneuopt.evaluation.energy import EnergyUse
-from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
-from pneuopt.evaluation.margins import Margins, frequency_response, margins
-from pneuopt.evaluation.metrics import BandCentre, step_metrics
-from pneuopt.evaluation.record import Recording, record
-from pneuopt.evaluation.requirements import (
+from .control.linear_loop import linear_plant, open_loop
+from .control.loop import ClosedLoop
+from .control.pid import PID
+from .control.reference import Step
+from .control.sensor import Encoder, SensorLag
+from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
+from .dynamics.stick_slip import EventKind
+from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
+from .evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
+from .evaluation.energy import EnergyUse
+from .evaluation.evaluate import evaluate, respond
+from .evaluation.limit_cycle import LimitCycle, find_limit_cycle
+from .evaluation.margins import Margins, frequency_response, margins
+from .evaluation.metrics import BandCentre, step_metrics
+from .evaluation.record import Recording, record
+from .evaluation.requirements import (
     IAE,
     ISE,
     ITAE,
@@ -49,21 +50,22 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.evaluation.rig import Actuator, Rig, Sensor
-from pneuopt.evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
-from pneuopt.files.drive import read_drive, write_fit
-from pneuopt.files.tuning import read_tuning, write_tuned
-from pneuopt.identification.compare_logs import LogComparison, compare_logs
-from pneuopt.identification.identifiability import identifiability
-from pneuopt.identification.identify import identify, predict, validate
-from pneuopt.identification.losses import Huber, SoftL1
-from pneuopt.identification.profiles import Profile, profile
-from pneuopt.identification.propagation import PropagatedValue, propagate_error
-from pneuopt.identification.result import IdentificationResult, Verdict
-from pneuopt.identification.select_model import ModelSelection, select_model
-from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
-from pneuopt.models.drive import ForceDrive, MotionDrive
-from pneuopt.models.friction import (
+from .evaluation.rig import Actuator, Rig, Sensor
+from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
+from .files.drive import read_drive, write_fit
+from .files.tuning import read_tuning, write_tuned
+from .identification.compare_logs import LogComparison, compare_logs
+from .identification.identifiability import identifiability
+from .identification.identify import identify, predict, validate
+from .identification.losses import Huber, SoftL1
+from .identification.profiles import Profile, profile
+from .identification.propagation import PropagatedValue, propagate_error
+from .identification.result import IdentificationResult, Verdict
+from .identification.select_model import ModelSelection, select_model
+from .logs.experiments import Experiment, differentiate, read_log, resample, split
+from .models import catalog
+from .models.drive import ForceDrive, MotionDrive
+from .models.friction import (
     Asymmetric,
     Coulomb,
     LuGre,
@@ -71,19 +73,19 @@ from pneuopt.models.friction import (
     Stribeck,
     Viscous,
 )
-from pneuopt.models.friction_laws import friction_ladder
-from pneuopt.models.karnopp import Karnopp
-from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
-from pneuopt.models.load import Load
-from pneuopt.models.load_dependent import LoadDependent
-from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
-from pneuopt.models.pneumatic.cylinder import Cylinder
-from pneuopt.models.pneumatic.drive import PneumaticDrive
-from pneuopt.models.pneumatic.gas import IsentropicNozzle, Iso6358
-from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
-from pneuopt.models.rotary import RotaryDrive
-from pneuopt.models.sensing import coarse_delay, with_sensors
-from pneuopt.plotting import (
+from .models.friction_laws import friction_ladder
+from .models.karnopp import Karnopp
+from .models.linear import FirstOrder, Integrator, SecondOrder
+from .models.load import Load
+from .models.load_dependent import LoadDependent
+from .models.pneumatic.chamber import Polytropic, Thermal
+from .models.pneumatic.cylinder import Cylinder
+from .models.pneumatic.drive import PneumaticDrive
+from .models.pneumatic.gas import IsentropicNozzle, Iso6358
+from .models.pneumatic.valve import ProportionalValve, Spool
+from .models.rotary import RotaryDrive
+from .models.sensing import coarse_delay, with_sensors
+from .plotting import (
     plot_bode,
     plot_correlation,
     plot_fit,
@@ -95,19 +97,19 @@ from pneuopt.plotting import (
     plot_steps,
     save_figure,
 )
-from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
-from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.status import Code, Status
-from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.full_space import FullSpace
-from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.studies.sweep import grid, sweep
-from pneuopt.tuning.condensed import Condensed
-from pneuopt.tuning.pareto import pareto_front
-from pneuopt.tuning.screening import Screening
-from pneuopt.tuning.tune import TuningResult, tune
-from pneuopt.tuning.two_phase import TwoPhase
-from pneuopt.tuning.validation import DesignValidation, validate_design
+from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
+from .quantities.parameters import Parameter, ParameterSet, Quantity
+from .quantities.status import Code, Status
+from .quantities.trajectories import Trajectory
+from .shooting.full_space import FullSpace
+from .shooting.least_squares import LeastSquares
+from .studies.sweep import grid, sweep
+from .tuning.condensed import Condensed
+from .tuning.pareto import pareto_front
+from .tuning.screening import Screening
+from .tuning.tune import TuningResult, tune
+from .tuning.two_phase import TwoPhase
+from .tuning.validation import DesignValidation, validate_design
 
 __version__: str
 __all__ = [
@@ -208,6 +210,7 @@ __all__ = [
     "apply_scenario",
     "average_dither",
     "bumpless_transfer",
+    "catalog",
     "coarse_delay",
     "compare_logs",
     "contacts",
@@ -239,6 +242,7 @@ __all__ = [
     "plot_prediction",
     "plot_residuals",
     "plot_steps",
+    "plotting",
     "predict",
     "profile",
     "propagate_error",

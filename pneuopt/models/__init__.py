@@ -4,3 +4,7 @@ Friction laws, loads, drives, transfer functions, sensors, cited numbers, and ho
 `plotting`, `studies` and `cli` may import it; identification, tuning, shooting, evaluation and dynamics never do: they
 read what a plant declares. A newcomer adds a friction law, with its row in `friction_laws`, or a plant (`drive_kinds`).
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["catalog"])
