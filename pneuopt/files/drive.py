@@ -83,7 +83,7 @@ def read_status(path: str | Path) -> Status | None:
     codes = [code.value for code in Code]
     require(isinstance(said, dict), f"{path}: status must be a section, [status]")
     check_names("status", [str(said.get("code"))], codes, f"{path}: [status] code")
-    return Status(Code(said["code"]), str(said.get("message", "")))
+    return Status(Code(said["code"]), tuple(filter(None, [str(said.get("message", ""))])))
 
 
 def write_fit(path: str | Path, source: str | Path, result: "IdentificationResult") -> None:

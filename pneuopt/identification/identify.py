@@ -51,7 +51,10 @@ from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_square
 if TYPE_CHECKING:
     import pandas as pd
 
-NOTHING_IDENTIFIABLE = "the logs tell none of the free parameters by itself; fix some, or log runs that tell them apart"
+NOTHING_IDENTIFIABLE = Status(
+    Code.NOT_CONVERGED,
+    ("the logs identify none of the free parameters by itself", "fix some, or log runs that separate them"),
+)
 
 
 def identify(
@@ -106,7 +109,7 @@ def identify(
     held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
     result = review_fit(held, *_result(held, fit, label, loss))
     if doubted:
-        result = replace(result, status=replace(result.status, message="; ".join((result.status.message, *doubted))))
+        result = replace(result, status=result.status.with_remedies(*doubted))
     if throw and not result.status.converged:
         raise ConvergenceError(f"identification {result.status}", result)
     return result
@@ -197,7 +200,7 @@ def _result(
         covariance = covariance + fit.prior_covariance
         leaning = rests_on_prior(covariance, fit.prior_covariance)
     untold = tuple(n for n, leans in zip(free, leaning, strict=True) if leans or n in problem.held)
-    status = Status(Code.NOT_CONVERGED, NOTHING_IDENTIFIABLE) if free and set(untold) == set(free) else fit.status
+    status = NOTHING_IDENTIFIABLE if free and set(untold) == set(free) else fit.status
     result = IdentificationResult(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, status),

@@ -163,8 +163,8 @@ def _summarise(problem: EstimationProblem, fits: Sequence[Fit], loss: Loss | Non
     return replace(fit, stats={**fit.stats, **effort, "refits": len(fits) - 1.0}, status=status)
 
 
-def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> str:
-    """In words: outliers, and what the model leaves beyond the noise in the other samples."""
+def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> tuple[str, ...]:
+    """Sentences on the outliers, and on what the model leaves beyond the noise in the other samples."""
     worst, level, beyond, count = "", 1.0, 0, 0
     for e, run in zip(problem.experiments, fit.trajectories, strict=True):
         residuals = _residuals_in_noise(problem, e, run)
@@ -174,14 +174,12 @@ def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> str:
         if scales.max() > level:
             level, channel = float(scales.max()), outputs_in_log(problem.system, e)[int(np.argmax(scales))]
             worst = f"{channel} of {e.name}"
-    message = (
-        f"{fits - 1} refits, {beyond} of {count} samples are outliers, beyond {OUTLIER_THRESHOLD:g} standard deviations"
-    )
+    outliers = f"{beyond} of {count} samples are outliers, beyond {OUTLIER_THRESHOLD:g} standard deviations"
+    verdict = f"{fits - 1} refits, {outliers}"
     if level**2 <= MAX_CHI_SQUARE_RATIO:
-        return message
-    return (
-        f"{message}; the model does not explain the log to its noise: residuals are {level:.2g} times that of {worst}"
-    )
+        return (verdict,)
+    misfit = f"residuals are {level:.2g} times that of {worst}"
+    return verdict, f"the model does not explain the log to its noise: {misfit}"
 
 
 def _refit(

@@ -80,11 +80,12 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
     """The status of the best fit of several starts."""
     status = fit.status
     if interrupted and (starts > 1 or status.code is not Code.INTERRUPTED):
-        status = Status(Code.INTERRUPTED, f"the best of {starts} starts so far; run again for an answer")
+        status = Status(Code.INTERRUPTED, (f"the best of {starts} starts so far", "run again for an answer"))
     elif not status.converged and starts > 1:
-        status = Status(status.code, f"none of {starts} starts will do; in the best, {status.message}")
+        in_the_best = (f"in the best, {status.verdict}", *status.sentences[1:])
+        status = Status(status.code, (f"none of {starts} starts will do", *in_the_best))
     if len(problem.experiments) > 1:
-        status = Status(status.code, f"{status.message}; compare_logs tells whether the logs are of one drive")
+        status = status.with_remedies("compare_logs shows whether the logs are of one drive")
     return status
 
 

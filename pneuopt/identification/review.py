@@ -87,12 +87,7 @@ def review_fit(
         verdict = add_unidentifiable(verdict, untold, seen, _names_at_given_value(problem))
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
-    message = (
-        f"{result.status.message}; the logs do not tell {join_names(verdict.unidentifiable)}"
-        if verdict.unidentifiable
-        else ""
-    )
-    status = Status(result.status.code, message) if message else result.status
+    status = result.status.with_details(_name_unidentifiable(verdict))
     return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
 
 
@@ -175,14 +170,18 @@ def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
 
 def _locate_failure(problem: EstimationProblem, start: Start, status: Status, verdict: Verdict) -> Status:
     """A failure with the place where it is worst."""
-    parts = [status.message, _worst_residual(problem, start), _worst_gap(problem, start)]
+    status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
     if verdict.unidentifiable:
-        parts.append(
-            f"the logs do not tell {join_names(verdict.unidentifiable)}: "
-            "fix what is not told, or log a run that tells it"
+        status = status.with_remedies(
+            _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
         )
-    parts.append(_smoothing_advice(problem))
-    return Status(status.code, "; ".join(part for part in parts if part))
+    return status.with_remedies(_smoothing_advice(problem))
+
+
+def _name_unidentifiable(verdict: Verdict) -> str:
+    """A sentence on what the logs do not identify; empty if they identify all."""
+    names = verdict.unidentifiable
+    return f"the logs do not identify {join_names(names)}" if names else ""
 
 
 def _smoothing_advice(problem: EstimationProblem) -> str:

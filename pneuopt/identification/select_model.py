@@ -97,7 +97,7 @@ def select_model(
     fits = {n: identify(s, experiments, given[n], method=method, throw=False) for n, s in candidates.items()}
     converged = [n for n, fit in fits.items() if fit.status.converged]
     if not converged:
-        message = "; ".join(f"{n}: {fit.status.message}" for n, fit in fits.items())
+        message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
         raise ConvergenceError(f"none of the candidates converged: {message}", fits)
     predicted = {n: _mean_nrmse(candidates[n], held_out, fits[n]) for n in converged}
     rows = _candidate_rows(candidates, fits, predicted)

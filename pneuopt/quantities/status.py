@@ -1,7 +1,7 @@
 """How a computation ended, in words that name the remedy, and how it reports on its way."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 ProgressCallback = Callable[[str], None]
@@ -26,18 +26,36 @@ class Status:
     Attributes
     ----------
     code : Code
-    message : str
-        One sentence with figures; where it did not converge it names the worst residual and the remedy.
+    sentences : tuple of str
+        The verdict first, in less than 100 characters; then details with figures; the remedy last.
     """
 
     code: Code
-    message: str = ""
+    sentences: tuple[str, ...] = ()
 
     @property
     def converged(self) -> bool:
         """Whether the answer may be trusted."""
         return self.code is Code.CONVERGED
 
+    @property
+    def verdict(self) -> str:
+        """The first sentence."""
+        return self.sentences[0] if self.sentences else self.code.value
+
+    @property
+    def message(self) -> str:
+        """All sentences on one line, as a file or a table holds them."""
+        return "; ".join(self.sentences)
+
+    def with_details(self, *details: str) -> "Status":
+        """The status with more details behind its verdict, so that a remedy stays last; empty ones are left out."""
+        return replace(self, sentences=(*self.sentences[:1], *filter(None, details), *self.sentences[1:]))
+
+    def with_remedies(self, *remedies: str) -> "Status":
+        """The status with more remedies at its end; empty ones are left out."""
+        return replace(self, sentences=(*self.sentences, *filter(None, remedies)))
+
     def __str__(self) -> str:
         lead = "converged" if self.converged else f"NOT converged ({self.code.value})"
-        return f"{lead}: {self.message}" if self.message else lead
+        return "\n  ".join((f"{lead}: {self.sentences[0]}", *self.sentences[1:])) if self.sentences else lead

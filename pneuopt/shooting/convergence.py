@@ -51,26 +51,29 @@ def assess_convergence(
     nothing = np.diag(equations.arrow.corner) == 0  # even at a bound
     idle = ~space.held & ~space.has_effect(equations) & (nothing | ~space.at_bound(z))
     if idle.any():
-        said = f"the data do not feel {' and '.join(names[idle])}; fix it, or log a run that does"
-        return ConvergenceTest(Status(Code.NOT_CONVERGED, said), np.flatnonzero(idle))
+        sentences = f"the data do not feel {' and '.join(names[idle])}", "fix it, or log a run that does"
+        return ConvergenceTest(Status(Code.NOT_CONVERGED, sentences), np.flatnonzero(idle))
     reduced = equations.arrow.eliminate(0.0)
     if reduced is None:
-        return ConvergenceTest(Status(Code.NOT_CONVERGED, "the data do not determine the states; log another output"))
+        return ConvergenceTest(
+            Status(Code.NOT_CONVERGED, ("the data do not determine the states", "log another output"))
+        )
     keep = space.movable(z, equations, reduced)
     own = np.flatnonzero(keep)
     alike, solved = own[equations.unidentifiable_parameters(reduced, keep)], reduced.step(keep)
     noise = max(1.0, math.sqrt(equations.chi_square / max(1, equations.count)))
     if alike.size or solved is None:
-        said = f"the data do not determine {' and '.join(names[np.sort(alike)])}; "
-        status = Status(Code.NOT_CONVERGED, said + "fix one, or log a run that tells them apart")
+        verdict = f"the data do not determine {' and '.join(names[np.sort(alike)])}"
+        status = Status(Code.NOT_CONVERGED, (verdict, "fix one, or log a run that separates them"))
         blind = _least_sensitive(own, space, reduced, noise)
         return ConvergenceTest(status, blind if blind.size else alike[-1:])
     spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
     step = np.abs(solved.parameters[keep]) / spread
     if np.max(step, initial=0.0) > tolerance * noise:
         worst = int(np.argmax(step))
-        said = f"{names[keep][worst]} would still move by {step[worst] / noise:.2g} standard deviations; "
-        status = Status(Code.NOT_CONVERGED, said + "try more iterations, other start values, or fix a parameter")
+        verdict = f"{names[keep][worst]} would still move by {step[worst] / noise:.2g} standard deviations"
+        remedy = "try more iterations, other start values, or fix a parameter"
+        status = Status(Code.NOT_CONVERGED, (verdict, remedy))
         return ConvergenceTest(status, _least_certain(own, noise * spread, space))
     pressed = np.flatnonzero(space.at_bound(z) & ~space.held)
     return ConvergenceTest(
@@ -82,11 +85,12 @@ def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: boo
     """The status of an optimum: converged, unless its gaps take up what the model cannot."""
     gap, misfit = equations.largest_gap, 2 * equations.cost / max(1, equations.count)
     if equations.gap_share > MAX_GAP_SHARE and not (noisy_gaps and misfit <= MAX_CHI_SQUARE_RATIO):
-        said = f"the gaps between segments carry {equations.gap_share:.0%} of the cost, the largest is {gap:.1g} "
-        remedy = "of a state's nominal size: the model cannot follow the log; check its terms, inputs and units"
-        return Status(Code.NOT_CONVERGED, said + remedy)
-    said = f"{message}, largest gap {gap:.1g} of a state's nominal size"
-    return Status(Code.CONVERGED, said + describe_misfit(equations, MAX_CHI_SQUARE_RATIO, noisy_gaps=noisy_gaps))
+        verdict = f"the gaps between segments carry {equations.gap_share:.0%} of the cost"
+        detail = f"the largest is {gap:.1g} of a state's nominal size: the model cannot follow the log"
+        return Status(Code.NOT_CONVERGED, (verdict, detail, "check its terms, inputs and units"))
+    verdict = f"{message}, largest gap {gap:.1g} of a state's nominal size"
+    misfit_sentences = describe_misfit(equations, MAX_CHI_SQUARE_RATIO, noisy_gaps=noisy_gaps)
+    return Status(Code.CONVERGED, (verdict, *misfit_sentences))
 
 
 def _least_sensitive(positions: Indices, space: ParameterScaling, reduced: ReducedEquations, noise: float) -> Indices:

@@ -236,25 +236,25 @@ def second_order_correction(equations: NormalEquations, step: Array, moved: Arra
     return np.asarray(nodes + shift * segments.nominal)
 
 
-def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: bool) -> str:
-    """In words, what the model leaves beyond `level` (squared residuals, in noise variances); empty if nothing.
+def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: bool) -> tuple[str, ...]:
+    """Sentences on what the model leaves beyond `level` (squared residuals, in noise variances); none if nothing.
 
-    With `jumps` the gaps stand for noise of the states.
+    With `noisy_gaps` the gaps stand for noise of the states.
     """
     segments = equations.segments
-    lead = "; the model does not explain the log to its noise: "
-    tail = ", and the intervals count that as noise: they do not hold the bias of a wrong model"
+    lead = "the model does not explain the log to its noise: "
+    tail = "the intervals count that as noise: they do not hold the bias of a wrong model"
     if noisy_gaps:
         sizes = np.sqrt(np.mean(equations.gaps[segments.linked] ** 2, axis=0))
         state = segments.system.states[int(np.argmax(sizes))]
         size = f"{np.max(sizes) * state.nominal:.2g} {state.unit}"
-        return f"{lead}from segment to segment {state.name} jumps by {size} (rms){tail}"
+        return f"{lead}from segment to segment {state.name} jumps by {size} (rms)", tail
     misfit = equations.misfit
     worst = int(np.argmax(misfit))
     if misfit[worst] ** 2 <= level:
-        return ""
+        return ()
     output = segments.system.outputs[worst].name
-    return f"{lead}residuals are {misfit[worst]:.2g} times the noise of {output}{tail}"
+    return f"{lead}residuals are {misfit[worst]:.2g} times the noise of {output}", tail
 
 
 def _propagate_shifts(own: Array, excess: Array) -> Array:

@@ -151,7 +151,7 @@ def solve_from(problem: FullSpaceProblem, start: ParameterSet, guesses: Sequence
     w = np.clip(np.concatenate([to_unknowns(transcription, q), *nodes]), low, up)
     fault = _find_nan(problem, w, q)
     if fault:
-        return _solution(problem, w, q, Status(Code.DIVERGED, f"at the start {fault}; start elsewhere"), {}, {})
+        return _solution(problem, w, q, Status(Code.DIVERGED, (f"at the start {fault}", "start elsewhere")), {}, {})
     return _run_solver(problem, w, q)[0]
 
 
@@ -237,17 +237,18 @@ def _solver_status(
     worst = _describe_worst_row(problem, found["g"])
     taken = f"after {figures['iterations']:.0f} iterations and {figures['seconds']:.2f} s"
     if ended == "Solve_Succeeded" and bool(np.all(np.isfinite(found["x"]))):
-        return Status(Code.CONVERGED, f"{taken}, largest gap {figures['largest_gap']:.1e} of the states' nominal size")
+        gap = f"{figures['largest_gap']:.1e} of the states' nominal size"
+        return Status(Code.CONVERGED, (f"{taken}, largest gap {gap}",))
     if ended in {"Infeasible_Problem_Detected", "Restoration_Failed"}:
-        return Status(Code.INFEASIBLE, f"{taken}, {worst}; relax this limit or widen the parameters' bounds")
+        return Status(Code.INFEASIBLE, (taken, worst, "relax this limit or widen the parameters' bounds"))
     if ended in {"Maximum_Iterations_Exceeded", "Maximum_WallTime_Exceeded"}:
-        return Status(Code.ITERATION_LIMIT, f"{taken}, {worst}; start nearer or allow more")
+        return Status(Code.ITERATION_LIMIT, (taken, worst, "start nearer or allow more"))
     if ended in {"Invalid_Number_Detected", "Diverging_Iterates"}:
         fault = _find_nan(problem, found["x"], q) or f"the iterates diverge, {worst}"
-        return Status(Code.DIVERGED, f"{taken}, {fault}; bound the parameters or refine the integration")
+        return Status(Code.DIVERGED, (taken, fault, "bound the parameters or refine the integration"))
     if ended == "User_Requested_Stop":
-        return Status(Code.INTERRUPTED, taken)
-    return Status(Code.NOT_CONVERGED, f"IPOPT says {ended} {taken}, {worst}; rescale or start elsewhere")
+        return Status(Code.INTERRUPTED, (taken,))
+    return Status(Code.NOT_CONVERGED, (f"IPOPT says {ended} {taken}", worst, "rescale or start elsewhere"))
 
 
 def _row_violation(rows: ConstraintRows, g: Array) -> Array:

@@ -33,7 +33,7 @@ FINAL_COST_TOLERANCE = 5e-7  # likewise the last, in noise variances: half of (0
 MIN_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
 STALL_COST_DECREASE = 2e-3  # of the cost an iteration, below which a search that goes on gets nowhere
-GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, "the gaps between segments take up what the model cannot")
+GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments take up what the model cannot",))
 STIFFNESS_UPDATE_CHANGE = 0.03  # a parameter's relative change that has the stiffness judged anew
 MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample beyond which a search would take hours
 MAX_STAGE_REFINEMENT = 8  # how far a stage may refine the start's integration steps
@@ -202,16 +202,14 @@ class _LevenbergMarquardt:
         try:
             status = self._run_stages()
         except KeyboardInterrupt:
-            status = Status(Code.INTERRUPTED, "the best iterate so far; run again for an answer")
+            status = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
         return self._fit(status, time.perf_counter() - began)
 
     def _run_stages(self) -> Status:
         if self.required_substeps > self.min_substeps:
-            message = (
-                f"the model is so stiff that a sample takes {self.required_substeps} integration steps; smooth its "
-            )
-            remedy = "sharpest term (friction.smoothing to 1e-4 m/s), or give LeastSquares(substeps=)"
-            return Status(Code.NOT_CONVERGED, message + remedy)
+            verdict = f"the model is so stiff that a sample takes {self.required_substeps} integration steps"
+            remedy = "smooth its sharpest term (friction.smoothing to 1e-4 m/s), or give LeastSquares(substeps=)"
+            return Status(Code.NOT_CONVERGED, (verdict, remedy))
         last, allowed = self.method.stages[-1], None
         for stage in self.method.stages:
             if stage is last and self._gaps_absorb_misfit():
@@ -220,7 +218,7 @@ class _LevenbergMarquardt:
                     return self._refine_steps(allowed)
             self._enter_stage(stage, self.current.nodes, self.current.z)
             if not math.isfinite(self.current.cost):
-                return Status(Code.DIVERGED, "the model is not finite at the start; check values and units")
+                return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
             self.has_stalled = self._run_stage()
             self.stage_ends.append(_StageEnd(self.current.nodes, self.current.z, self.current.cost))
         status = self._convergence_status(self.current)

@@ -117,7 +117,7 @@ class Certifier:
             status = _contact_status(met) if met else self._certificate_status(found, claimed, certified)
         except ConvergenceError as error:
             certified, met, slopes = claimed * np.nan, [], {}
-            status = Status(Code.NOT_CERTIFIED, str(error))
+            status = Status(Code.NOT_CERTIFIED, (str(error),))
         deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
         values = dict(zip(self.task.space.names, point.tolist(), strict=True))
         contacts = {"contacts": float(len(met))} if met else {}
@@ -161,26 +161,28 @@ class Certifier:
         claim, proof = (worst_values([requirement_values(dict(f[r])) for r in f]) for f in (claimed, certified))
         for q in self.task.spec.violations(proof):
             n, (value, allowed) = metric_name(q), describe_value(q, proof[metric_name(q)])
+            claim_text = f"claimed {describe_value(q, claim[n])[0]}"
             return Status(
                 Code.NOT_CERTIFIED,
-                f"{n} is {value}{self._worst_case(certified, n)}, {allowed}, claimed {describe_value(q, claim[n])[0]}; "
-                f"give {n} more room",
+                (f"{n} is {value}{self._worst_case(certified, n)}, {allowed}, {claim_text}", f"give {n} more room"),
             )
         ours, theirs = self.task.spec.objective(proof), min(self.task.spec.objective(claim), found.stats["optimum"])
         if not ours <= theirs * (1 + MAX_CERTIFIED_EXCESS):
             return Status(
                 Code.NOT_CERTIFIED,
-                f"the objective is {ours:.6g}, claimed {theirs:.6g}: the optimum grazes the band, or does not survive "
-                "rounding; ask for more digits or a wider band",
+                (
+                    f"the objective is {ours:.6g}, claimed {theirs:.6g}",
+                    "the optimum grazes the band, or does not survive rounding",
+                    "ask for more digits or a wider band",
+                ),
             )
         agreeing = (
             f", {found.stats['starts_agreeing']:.0f} of {found.stats['starts']:.0f} starts agree"
             if "starts" in found.stats
             else ""
         )
-        return Status(
-            Code.CONVERGED, f"certified objective {ours:.6g}, claimed {self.task.spec.objective(claim):.6g}{agreeing}"
-        )
+        message = f"certified objective {ours:.6g}, claimed {self.task.spec.objective(claim):.6g}{agreeing}"
+        return Status(Code.CONVERGED, (message,))
 
     def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
         """The worst case, where there are several."""
@@ -219,9 +221,9 @@ def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]]) ->
     closest = [f"{n} {row.certified:.6g} ({row.allowed:.6g} asked)" for n, row in broken.iterrows()]
     unknown = [str(n) for n, row in result.requirements.iterrows() if np.isnan(row.certified) and np.isnan(row.allowed)]
     lead = f"no design found keeps all limits, the closest has {', '.join([*closest, *(f'no {n}' for n in unknown)])}"
-    message = f"{lead}; {describe_relaxations(rows)}; or widen the gains' bounds"
+    sentences = (lead, describe_relaxations(rows), "or widen the gains' bounds")
     relaxations = pd.DataFrame.from_dict(rows, orient="index")
-    return replace(result, status=Status(Code.INFEASIBLE, message), relaxations=relaxations)
+    return replace(result, status=Status(Code.INFEASIBLE, sentences), relaxations=relaxations)
 
 
 def relaxation_share(result: TuningResult) -> float:
@@ -252,4 +254,4 @@ def _requirement_row(requirement: Requirement, claimed: "pd.DataFrame", certifie
 def _contact_status(met: Sequence[str]) -> Status:
     """Of a response that ran into an end stop or emptied a chamber: whatever it shows, the drive does not."""
     remedy = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
-    return Status(Code.NOT_CERTIFIED, f"{'; '.join(dict.fromkeys(met))}; {remedy}")
+    return Status(Code.NOT_CERTIFIED, (*dict.fromkeys(met), remedy))

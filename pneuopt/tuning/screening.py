@@ -353,10 +353,11 @@ def _screening_status(spec: Specification, values: Mapping[str, float]) -> Statu
         for q in spec.violations(values, LIMIT_TOLERANCE)
     ]
     if broken:
-        return Status(Code.INFEASIBLE, f"the closest found has {'; '.join(broken)}; relax a limit or widen the bounds")
+        verdict = f"the closest found has {' and '.join(broken)}"
+        return Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))
     if not np.isfinite(spec.objective(values)):
         return Status(
-            Code.NOT_CONVERGED, "nothing found settles; widen the band or the bounds, or lengthen the horizon"
+            Code.NOT_CONVERGED, ("nothing found settles", "widen the band or the bounds, or lengthen the horizon")
         )
     return Status(Code.CONVERGED)
 

@@ -123,9 +123,9 @@ class Search:
         best = self.certifier.certify(
             simulator, found, self.space.round_point(found.point, digits) if digits else found.point
         )
-        verdict = f"{'holds' if best.status.converged else 'does not hold'}: {best.status.message}"
-        count = f"{found.stats['simulations']:.0f} simulations"
-        status = Status(Code.INTERRUPTED, f"the best of {count} so far {verdict}; run again for an answer")
+        holds = "holds" if best.status.converged else "does not hold"
+        verdict = f"the best of {found.stats['simulations']:.0f} simulations so far {holds}: {best.status.verdict}"
+        status = Status(Code.INTERRUPTED, (verdict, *best.status.sentences[1:], "run again for an answer"))
         values = {f"rejected.{n}": best.parameters.value(n) for n in self.space.names if best.status.converged}
         return replace(best, parameters=self.space.parameters, status=status, stats={**values, **best.stats})
 

@@ -104,15 +104,15 @@ def tune(
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     felt = search.space.names
     unfelt = [n for n in search_space(loop, parameters).names if n not in felt]
-    note = f"; {', '.join(unfelt)} left as given: without effect on a linear loop's average" if unfelt else ""
+    note = f"{', '.join(unfelt)} left as given: without effect on a linear loop's average" if unfelt else ""
     result = replace(
         result,
         parameters=parameters | result.parameters.select(felt if result.status.converged else ()),
-        status=replace(result.status, message=result.status.message + note),
+        status=result.status.with_remedies(note),
         stats={**result.stats, "seconds": time.perf_counter() - begun},
     )
     if throw and not result.status.converged:
-        raise ConvergenceError(f"tuning {result.status}; the given gains stand", result)
+        raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
     return result
 
 

@@ -53,7 +53,7 @@ def fit_of(
 ) -> IdentificationResult:
     """A result with nothing but what a file shows of it."""
     table = pd.DataFrame()
-    status = status or Status(Code.CONVERGED, "gaps 1e-9")
+    status = status or Status(Code.CONVERGED, ("gaps 1e-9",))
     known = table if estimates is None else estimates
     return IdentificationResult(parameters, known, table, table, {}, status, {}, provenance or {}, verdict)
 
@@ -203,13 +203,13 @@ def test_a_fit_adds_what_the_file_left_out(tmp_path: Path) -> None:
 def test_a_fit_of_a_fit_replaces_the_results(tmp_path: Path) -> None:
     source = written(tmp_path, AXIS)
     rig = read_drive(source)[1]
-    bad = Status(Code.ITERATION_LIMIT, "gap of position 3e-3; raise max_iterations")
+    bad = Status(Code.ITERATION_LIMIT, ("gap of position 3e-3; raise max_iterations",))
     write_fit(tmp_path / "fit.toml", source, fit_of(rig.with_values({"load.mass": 90.0}), status=bad))
     assert read_status(tmp_path / "fit.toml") == bad
     assert read_drive(tmp_path / "fit.toml")[1].value("load.mass") == 90.0
     better = rig.with_values({"load.mass": 91.0}).fixed("load.mass")
     write_fit(tmp_path / "fit.toml", tmp_path / "fit.toml", fit_of(better))
-    assert read_status(tmp_path / "fit.toml") == Status(Code.CONVERGED, "gaps 1e-9")
+    assert read_status(tmp_path / "fit.toml") == Status(Code.CONVERGED, ("gaps 1e-9",))
     assert read_drive(tmp_path / "fit.toml")[1] == better
     assert read_status(source) is None
 

@@ -82,7 +82,7 @@ peak_control = "4500 mV"
 def tuned(parameters: ParameterSet, status: Status | None = None) -> TuningResult:
     """A result with nothing but what a file shows of it."""
     table, certified = pd.DataFrame(), pd.DataFrame({"0 to 0.2": {"SettlingTime": np.float64(0.25)}})
-    status = status or Status(Code.CONVERGED, "certified")
+    status = status or Status(Code.CONVERGED, ("certified",))
     return TuningResult(parameters, certified, certified, table, table, (), status, {}, {"pneuopt": "0.1"})
 
 
@@ -258,13 +258,13 @@ def test_a_tuned_file_keeps_the_users_text_and_adds_the_results(tmp_path: Path) 
     said = read_toml(tmp_path / "tuned.toml").unwrap()
     assert said["certified"] == {"0 to 0.2": {"SettlingTime": 0.25}}
     assert said["provenance"] == {"pneuopt": "0.1"}
-    assert read_status(tmp_path / "tuned.toml") == Status(Code.CONVERGED, "certified")
+    assert read_status(tmp_path / "tuned.toml") == Status(Code.CONVERGED, ("certified",))
 
 
 def test_a_failed_tuning_keeps_the_old_gains_and_no_old_certificate(tmp_path: Path) -> None:
     _, found = read_all(tmp_path, {"pid.Kp": 12.34})
     write_tuned(tmp_path / "tuned.toml", tmp_path / "tuning.toml", tuned(found))
-    failed = tuned(found.with_values({"pid.Kp": 50.0}), status=Status(Code.NOT_CERTIFIED, "grazes the band"))
+    failed = tuned(found.with_values({"pid.Kp": 50.0}), status=Status(Code.NOT_CERTIFIED, ("grazes the band",)))
     write_tuned(tmp_path / "again.toml", tmp_path / "tuned.toml", failed)
     assert read_tuning(tmp_path / "again.toml", PLANT).parameters.value("pid.Kp") == 12.34
     said = read_toml(tmp_path / "again.toml").unwrap()

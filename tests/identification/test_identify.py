@@ -246,7 +246,7 @@ def test_twins_never_get_an_interval_and_spoil_no_other() -> None:
     assert np.isnan(rows.loc[twins, ["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
     assert sum(result.parameters.value(n) for n in twins) == pytest.approx(60, rel=0.01)
     assert result.parameters.value("twin") == 0.0
-    assert "the logs do not tell friction.viscous and twin" in result.status.message
+    assert "the logs do not identify friction.viscous and twin" in result.status.sentences
     assert "friction.viscous and twin only count together" in str(result.verdict)
     others = alone.estimates.drop("friction.viscous")[["value", "stderr"]]
     pd.testing.assert_frame_equal(rows.drop(twins)[["value", "stderr"]], others, rtol=1e-3)

@@ -86,7 +86,7 @@ def test_a_curve_that_is_not_there_has_open_ends_and_no_interval() -> None:
     assert (row["ci_low"], row["ci_high"]) == (-math.inf, math.inf)
     assert f"the logs do not tell {name}: anything from 0.0001 to 1 m/s fits as well; log" in str(result.verdict)
     assert np.isnan(result.covariance[name]).all()
-    assert f"the logs do not tell {name}" in result.status.message
+    assert f"the logs do not identify {name}" in result.status.sentences
 
 
 def test_bad_input_is_named() -> None:

@@ -59,7 +59,7 @@ def fitted(stiffness: float = 2e4, damping: float = 100.0, seed: int = 0) -> Ide
 def test_bristles_without_presliding_are_no_numbers_and_keep_their_given_values() -> None:
     result = fitted()
     assert result.status.converged
-    assert "the logs do not tell friction.bristle_stiffness and friction.bristle_damping" in result.status.message
+    assert "the logs do not identify friction.bristle_stiffness and friction.bristle_damping" in result.status.sentences
     rows = result.estimates
     assert rows.index[rows["note"] == "not told"].tolist() == list(BRISTLES)
     assert np.isnan(rows.loc[[*BRISTLES], ["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
