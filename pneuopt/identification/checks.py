@@ -54,7 +54,7 @@ def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> N
 
 
 def check_content(experiments: Sequence[Experiment]) -> None:
-    """Refuse logs that most of them show to be wrong or silent; a window of a good log may well stand still."""
+    """Refuse logs that most of them show to be wrong or without motion; a window of a good log may well stand still."""
     found: dict[str, dict[str, Finding]] = {}
     for experiment in experiments:
         for finding in examine(experiment):

@@ -35,7 +35,8 @@ class LogComparison:
     ----------
     table : DataFrame
         A row a parameter and log: value, stderr, others (weighted mean of the other logs' values), deviation (of the
-        one from the other, in standard deviations of the difference), unit. NaN where one log alone does not tell.
+        one from the other, in standard deviations of the difference), unit. NaN where the parameter is unidentifiable
+        from one log alone.
     agree : bool
         Whether no parameter is 4 standard deviations and 2 % apart; also where nothing could be compared.
     reason, fits
@@ -111,7 +112,7 @@ def _comparison_table(
 
 
 def _estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
-    """Value and deviation; NaN where this log alone does not tell."""
+    """Value and deviation; NaN where this log alone does not identify it."""
     if not fit.status.converged or name not in fit.estimates.index:
         return math.nan, math.nan
     value, stderr = (float(fit.estimates[column][name]) for column in ("value", "stderr"))
@@ -119,7 +120,7 @@ def _estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
 
 
 def _inverse_variance_mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Weighted mean of those that tell, and its deviation."""
+    """Weighted mean of the finite ones, and its deviation."""
     finite = np.array([e for e in estimates if math.isfinite(e[1])]).reshape(-1, 2)
     if not len(finite):
         return math.nan, math.nan
@@ -138,7 +139,9 @@ def _disagreements(table: "pd.DataFrame") -> "pd.DataFrame":
 def _comparison_reason(table: "pd.DataFrame", apart: "pd.DataFrame", logs: int) -> str:
     compared = list(dict.fromkeys(str(n) for n, _ in table.index[np.isfinite(table["deviation"])]))
     if not compared:
-        return "nothing could be compared: no parameter is told by two logs alone; fit fewer, or log longer runs"
+        return (
+            "nothing could be compared: no parameter is identifiable from two logs alone; fit fewer, or log longer runs"
+        )
     if not len(apart):
         return f"the {logs} logs agree in {', '.join(compared)}"
     name, log = apart.index[0]

@@ -22,6 +22,7 @@ from pneuopt.identification.checks import (
     emit_log_warnings,
     outputs_in_log,
 )
+from pneuopt.identification.identifiability import rests_on_prior
 from pneuopt.identification.losses import Loss
 from pneuopt.identification.multistart import fit_from_starts
 from pneuopt.identification.problem import (
@@ -38,7 +39,6 @@ from pneuopt.identification.statistics import (
     cross_correlation,
     ljung_box,
 )
-from pneuopt.identification.unidentifiable import rests_on_prior
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
@@ -46,7 +46,8 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
+from pneuopt.shooting.solution import Fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -182,7 +183,7 @@ def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) 
 def _result(
     problem: EstimationProblem, fit: Fit, label: str, loss: Loss | None
 ) -> tuple[IdentificationResult, tuple[str, ...]]:
-    """Read the solver's answer back into parameters and tables; and what the logs do not tell by themselves."""
+    """The fit as parameters and tables; and the names of what rests on a prior, not on the logs."""
     free = fit.parameters.free_names
     estimates = problem.unknowns().with_values({n: fit.parameters.value(n) for n in free}).select(free)
     shared = [n for n in free if n in problem.parameters]
@@ -199,8 +200,8 @@ def _result(
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
         leaning = rests_on_prior(covariance, fit.prior_covariance)
-    untold = tuple(n for n, leans in zip(free, leaning, strict=True) if leans or n in problem.held)
-    status = NOTHING_IDENTIFIABLE if free and set(untold) == set(free) else fit.status
+    unidentifiable = tuple(n for n, leans in zip(free, leaning, strict=True) if leans or n in problem.held)
+    status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else fit.status
     result = IdentificationResult(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, status),
@@ -215,7 +216,7 @@ def _result(
             **{f"sha256[{e.name}]": e.sha256 for e in problem.experiments},
         },
     )
-    return result, untold
+    return result, unidentifiable
 
 
 def _fit_table(system: Fittable, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":

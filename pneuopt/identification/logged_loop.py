@@ -1,6 +1,6 @@
 """`LoggedLoop`: a sampled loop as an identification reads it from a log that holds the reference, but not the command.
 
-The controller is known; run along the logged feedback, it tells what it commanded. With that command the plant finds
+The controller is known; run along the logged feedback, it shows what it commanded. With that command the plant finds
 its own start; the fit itself then runs plant and controller together, with the exact sampled update and its clip.
 """
 
@@ -51,10 +51,10 @@ class LoggedLoop:
     loop: ClosedLoop
 
     def __post_init__(self) -> None:
-        told = "a log comes from a sampled controller: give the loop's PID its sample_time"
-        require(self.loop.pid.sample_time is not None, told, ModelError)
-        told = "an identification has no derivatives through an Encoder; give SensorLag(filter + half a sample)"
-        require(not isinstance(self.loop.sensor, Encoder), told, ModelError)
+        message = "a log comes from a sampled controller: give the loop's PID its sample_time"
+        require(self.loop.pid.sample_time is not None, message, ModelError)
+        message = "an identification has no derivatives through an Encoder; give SensorLag(filter + half a sample)"
+        require(not isinstance(self.loop.sensor, Encoder), message, ModelError)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -235,8 +235,8 @@ def _feedback_along_log(measured: Trajectory, wanted: str, reference: str, name:
     if wanted == "speed" and "position" in measured:
         window = min(DIFFERENTIATION_WINDOW, (len(t) - 1) // 2 * 2 + 1)
         return np.asarray(savgol_filter(measured.fill_gaps("position"), window, 2, deriv=1, delta=step))
-    told = f"{name}: the loop feeds back {wanted!r}; without it, or the motion it follows from, there is no start"
-    require(wanted == "position" and "speed" in measured, told, LogError)
+    message = f"{name}: the loop feeds back {wanted!r}; without it, or the motion it follows from, there is no start"
+    require(wanted == "position" and "speed" in measured, message, LogError)
     speed = measured.fill_gaps("speed")
     travel = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
     return np.asarray(measured[reference][0] + travel)

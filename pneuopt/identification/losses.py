@@ -20,7 +20,8 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import Fit, LeastSquares, solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
+from pneuopt.shooting.solution import Fit
 
 MAX_REFITS = 12
 ESTIMATE_CHANGE_TOLERANCE = 0.05  # standard deviations that an estimate may still move from refit to refit
@@ -155,12 +156,11 @@ def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
 
 def _summarise(problem: EstimationProblem, fits: Sequence[Fit], loss: Loss | None) -> Fit:
     """The last fit with the effort of all, and a status that counts the bulk of the samples, not the outliers."""
-    fit = fits[-1]
-    effort = {n: sum(each.stats[n] for each in fits) for n in ("iterations", "seconds")}
+    fit = fits[-1].with_effort_of(*fits[:-1])
     status = fit.status
     if loss is not None and status.converged and fit.jumps is None:
         status = Status(status.code, _describe_outliers(problem, fit, len(fits)))
-    return replace(fit, stats={**fit.stats, **effort, "refits": len(fits) - 1.0}, status=status)
+    return replace(fit, stats={**fit.stats, "refits": len(fits) - 1.0}, status=status)
 
 
 def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> tuple[str, ...]:

@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
+from pneuopt.identification.identifiability import refuses_held_values
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
-from pneuopt.identification.unidentifiable import refuses_held_values
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
-from pneuopt.shooting.least_squares import Fit, solve_least_squares
+from pneuopt.shooting.least_squares import solve_least_squares
+from pneuopt.shooting.solution import Fit
 
 GUESS_STAGES = 3  # stages of a search with guesses held; tighter gaps would force a wrong guess on the log
 # relative width of the bounds that hold a guess; equal bounds would compile other equations than those of the search
@@ -26,7 +27,7 @@ GUESS_BOUND_WIDTH = 1e-9
 # squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
 # tried, while a wrong basin of soft bristles has left 1.1
 ACCEPTED_CHI_SQUARE_RATIO = 1.05
-SAME_COST_RATIO = 1.001  # costs of two fits up to which both are the same optimum; lower, and rounding tells them apart
+SAME_COST_RATIO = 1.001  # costs of two fits up to which both are one optimum; lower, and rounding makes two of it
 
 Candidate = tuple[EstimationProblem, Fit, str]
 
@@ -165,14 +166,10 @@ def _hold_unidentifiable(
     while fit.unidentifiable and len(held.held) + len(fit.unidentifiable) < len(given.free_names):
         held = replace(held, held={**held.held, **{n: source.value(n) for n in fit.unidentifiable}})
         before, fit = fit, solve_least_squares(held.transcription(held.start_from(fit, label)), warm)
-        fit = replace(fit, stats={**fit.stats, **_total_effort(before, fit)})
+        fit = fit.with_effort_of(before)
         if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
             break
     return held, fit
-
-
-def _total_effort(*fits: Fit) -> dict[str, float]:
-    return {n: sum(fit.stats[n] for fit in fits) for n in ("iterations", "seconds")}
 
 
 def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:

@@ -18,7 +18,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import Fit, LeastSquares
+from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 REFIT_STAGES = 3  # last stages of a method: a refit starts near its answer; more cost time, fewer may not converge

@@ -16,7 +16,8 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.solution import Fit
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,7 @@ from pneuopt.quantities.trajectories import Trajectory
 if TYPE_CHECKING:
     import pandas as pd
 
-AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "not told"
+AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "unidentifiable"
 INFINITE_INFLATION = (
     1e5  # times that a standard deviation shrinks if the others were known, that are as good as infinite
 )
@@ -21,17 +21,17 @@ INFINITE_INFLATION = (
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What logs can tell.
+    """Which parameters a set of logs identifies, how well, and which run would identify the others.
 
     Attributes
     ----------
     table : DataFrame
         A row a free parameter: value, expected standard deviation (`stderr`) and that over the value (`relative`), the
-        one if all others were known (`alone`), their ratio (`inflation`), and whether the logs tell it (`told`).
+        one if all others were known (`alone`), their ratio (`inflation`), and whether it is `identifiable`.
     indistinguishable : tuple of tuple of str
-        Parameters that only count together.
+        Groups of parameters of which the logs identify only a combination.
     reasons : mapping of str to str
-        By parameter: why the logs do not tell it, or only roughly, and what run would.
+        By parameter: why the logs do not identify it, or only roughly, and which run would.
     unchanged : tuple of str
         Parameters that a fit left at their given values.
     excitation : Excitation
@@ -46,36 +46,40 @@ class Verdict:
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """The parameters of which the logs say nothing."""
-        return tuple(str(n) for n, told in self.table["told"].items() if not told)
+        """The parameters that the logs do not identify."""
+        return tuple(str(n) for n, identifiable in self.table["identifiable"].items() if not identifiable)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is amiss, in words; empty if nothing is."""
+        """A sentence for each parameter or group that is not identified well; empty if all are."""
         by_reason: dict[tuple[bool, str], list[str]] = {}
         for name, reason in self.reasons.items():
             by_reason.setdefault((name in self.unidentifiable, reason), []).append(name)
         single = [
-            f"the logs {'do not tell' if untold else 'tell only roughly'} {join_names(names)}: {reason}"
-            for (untold, reason), names in by_reason.items()
+            f"the logs {'do not identify' if is_blind else 'identify only roughly'} {join_names(names)}: {reason}"
+            for (is_blind, reason), names in by_reason.items()
         ]
         groups = [_describe_group(group, self.table["inflation"], self.excitation) for group in self.indistinguishable]
-        return (*single, *groups, *([self._describe_left_alone()] if self.unchanged else []))
+        return (*single, *groups, *([self._describe_unchanged()] if self.unchanged else []))
 
-    def _describe_left_alone(self) -> str:
-        """What became of the parameters that a fit has left alone."""
+    def _describe_unchanged(self) -> str:
+        """The values at which a fit has held parameters."""
         values = join_names([f"{n} ({self.table['value'][n]:.4g})" for n in self.unchanged])
         verb = "keep their given values" if len(self.unchanged) > 1 else "keeps its given value"
         return f"{values} {verb}, on which the other intervals do not rest"
 
     def to_dict(self) -> dict[str, Any]:
         """All but the table, for a file."""
-        reasons = {str(n): reason for n, reason in self.reasons.items()}
-        words = {"sentences": list(self.sentences), "untold": list(self.unidentifiable), "kept": list(self.unchanged)}
-        return {**words, "together": [list(group) for group in self.indistinguishable], "reasons": reasons}
+        return {
+            "sentences": list(self.sentences),
+            "unidentifiable": list(self.unidentifiable),
+            "kept": list(self.unchanged),
+            "together": [list(group) for group in self.indistinguishable],
+            "reasons": {str(n): reason for n, reason in self.reasons.items()},
+        }
 
     def __str__(self) -> str:
-        return "\n".join(self.sentences) or "the logs tell every free parameter"
+        return "\n".join(self.sentences) or "the logs identify every free parameter"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +90,14 @@ class IdentificationResult:
     ----------
     parameters : ParameterSet
         The system's, with the given values and the estimates; a `per_log` parameter keeps its given value here, and so
-        does one that the logs do not tell, unless they refuse that value or tell it only together with another: then
-        it is where the other estimates stand.
+        does an unidentifiable one, unless the logs refuse that value or identify it only together with another: then
+        it has the value that belongs to the other estimates.
     estimates : DataFrame
         A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
-        at_bound, unit, source, note. The value is NaN where the note is "not told". No interval there, at a bound, or
-        without convergence. Where a linear interval would lie it is the profile likelihood's, infinite at an open end.
-        What is not told may lie a factor of ten from where it stays: the other intervals allow for that.
+        at_bound, unit, source, note. The value is NaN where the note is "unidentifiable". No interval there, at a
+        bound, or without convergence. Where a linear interval would be wrong it is the profile likelihood's, infinite
+        at an open end.
+        An unidentifiable parameter may lie a factor of ten from where it is held: the other intervals allow for that.
     covariance : DataFrame
         Of the estimates, scaled by the residuals' own level and correlation; NaN for what has no interval.
     fit : DataFrame
@@ -103,7 +108,7 @@ class IdentificationResult:
     stats : mapping of str to float
     provenance : mapping of str to str
     verdict : Verdict
-        What the logs do not tell, why, and what run would: ``print(result.verdict)``.
+        What the logs do not identify, why, and which run would: ``print(result.verdict)``.
     """
 
     parameters: ParameterSet
@@ -120,11 +125,9 @@ class IdentificationResult:
 def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:
     times = float(inflation[list(group)].max())
     message = (
-        f"known {times:.0f} times better if the others were"
-        if times < INFINITE_INFLATION
-        else "nothing tells them apart"
+        f"known {times:.0f} times better if the others were" if times < INFINITE_INFLATION else "nothing separates them"
     )
-    return f"{join_names(group)} only count together ({message}): {remedy(excitation, group)}"
+    return f"{join_names(group)} act only together ({message}): {remedy(excitation, group)}"
 
 
 def join_names(names: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""A second look at a fit: which intervals lie, what the logs do not tell, and where a fit that failed falls short."""
+"""`review_fit`: which intervals of a fit are wrong, what its logs do not identify, and where a failed fit is worst."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -9,7 +9,13 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
-from pneuopt.identification.identifiability import verdict_from_covariance, verdict_from_sensitivities
+from pneuopt.identification.identifiability import (
+    MAX_LINEAR_DEVIATION,
+    add_profiles,
+    add_unidentifiable,
+    verdict_from_covariance,
+    verdict_from_sensitivities,
+)
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiles import Profile, trace_profile
 from pneuopt.identification.result import (
@@ -19,7 +25,6 @@ from pneuopt.identification.result import (
     Verdict,
     join_names,
 )
-from pneuopt.identification.unidentifiable import MAX_LINEAR_DEVIATION, add_profiles, add_unidentifiable
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.equations import segment_gaps
@@ -42,16 +47,16 @@ SMOOTHING_PARAMETER, NARROW_SMOOTHING, SMOOTHING_REDUCTION = (
 
 
 def review_fit(
-    problem: EstimationProblem, result: IdentificationResult, untold: Sequence[str] = ()
+    problem: EstimationProblem, result: IdentificationResult, unidentifiable: Sequence[str] = ()
 ) -> IdentificationResult:
-    """Mark what the fit says without knowing it.
+    """Review the intervals of a fit, and mark what its logs do not identify.
 
     Parameters
     ----------
     problem : Problem
     result : IdentificationResult
         As the search left it.
-    untold : sequence of str
+    unidentifiable : sequence of str
         Free parameters that rest on a prior: those held, and those that hang on them.
 
     Returns
@@ -77,14 +82,16 @@ def review_fit(
             status=status,
             verdict=verdict,
         )
-    result = replace(result, estimates=_blank_intervals(result.estimates, untold))
+    result = replace(result, estimates=_blank_intervals(result.estimates, unidentifiable))
     profiles = _profiles(problem, result)
     trusted = result.stats["chi_square_ratio"] <= MAX_CHI_SQUARE_RATIO
-    verdict = verdict_from_covariance(problem, start, _blank_covariance(result.covariance, untold), trusted=trusted)
+    verdict = verdict_from_covariance(
+        problem, start, _blank_covariance(result.covariance, unidentifiable), trusted=trusted
+    )
     verdict = add_profiles(verdict, profiles)
-    if untold:
+    if unidentifiable:
         seen = _verdict_at(problem, start, result)
-        verdict = add_unidentifiable(verdict, untold, seen, _names_at_given_value(problem))
+        verdict = add_unidentifiable(verdict, unidentifiable, seen, _names_at_given_value(problem))
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
     status = result.status.with_details(_name_unidentifiable(verdict))
@@ -161,9 +168,9 @@ def _replace_intervals(estimates: "pd.DataFrame", profiles: Mapping[str, Profile
 
 
 def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
-    """A note beside each number that is none, and no number where nothing is told."""
-    untold, bound = set(verdict.unidentifiable), estimates["at_bound"]
-    notes = [AT_BOUND_NOTE if bound[n] else UNIDENTIFIABLE_NOTE if n in untold else "" for n in estimates.index]
+    """A note on each estimate at a bound or unidentifiable; NaN for the value of the latter."""
+    blind, bound = set(verdict.unidentifiable), estimates["at_bound"]
+    notes = [AT_BOUND_NOTE if bound[n] else UNIDENTIFIABLE_NOTE if n in blind else "" for n in estimates.index]
     out = estimates.assign(note=notes)
     return out.assign(value=out["value"].where(out["note"] != UNIDENTIFIABLE_NOTE))
 

@@ -88,7 +88,7 @@ def select_model(
     -----
     The deviance is the squared residuals over their variance in the best candidate, and over their correlation time: as
     if only independent samples counted. Between nested candidates it falls as chi-square with the extra parameters
-    (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). What the logs do not tell counts among the k, so
+    (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable parameters count among the k, so
     that a candidate with such parameters gives way to a simpler one that fits as well.
     """
     require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
@@ -234,7 +234,7 @@ def _selection_reason(rows: Mapping[str, _CandidateRow], chosen: str, passed_ove
     if math.isfinite(row.held_out_nrmse):
         message += f"; it predicts held-out runs with an NRMSE of {row.held_out_nrmse:.2%}"
     if row.unidentifiable:
-        message += f"; the logs do not tell its {row.unidentifiable}"
+        message += f"; the logs do not identify its {row.unidentifiable}"
     if row.at_bound:
         message += f"; at a bound: {row.at_bound}"
     failed = [n for n in rows if n not in good]

@@ -147,7 +147,7 @@ def positive_definite_inverse(matrix: Array) -> Array:
 
 
 def indistinguishable_parameters(schur: Array, corner: Array) -> Indices:
-    """Positions of parameters that only count together: the weakest direction, if it is no more than rounding.
+    """Positions of parameters that act only together: the weakest direction, if it is no more than rounding.
 
     Parameters
     ----------

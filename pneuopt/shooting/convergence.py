@@ -1,4 +1,4 @@
-"""What a lifted least squares has reached: converged or not, in words; and which parameter its data do not tell."""
+"""The convergence test of a lifted least squares, and which parameter its data do not determine."""
 
 import math
 from typing import NamedTuple
@@ -19,7 +19,7 @@ NO_POSITIONS = np.zeros(0, dtype=np.intp)
 
 
 class ConvergenceTest(NamedTuple):
-    """How a search stands, and the positions of free parameters that its data do not tell there."""
+    """How a search stands, and the positions of free parameters that its data do not determine there."""
 
     status: Status
     unidentifiable: Indices = NO_POSITIONS
@@ -28,24 +28,24 @@ class ConvergenceTest(NamedTuple):
 def assess_convergence(
     equations: NormalEquations, space: ParameterScaling, z: Array, tolerance: float, message: str, *, noisy_gaps: bool
 ) -> ConvergenceTest:
-    """Judge an iterate: converged means that a full undamped step would move nothing that the data can tell apart.
+    """Test an iterate: converged means that a full undamped step would move no parameter noticeably.
 
     Parameters
     ----------
-    equations : Equations
-    space : Space
+    equations : NormalEquations
+    space : ParameterScaling
     z : ndarray, shape (k,)
         The free parameters as searched.
     tolerance : float
         Of the step, in standard deviations.
-    told : str
-        What a success says of the search.
-    is_loose : bool
+    message : str
+        How a success describes the search.
+    noisy_gaps : bool
         The gaps stand for noise of the states.
 
     Returns
     -------
-    Judgement
+    ConvergenceTest
     """
     names = np.array(equations.segments.transcription.parameters.free_names, dtype=object)
     nothing = np.diag(equations.arrow.corner) == 0  # even at a bound

@@ -98,7 +98,7 @@ class NormalEquations:
         return np.asarray(np.sqrt(self.linearisation.squares.sum(axis=0) / np.maximum(self.segments.counts, 1)))
 
     def unidentifiable_parameters(self, reduced: ReducedEquations, keep: Mask) -> Indices:
-        """Positions, among the kept parameters, of those that the data do not tell apart; empty if they do."""
+        """Positions, among the kept parameters, of those that the data do not separate; empty if they do."""
         square = np.ix_(keep, keep)
         return indistinguishable_parameters(reduced.schur[square], self.arrow.corner[square])
 

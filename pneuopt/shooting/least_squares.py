@@ -7,7 +7,6 @@ as single shooting does, which fails there (problems/speed/benchmark_identificat
 
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -15,15 +14,14 @@ import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
-from pneuopt.quantities.arrays import Array, Mask
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, ProgressCallback, Status
-from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, ConvergenceTest, assess_convergence
 from pneuopt.shooting.equations import NormalEquations, normal_equations, second_order_correction, weigh_gaps
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, segment, stable_substeps, start_nodes
+from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
 INITIAL_DAMPING = 1e-3  # with loose gaps
@@ -92,52 +90,6 @@ class LeastSquares:
     tolerance: float = 0.1
     kinematic: float = 0.01
     progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """What a least squares found: the states over time, the parameters, and how well the data determine them.
-
-    Attributes
-    ----------
-    trajectories : tuple of Trajectory
-        States and outputs, one a phase.
-    parameters : ParameterSet
-        The problem's parameters with the free ones solved for.
-    status : Status
-    stats : mapping of str to float
-        Iterations, seconds, final cost, largest gap, ...
-    covariance : ndarray, shape (k, k), or None
-        Of the free parameters in their own units, at unit noise scale; None where the data do not determine them.
-    chi_square : float
-        Sum of squared data residuals, in noise standard deviations.
-    count : int
-        Number of data residuals.
-    at_bound : ndarray of bool, shape (k,)
-        Without those that were held, by equal bounds.
-    jumps : ndarray, shape (m, n_states), or None
-        Where the gaps had to stand for noise of the states: the gap behind each linked segment, in nominal sizes.
-    unidentifiable : tuple of str
-        The parameters that the data do not determine here; hold them, and fit again.
-    prior_covariance : ndarray, shape (k, k), or None
-        What a weak prior of those held adds to the covariance (`NormalEquations.prior_covariance`); None where nothing
-        is held.
-    variance_inflation : float
-        By how much the estimates' variance exceeds what weighted squares say (robust losses).
-    """
-
-    trajectories: tuple[Trajectory, ...]
-    parameters: ParameterSet
-    status: Status
-    stats: Mapping[str, float]
-    covariance: Array | None
-    chi_square: float
-    count: int
-    at_bound: Mask
-    jumps: Array | None = None
-    unidentifiable: tuple[str, ...] = ()
-    prior_covariance: Array | None = None
-    variance_inflation: float = 1.0
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:

@@ -1,8 +1,9 @@
-"""What every solver of `shooting` hands back."""
+"""What the solvers of `shooting` hand back: a `Solution`, and of a least squares a `Fit`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
@@ -10,7 +11,7 @@ from pneuopt.quantities.trajectories import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What every solver returns.
+    """What a solver with costs and limits found.
 
     Attributes
     ----------
@@ -30,3 +31,54 @@ class Solution:
     status: Status
     stats: Mapping[str, float] = field(default_factory=dict)
     multipliers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a least squares found: the states over time, the parameters, and how well the data determine them.
+
+    Attributes
+    ----------
+    trajectories : tuple of Trajectory
+        States and outputs, one a phase.
+    parameters : ParameterSet
+        The problem's parameters with the free ones solved for.
+    status : Status
+    stats : mapping of str to float
+        Iterations, seconds, final cost, largest gap, ...
+    covariance : ndarray, shape (k, k), or None
+        Of the free parameters in their own units, at unit noise scale; None where the data do not determine them.
+    chi_square : float
+        Sum of squared data residuals, in noise standard deviations.
+    count : int
+        Number of data residuals.
+    at_bound : ndarray of bool, shape (k,)
+        Without those that were held, by equal bounds.
+    jumps : ndarray, shape (m, n_states), or None
+        Where the gaps had to stand for noise of the states: the gap behind each linked segment, in nominal sizes.
+    unidentifiable : tuple of str
+        The parameters that the data do not determine here; hold them, and fit again.
+    prior_covariance : ndarray, shape (k, k), or None
+        What a weak prior of those held adds to the covariance (`NormalEquations.prior_covariance`); None where nothing
+        is held.
+    variance_inflation : float
+        By how much the estimates' variance exceeds what weighted squares say (robust losses).
+    """
+
+    trajectories: tuple[Trajectory, ...]
+    parameters: ParameterSet
+    status: Status
+    stats: Mapping[str, float]
+    covariance: Array | None
+    chi_square: float
+    count: int
+    at_bound: Mask
+    jumps: Array | None = None
+    unidentifiable: tuple[str, ...] = ()
+    prior_covariance: Array | None = None
+    variance_inflation: float = 1.0
+
+    def with_effort_of(self, *earlier: "Fit") -> "Fit":
+        """The fit with the iterations and seconds of earlier ones added to its own."""
+        total = {n: sum(fit.stats[n] for fit in (*earlier, self)) for n in ("iterations", "seconds")}
+        return replace(self, stats={**self.stats, **total})

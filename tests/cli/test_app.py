@@ -55,8 +55,8 @@ def test_identify_recovers_what_made_the_logs_and_says_so(folder: Path, axis_tru
     assert Path("fit.png").stat().st_size > 10_000
     for name in ("friction", "residuals", "correlation"):
         assert Path(f"fit_{name}.png").stat().st_size > 10_000
-    words = {n: said["verdict"][n] for n in ("sentences", "untold", "kept", "together", "reasons")}
-    assert words == {"sentences": [], "untold": [], "kept": [], "together": [], "reasons": {}}
+    words = {n: said["verdict"][n] for n in ("sentences", "unidentifiable", "kept", "together", "reasons")}
+    assert words == {"sentences": [], "unidentifiable": [], "kept": [], "together": [], "reasons": {}}
     assert said["verdict"]["table"][0]["name"] == "load.mass"
 
 
@@ -79,21 +79,24 @@ def test_what_a_log_does_not_tell_is_said_before_and_after(folder: Path) -> None
     rows = [f"{a:.4f},30,{b:.5f}" for a, b in zip(t, position, strict=True)]
     Path("steady.csv").write_text("\n".join(["time [s],force [N],position [mm]", *rows]) + "\n", encoding="utf-8")
     result = run("identify drive.toml steady.csv --json fit.json")
-    assert "warning: before the fit: the logs do not tell" in result.stderr
+    assert "warning: before the fit: the logs do not identify" in result.stderr
     assert "friction.viscous: nearly all speeds lie between" in result.stderr.replace("\n", " ")
     said = json.loads(Path("fit.json").read_text(encoding="utf-8"))
     assert said["verdict"]["sentences"]
     assert "friction.viscous" in result.stdout
 
 
-def test_open_ends_and_what_is_not_told_are_no_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    ends = {"a.open": (2.0, math.nan, 1.5, math.inf, ""), "b.blind": (7.0, math.nan, -math.inf, math.inf, "not told")}
+def test_open_ends_and_what_is_unidentifiable_are_no_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    ends = {
+        "a.open": (2.0, math.nan, 1.5, math.inf, ""),
+        "b.blind": (7.0, math.nan, -math.inf, math.inf, "unidentifiable"),
+    }
     columns = ["value", "stderr", "ci_low", "ci_high", "note"]
     table = pd.DataFrame.from_dict(ends, orient="index", columns=columns).assign(unit="N")
     show_estimates(make_console(), table)
     first, second = capsys.readouterr().out.splitlines()[-3:-1]
     assert first.split() == ["a.open", "2", "above", "1.5", "N"]
-    assert second.split() == ["b.blind", "-", "not", "determined", "N", "not", "told"]
+    assert second.split() == ["b.blind", "-", "not", "determined", "N", "unidentifiable"]
 
 
 def test_many_windows_are_shown_in_short(folder: Path) -> None:

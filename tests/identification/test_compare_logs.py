@@ -29,7 +29,7 @@ def pushed(name: str, seed: int, **other: float) -> Experiment:
 def test_the_parameter_and_the_log_that_disagree_are_named() -> None:
     logs = [pushed("a", 1), pushed("b", 2), pushed("other", 3, friction__coulomb=36.0)]
     joint = identify(DRIVE, logs, FREE, throw=False)
-    assert "compare_logs tells whether the logs are of one drive" in joint.status.message
+    assert "compare_logs shows whether the logs are of one drive" in joint.status.message
     found = compare_logs(DRIVE, logs, FREE)
     assert not found.agree
     assert found.reason.startswith("friction.coulomb is 36")

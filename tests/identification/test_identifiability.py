@@ -39,13 +39,13 @@ def rubbed(speeds: Sequence[float], noise: float = 0.2) -> Experiment:
     return Experiment(Trajectory(t, {"speed": speed, "force": force}), {"force": noise}, name="rig")
 
 
-def test_what_a_rich_log_tells_is_foreseen() -> None:
+def test_what_a_rich_log_identifies_is_foreseen() -> None:
     """The expected deviations are those of the fit, and nothing is amiss."""
     truth, log = pushed(Coulomb(), load__mass=3.0)
     free = truth.freed("load.mass", "load.force", "friction.coulomb", "friction.viscous")
     system = ForceDrive(Coulomb()).system()
     verdict, result = identifiability(system, [log], free), identify(system, [log], free)
-    assert str(verdict) == str(result.verdict) == "the logs tell every free parameter"
+    assert str(verdict) == str(result.verdict) == "the logs identify every free parameter"
     assert verdict.unidentifiable == ()
     assert verdict.indistinguishable == ()
     ratio = verdict.table["stderr"] / result.estimates["stderr"]
@@ -61,7 +61,7 @@ def test_offset_and_coulomb_asymmetry_only_count_together() -> None:
     sharp = truth.with_values({"friction.smoothing": 1e-4, "friction.asymmetry_width": 1e-4})
     verdict = identifiability(system, [log], sharp.freed(*free))
     assert verdict.indistinguishable == (("load.force", "friction.coulomb_asymmetry"),)
-    assert "load.force and friction.coulomb_asymmetry only count together" in str(verdict)
+    assert "load.force and friction.coulomb_asymmetry act only together" in str(verdict)
     assert "turn the axis round" in str(verdict)
 
 
@@ -91,7 +91,7 @@ def test_without_reversals_bristles_are_refused_and_never_a_number() -> None:
     result = identify(system, [late], free)
     rows = result.estimates.loc[sorted(bristles)]
     assert np.isnan(rows[["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
-    assert (rows["note"] == "not told").all()
+    assert (rows["note"] == "unidentifiable").all()
     assert result.verdict is not None
     assert "the motion never reverses" in result.verdict.to_dict()["reasons"]["friction.bristle_stiffness"]
 
@@ -127,9 +127,9 @@ def test_a_failure_names_the_worst_place() -> None:
     free = truth.freed("load.mass", "friction.coulomb", "friction.viscous")
     with pytest.raises(
         ConvergenceError, match=r"the worst residuals, .* are position of bad from 0\.\d+ to 0\.\d+ s"
-    ) as told:
+    ) as caught:
         identify(ForceDrive(Coulomb()).system(), [bad], free)
-    result = told.value.solution
+    result = caught.value.solution
     assert isinstance(result, IdentificationResult)
     assert result.estimates[["stderr", "ci_low", "ci_high"]].isna().all(axis=None)
     assert math.isfinite(result.estimates["value"].iloc[0])

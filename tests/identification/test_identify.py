@@ -114,7 +114,7 @@ def test_known_parameters_are_recovered_without_a_guess(name: str, channels: tup
     assert relative[["load.mass", "friction.coulomb", "friction.viscous"]].max() < 0.01
 
 
-def test_directions_are_told_apart() -> None:
+def test_directions_are_separated() -> None:
     friction = Asymmetric(Coulomb())
     free = ("load.mass", "friction.coulomb", "friction.viscous", "friction.*_asymmetry")
     fixed = known(friction).with_values({"friction.coulomb_asymmetry": 0.0, "friction.viscous_asymmetry": 0.0})
@@ -242,18 +242,18 @@ def test_twins_never_get_an_interval_and_spoil_no_other() -> None:
     result = identify(system, [log], system.parameters.freed(*FREE, "twin"))
     alone = identify(system, [log], system.parameters.freed(*FREE))
     twins, rows = ["friction.viscous", "twin"], result.estimates
-    assert rows["note"][rows["note"] == "not told"].index.tolist() == twins
+    assert rows["note"][rows["note"] == "unidentifiable"].index.tolist() == twins
     assert np.isnan(rows.loc[twins, ["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
     assert sum(result.parameters.value(n) for n in twins) == pytest.approx(60, rel=0.01)
     assert result.parameters.value("twin") == 0.0
     assert "the logs do not identify friction.viscous and twin" in result.status.sentences
-    assert "friction.viscous and twin only count together" in str(result.verdict)
+    assert "friction.viscous and twin act only together" in str(result.verdict)
     others = alone.estimates.drop("friction.viscous")[["value", "stderr"]]
     pd.testing.assert_frame_equal(rows.drop(twins)[["value", "stderr"]], others, rtol=1e-3)
 
 
 def test_a_parameter_that_the_log_does_not_reach_is_named() -> None:
-    """The drive never moves fast enough to tell anything else than sticking."""
+    """The drive never moves fast enough to show anything else than sticking."""
     t = times(1.0)
     force = 5 + 8 * np.sin(2 * np.pi * t)  # well below 30 N
     log = generated(ForceDrive(Coulomb()).system(), {"force": force}, t, TRUTH, 0, "position")

@@ -55,8 +55,8 @@ def test_fewer_channels_still_tell(log: po.Experiment, channels: tuple[str, ...]
 
 
 @pytest.mark.parametrize("off", [0.0, -0.02])
-def test_speed_alone_tells_friction_and_where_it_began(log: po.Experiment, off: float) -> None:
-    """The air in both chambers tells the position, if the log begins elsewhere than it is said to."""
+def test_speed_alone_identifies_friction_and_where_it_began(log: po.Experiment, off: float) -> None:
+    """The air in both chambers identifies the position, if the log begins elsewhere than it is said to."""
     drive, truth = b32()
     true = float(log.trajectory["position"][0])
     begin = {"cylinder.start": (true + off) / truth.value("cylinder.stroke")}

@@ -69,7 +69,7 @@ def test_the_controller_is_replayed_exactly_along_an_exact_log() -> None:
     held = np.append(run["control"][:-1][::2], 0.0)
     np.testing.assert_allclose(empty.states["loop"]["pid.command"][1::2], held[: len(held) - 1], atol=1e-6)
     assert validate(loop, [log], given(loop))["fit_percent"].min() > 99
-    # what the derivative was at the first sample, a noisy log hardly tells; it fades within a few Tf
+    # what the derivative was at the first sample, a noisy log hardly shows; it fades within a few Tf
     np.testing.assert_allclose(predict(loop, log, given(loop))["control"][50:], run["control"][50:], atol=1.0)
 
 

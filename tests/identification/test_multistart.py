@@ -18,7 +18,8 @@ from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
 VELOCITY = "friction.stribeck_velocity"

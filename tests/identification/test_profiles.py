@@ -60,7 +60,7 @@ def test_of_a_drive_with_soft_gaps_it_is_the_linear_interval() -> None:
     assert found.high - found.low == pytest.approx(row["ci_high"] - row["ci_low"], rel=0.03)
 
 
-def test_a_weakly_told_stribeck_velocity_has_unequal_sides() -> None:
+def test_a_weakly_identifiable_stribeck_velocity_has_unequal_sides() -> None:
     log = moved(42.0, 16.0)
     system, result = fitted(Stribeck(), log, *CURVE)
     found = profile(system, [log], result, "friction.stribeck_velocity")
@@ -81,10 +81,10 @@ def test_a_curve_that_is_not_there_has_open_ends_and_no_interval() -> None:
     found = profile(system, [log], result, name)
     assert found.is_open
     row = result.estimates.to_dict(orient="index")[name]
-    assert row["note"] == "not told"
+    assert row["note"] == "unidentifiable"
     assert math.isnan(float(row["stderr"]))
     assert (row["ci_low"], row["ci_high"]) == (-math.inf, math.inf)
-    assert f"the logs do not tell {name}: anything from 0.0001 to 1 m/s fits as well; log" in str(result.verdict)
+    assert f"the logs do not identify {name}: anything from 0.0001 to 1 m/s fits as well; log" in str(result.verdict)
     assert np.isnan(result.covariance[name]).all()
     assert f"the logs do not identify {name}" in result.status.sentences
 

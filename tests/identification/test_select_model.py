@@ -102,7 +102,7 @@ def test_bad_input_is_named() -> None:
 
 
 def test_none_converged_is_an_error_with_every_result() -> None:
-    """At one speed no level can be told from a slope."""
+    """At one speed no level can be separated from a slope."""
     pair = {n: MotionDrive(STATIC[n], chamber=False).system() for n in ("coulomb", "stribeck")}
     run = moved(STATIC["coulomb"], 1, 100)
     steady = Experiment(Trajectory(run.trajectory.t, {**run.trajectory.values, "speed": np.full(100, 0.1)}), run.noise)
@@ -111,8 +111,8 @@ def test_none_converged_is_an_error_with_every_result() -> None:
     assert set(caught.value.solution) == {"coulomb", "stribeck"}
 
 
-def test_a_candidate_with_untold_parameters_gives_way_to_a_simpler_one_that_fits_as_well() -> None:
-    """All speeds are far beyond the Stribeck velocity; the reason and the table name what is not told."""
+def test_a_candidate_with_unidentifiable_parameters_gives_way_to_a_simpler_one_that_fits_as_well() -> None:
+    """All speeds are far beyond the Stribeck velocity; the reason and the table name what is unidentifiable."""
     pair = {n: MotionDrive(STATIC[n], chamber=False).system() for n in ("stribeck", "coulomb")}
     run = moved(STATIC["coulomb"], 1, 300)
     fast = Experiment(Trajectory(run.trajectory.t, fast_channels(run)), run.noise)
@@ -125,7 +125,7 @@ def test_a_candidate_with_untold_parameters_gives_way_to_a_simpler_one_that_fits
     assert found.reason.startswith("coulomb, of 2 converged candidates, has the lowest BIC")
     assert "not tell" not in found.reason
     only = select_model({"stribeck": pair["stribeck"], "also": pair["stribeck"]}, [fast], ParameterSet(), free=FREE[:4])
-    assert only.reason.endswith("; the logs do not tell its friction.static, friction.stribeck_velocity")
+    assert only.reason.endswith("; the logs do not identify its friction.static, friction.stribeck_velocity")
 
 
 def fast_channels(run: Experiment) -> dict[str, Array]:

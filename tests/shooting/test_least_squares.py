@@ -13,7 +13,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.full_space import solve_full_space
-from pneuopt.shooting.least_squares import Fit, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
 H = 0.02
@@ -264,7 +265,7 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
     assert np.abs((found(fit) - list(TRUTH.values())) / spread).max() < 4
 
 
-def test_residuals_beyond_the_noise_are_told() -> None:
+def test_residuals_beyond_the_noise_are_reported() -> None:
     problem = two_logs()
     proud = tuple(replace(r, noise=r.noise / 3) for r in problem.residuals)
     status = solve_least_squares(replace(problem, residuals=proud)).status
@@ -279,7 +280,7 @@ def test_too_few_iterations_are_no_convergence() -> None:
     assert "would still move by" in fit.status.message
 
 
-def test_a_model_too_stiff_to_search_is_told_at_once() -> None:
+def test_a_model_too_stiff_to_search_is_refused_at_once() -> None:
     problem = two_logs()
     stiff = problem.parameters.with_bounds({"damping": (0.0, 1e6)}).with_values({"damping": 3e4})
     fit = solve_least_squares(replace(problem, parameters=stiff))
@@ -288,7 +289,7 @@ def test_a_model_too_stiff_to_search_is_told_at_once() -> None:
     assert fit.stats["iterations"] == 0
 
 
-def test_a_start_that_is_not_finite_is_told() -> None:
+def test_a_start_that_is_not_finite_is_reported() -> None:
     problem = two_logs()
     guess = np.full((problem.phases[0].n, 2), 1e300)
     phases = (replace(problem.phases[0], guess=guess), problem.phases[1])
@@ -314,7 +315,7 @@ def test_an_interruption_hands_back_the_best_so_far() -> None:
     assert fit.stats["iterations"] == 3
 
 
-def test_explicit_substeps_are_kept_and_their_error_is_told() -> None:
+def test_explicit_substeps_are_kept_and_their_error_is_reported() -> None:
     problem = two_logs()
     coarse = solve_least_squares(problem, LeastSquares(substeps=1, stages=(Stage(1e-3, 20), Stage(1e-5, 30))))
     fine = solve_least_squares(problem, LeastSquares(substeps=8, stages=(Stage(1e-3, 20), Stage(1e-5, 30))))
@@ -333,14 +334,14 @@ def position(fit: Fit, name: str) -> int:
     return list(fit.parameters.free_names).index(name)
 
 
-def test_a_good_fit_is_silent_about_nothing() -> None:
+def test_a_good_fit_has_no_unidentifiable_parameter() -> None:
     fit = solve_least_squares(two_logs())
     assert fit.status.converged
     assert fit.unidentifiable == ()
     assert fit.prior_covariance is None
 
 
-def test_what_is_not_felt_is_silent_and_held_it_adds_nothing() -> None:
+def test_a_parameter_without_effect_is_unidentifiable_and_held_it_adds_nothing() -> None:
     problem = two_logs(extra=True)
     problem = replace(problem, parameters=problem.parameters.fixed("factor").freed("idle"))
     assert solve_least_squares(problem).unidentifiable == ("idle",)
@@ -353,7 +354,7 @@ def test_what_is_not_felt_is_silent_and_held_it_adds_nothing() -> None:
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])
-def test_of_two_that_only_count_together_one_is_silent_and_the_other_borrows_all(factor: float) -> None:
+def test_of_two_that_act_only_together_one_is_unidentifiable_and_the_other_takes_over_its_prior(factor: float) -> None:
     problem = two_logs(extra=True)
     assert set(solve_least_squares(problem).unidentifiable) < {"damping", "factor"}
     fit = held(problem, "factor", factor)

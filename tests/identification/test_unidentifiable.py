@@ -1,4 +1,4 @@
-"""Logs that cannot tell a parameter: the fit ends, the rest is told, and what is not told is no number."""
+"""Logs that cannot identify a parameter: the fit ends, the rest is identified, and there is no number for that one."""
 
 from functools import cache
 from pathlib import Path
@@ -61,7 +61,7 @@ def test_bristles_without_presliding_are_no_numbers_and_keep_their_given_values(
     assert result.status.converged
     assert "the logs do not identify friction.bristle_stiffness and friction.bristle_damping" in result.status.sentences
     rows = result.estimates
-    assert rows.index[rows["note"] == "not told"].tolist() == list(BRISTLES)
+    assert rows.index[rows["note"] == "unidentifiable"].tolist() == list(BRISTLES)
     assert np.isnan(rows.loc[[*BRISTLES], ["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
     assert np.isnan(result.covariance[BRISTLES[0]]).all()
     assert [result.parameters.value(n) for n in BRISTLES] == [2e4, 100.0]
@@ -73,7 +73,7 @@ def test_bristles_without_presliding_are_no_numbers_and_keep_their_given_values(
 
 
 @pytest.mark.parametrize("times", [1 / 3, 1.0, 3.0])
-def test_what_is_told_does_not_hang_on_what_is_not(times: float) -> None:
+def test_identifiable_estimates_do_not_depend_on_unidentifiable_ones(times: float) -> None:
     """Wherever the bristles are fixed, within a decade of the truth, the others stay within their own deviations."""
     rows = fitted().estimates.loc[[*SLIDING]]
     fixed = given(5e4 * times, 300 * times).freed(*SLIDING)
@@ -84,7 +84,7 @@ def test_what_is_told_does_not_hang_on_what_is_not(times: float) -> None:
     assert ((rows["value"] - truth).abs() < 4 * rows["stderr"]).all()
 
 
-def test_a_profile_of_a_told_parameter_is_its_interval() -> None:
+def test_a_profile_of_an_identifiable_parameter_is_its_interval() -> None:
     result = fitted()
     found = profile(DRIVE.system(), [slide()], result, "friction.coulomb")
     row = result.estimates.to_dict(orient="index")["friction.coulomb"]
@@ -92,13 +92,13 @@ def test_a_profile_of_a_told_parameter_is_its_interval() -> None:
     assert_allclose(np.array([found.low, found.high]), ends, rtol=0, atol=0.2 * row["stderr"])
 
 
-def test_the_file_of_the_fit_says_why_and_keeps_what_is_not_told(tmp_path: Path) -> None:
+def test_the_file_of_the_fit_says_why_and_keeps_what_is_unidentifiable(tmp_path: Path) -> None:
     source, fit = tmp_path / "drive.toml", tmp_path / "fit.toml"
     source.write_text(FILE, encoding="utf-8")
     write_fit(fit, source, fitted())
     said, text = read_toml(fit).unwrap(), fit.read_text(encoding="utf-8")
     assert said["status"]["code"] == "converged"
-    assert said["verdict"]["untold"] == said["verdict"]["kept"] == list(BRISTLES)
+    assert said["verdict"]["unidentifiable"] == said["verdict"]["kept"] == list(BRISTLES)
     assert "the motion never reverses" in said["verdict"]["reasons"][BRISTLES[0]]
     assert any("keep their given values" in sentence for sentence in said["verdict"]["sentences"])
     assert np.isnan(said["estimates"][BRISTLES[0]]["value"])
@@ -110,7 +110,7 @@ def test_the_file_of_the_fit_says_why_and_keeps_what_is_not_told(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_the_told_ones_are_covered() -> None:
+def test_the_identifiable_ones_are_covered() -> None:
     """Over 40 noise draws 95 % of the intervals hold the truth: binomial, the three of a draw correlated."""
     inside = []
     for seed in range(40):
@@ -134,16 +134,16 @@ def test_a_curve_that_no_speed_reaches_keeps_its_given_values() -> None:
     curve = ("friction.static", "friction.stribeck_velocity")
     free = rig.parameters.with_values({curve[1]: 0.01}).freed("friction.coulomb", "friction.viscous", *curve)
     result = identify(rig.system(), [rubbed(0.3, -0.3, 0.6, -0.9, 1.5)], free)
-    assert result.estimates["note"].to_dict() == {n: "not told" if n in curve else "" for n in free.free_names}
+    assert result.estimates["note"].to_dict() == {n: "unidentifiable" if n in curve else "" for n in free.free_names}
     assert {n: result.parameters.value(n) for n in curve} == {n: free.value(n) for n in curve}
     rows = result.estimates.drop([*curve])
     assert ((rows["value"] - np.array([30.0, 50.0])).abs() < 4 * rows["stderr"]).all()
 
 
-def test_a_log_that_tells_nothing_does_not_converge() -> None:
-    """At one speed there is one level: neither of its two parts is told."""
+def test_a_log_that_identifies_nothing_does_not_converge() -> None:
+    """At one speed there is one level: neither of its two parts is identifiable."""
     rig = MotionDrive(Stribeck(), chamber=False)
     free = rig.parameters.freed("friction.coulomb", "friction.viscous")
     result = identify(rig.system(), [rubbed(0.5)], free, throw=False)
     assert not result.status.converged
-    assert "the logs tell none of the free parameters by itself" in result.status.message
+    assert "the logs identify none of the free parameters by itself" in result.status.message
