@@ -25,7 +25,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import s32, t32
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame
 
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-DRIVES = {"T32": t32, "S32": s32}
+DRIVES = {"T32": po.catalog.t32, "S32": po.catalog.s32}
 SWEEP = (1000.0, 628.0, 400.0, 200.0, 126.0)  # [rad/s]
 CASES = [("T32", rate, 2.0) for rate in SWEEP] + [("S32", 1000.0, 2.0), ("S32", 200.0, 1.0)]
 BOUNDS = {"T32.1000": "<= 1", "T32.628": "<= 2", "T32.200": "<= 10", "S32.1000": "<= 5", "triangle.628": "<= 2"}  # [%]

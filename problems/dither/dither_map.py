@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 import pneuopt as po
 from pneuopt.evaluation.specification import specify
-from pneuopt.models.catalog import t32
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
@@ -93,14 +92,14 @@ def run() -> Job:
 
 
 def controlled(shape: po.Waveform = po.Waveform.SINE) -> po.ClosedLoop:
-    drive, _ = t32()
+    drive, _ = po.catalog.t32()
     sensor = po.Encoder(RESOLUTION, FILTER)
     return po.ClosedLoop(drive.system(), po.PID(sample_time=SAMPLE), po.Dither(60.0, waveform=shape), sensor=sensor)
 
 
 def filled(loop: po.ClosedLoop) -> po.ParameterSet:
     own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*", "sensor.*"))
-    return (t32()[1].with_values(HARDWARE).fixed("*") | own).with_values(GIVEN)
+    return (po.catalog.t32()[1].with_values(HARDWARE).fixed("*") | own).with_values(GIVEN)
 
 
 def tuned(
@@ -200,10 +199,10 @@ def figure(job: Job) -> "Figure":
     air = axes[2].pcolormesh(AMPLITUDES, FREQUENCIES, job.air, cmap="magma_r", shading="nearest")
     axes[2].set_title("its price, gains tuned with it", fontsize=10)
     picture.colorbar(air, ax=axes[2], label="air in 0.8 s [l(ANR)]")
-    dead = HARDWARE["valve.dead_zone"] * t32()[1].value("valve.span")
+    dead = HARDWARE["valve.dead_zone"] * po.catalog.t32()[1].value("valve.span")
     for plot, colour in zip(axes, ("w", "w", GREY), strict=True):
         plot.axvline(dead, color=colour, lw=1, ls="--")
-        plot.axhline(t32()[1].value("valve.bandwidth"), color=colour, lw=1, ls=":")
+        plot.axhline(po.catalog.t32()[1].value("valve.bandwidth"), color=colour, lw=1, ls=":")
         plot.set(xlabel="amplitude [V]", yscale="log")
         plot.set_yticks([20, 50, 100, 200], ["20", "50", "100", "200"])
         plot.minorticks_off()

@@ -25,7 +25,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import r25
 from pneuopt.plotting import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 from problems.shared.claims import Claim, arguments, design, finish, frame
 from problems.shared.r25 import CLIP, PAPERS_PID, TRANSDUCER
@@ -106,7 +105,7 @@ def run() -> Job:
 
 def stepped(v: float, gains: Mapping[str, float], *, lugre: bool = True) -> Run:
     """From rest at mid stroke, continuous, with ideal sensing."""
-    drive, p = r25(lugre)
+    drive, p = po.catalog.r25(lugre)
     loop = po.ClosedLoop(drive.system(), po.PID(dead_band="pid.dead_band" in gains), measured="speed")
     step = po.Step(v, horizon=SECONDS[v]).trajectory(1e-3)
     found = po.simulate(loop, step, (loop.parameters | p).with_values(gains), rtol=1e-8)
@@ -115,7 +114,7 @@ def stepped(v: float, gains: Mapping[str, float], *, lugre: bool = True) -> Run:
 
 def tuned(steps: list[po.Step], *limits: Any) -> po.TuningResult:
     """Minimises the settling time to 2 % on the LuGre model."""
-    drive, p = r25(lugre=True)
+    drive, p = po.catalog.r25(lugre=True)
     loop = po.ClosedLoop(drive.system(), po.PID(), measured="speed")
     given = (loop.parameters | p).with_values(PAPERS).with_bounds(RANGES).freed(*RANGES)
     asked = (*LIMITS, *limits)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
 
 import pneuopt as po
-from pneuopt.models.catalog import b32
 from problems.shared.b32 import FREE, LOGGED, VALVE, generate
 from problems.shared.claims import Claim, arguments, finish, frame
 
@@ -25,9 +24,9 @@ if TYPE_CHECKING:
 
 
 def main() -> "pd.DataFrame":
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     claims = _identified("stribeck", drive, truth, (*FREE, *VALVE))
-    drive, truth = b32(lugre=True)
+    drive, truth = po.catalog.b32(lugre=True)
     bristles = ("friction.bristle_stiffness", "friction.bristle_damping")
     return frame(claims + _identified("lugre", drive, truth, (*FREE, *bristles, *VALVE)))
 

@@ -20,7 +20,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import b32
 from problems.shared.b32 import FREE, LOGGED, VALVE, generate
 from problems.shared.claims import Claim, arguments, finish, frame
 
@@ -42,7 +41,7 @@ CHANNELS = {
 
 
 def main() -> "pd.DataFrame":
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     log = generate(drive, truth)
     claims = channels(drive, truth, log) + several(drive, truth) + shaped(drive, truth)
     return frame(claims + two_steps(drive, truth, log) + wrong_supply(drive, truth, log) + bristles())
@@ -100,7 +99,7 @@ def wrong_supply(drive: po.PneumaticDrive, truth: po.ParameterSet, log: po.Exper
 
 def bristles() -> list[Claim]:
     """LuGre friction from the position alone; then valve, mass and supply unknown, too."""
-    drive, truth = b32(lugre=True)
+    drive, truth = po.catalog.b32(lugre=True)
     log, free = _kept(generate(drive, truth), ("position",)), (*FREE, *BRISTLES)
     claims = _case("lugre_position", drive, [log], truth, free, None)
     blind = (*free, *VALVE, "load.mass", "supply.pressure")
@@ -110,7 +109,7 @@ def bristles() -> list[Claim]:
 def _kept(log: po.Experiment, channels: tuple[str, ...]) -> po.Experiment:
     """The named channels; a log without position begins where the piston was known to stand."""
     kept = log.select(("valve_voltage", *channels))
-    stroke = b32()[1].value("cylinder.stroke")
+    stroke = po.catalog.b32()[1].value("cylinder.stroke")
     begin = {"cylinder.start": float(log.trajectory["position"][:20].mean()) / stroke}
     return kept if "position" in channels else kept.with_conditions(begin)
 

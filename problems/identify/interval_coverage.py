@@ -23,7 +23,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import b32
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from problems.shared.b32 import FREE, LOGGED, NOISE, VALVE, completed
 from problems.shared.b32 import exact as exact_log
@@ -56,7 +55,7 @@ def run(
 
 def study(case: str, seeds: range) -> "pd.DataFrame":
     """A row a draw: for each parameter its error in standard errors, and whether the interval holds the truth."""
-    truth = b32()[1] | po.ParameterSet({"seed": po.Parameter(-1.0, "1")})
+    truth = po.catalog.b32()[1] | po.ParameterSet({"seed": po.Parameter(-1.0, "1")})
     draws = {f"{case} {seed}": {"seed": float(seed)} for seed in seeds}
     fn = functools.partial(identified, case)
     rows = po.sweep(fn, truth, draws, progress=lambda line: print(f"{case}: {line}", end="\r", file=sys.stderr))
@@ -65,7 +64,7 @@ def study(case: str, seeds: range) -> "pd.DataFrame":
 
 def identified(case: str, truth: po.ParameterSet) -> dict[str, Any]:
     """One draw's row."""
-    drive = b32()[0]
+    drive = po.catalog.b32()[0]
     blind = truth.select(drive.parameters).with_values({n: drive.parameters.value(n) for n in WANTED}).freed(*WANTED)
     log = drawn(case, round(truth.value("seed")))
     fit = po.identify(drive.system(), [log], blind, estimate_noise=case == "estimated", throw=False)
@@ -134,7 +133,7 @@ def figure(draws: dict[str, "pd.DataFrame"]) -> "Figure":
 
 @functools.cache
 def _exact() -> po.Trajectory:
-    return exact_log(b32()[1]).select(LOGGED)
+    return exact_log(po.catalog.b32()[1]).select(LOGGED)
 
 
 if __name__ == "__main__":

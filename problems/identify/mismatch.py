@@ -28,7 +28,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import b32
 from pneuopt.plotting import BLUE, GREY, axes_grid, legend_above
 from problems.shared.b32 import FREE, LOGGED, NOISE, SAMPLE, SETTLING, START, VALVE, completed, reference
 from problems.shared.claims import Claim, arguments, finish, frame
@@ -94,7 +93,7 @@ def drawn(given: po.ParameterSet) -> dict[str, Any]:
 
 def recorded(hardware: Hardware, seed: int) -> po.Experiment:
     """The rig's log at 1 kHz, after 0.3 s of settling; each draw has its own noise, and a reference moved by 1 mm."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     loop = po.ClosedLoop(
         replace(drive, friction=po.Karnopp(po.Stribeck())).system(), po.PID(sample_time=SAMPLE), measured="position"
     )
@@ -115,7 +114,7 @@ def recorded(hardware: Hardware, seed: int) -> po.Experiment:
 
 def identified(log: po.Experiment, width: float) -> dict[str, Any]:
     """What the smooth model makes of a log."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     unknown = {n: drive.parameters.value(n) for n in WANTED}
     blind = truth.with_values(unknown | {"friction.smoothing": width}).freed(*WANTED)
     began = time.process_time()

@@ -26,7 +26,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import b32
 from problems.shared.arrays import Array
 from problems.shared.b32 import FREE, LOGGED, NOISE, SAMPLE, VALVE, completed, exact, simulation_seconds
 from problems.shared.claims import Claim, arguments, finish, frame
@@ -71,7 +70,7 @@ def main(
 
 def study(kind: str, seeds: range, encoder: float = 0.0, outliers: float = 0.0) -> "pd.DataFrame":
     """A row a plant: what was drawn, whether it converged, how far its worst parameter is off, and the cost."""
-    truth = b32(kind == "lugre")[1] | po.ParameterSet({"seed": po.Parameter(-1.0, "1")})
+    truth = po.catalog.b32(kind == "lugre")[1] | po.ParameterSet({"seed": po.Parameter(-1.0, "1")})
     cases = {f"{kind} {seed}": {**drawn(kind, seed), "seed": float(seed)} for seed in seeds}
     fn = functools.partial(identified, kind, encoder, outliers)
     rows = po.sweep(fn, truth, cases, progress=lambda line: print(f"{kind}: {line}", end="\r", file=sys.stderr))
@@ -111,7 +110,7 @@ def identified(kind: str, encoder: float, outliers: float, truth: po.ParameterSe
     """One plant's row."""
     unit, free = _unit(kind), _free(kind)
     log = generate(kind, truth, round(truth.value("seed")), encoder, outliers)
-    drive, given = b32(kind == "lugre")
+    drive, given = po.catalog.b32(kind == "lugre")
     blind = given.with_values({n: drive.parameters.value(n) for n in free}).freed(*free)
     began = time.process_time()
     fit = po.identify(drive.system(), [log], blind, throw=False)
@@ -171,7 +170,7 @@ def _free(kind: str) -> tuple[str, ...]:
 def _unit(kind: str) -> float:
     """The unit of cost [CPU s]; and loads what an identification runs."""
     lugre = kind == "lugre"
-    drive, truth = b32(lugre)
+    drive, truth = po.catalog.b32(lugre)
     log = generate(kind, truth, 0)
     short = replace(log, trajectory=log.trajectory.rows(0, 1000))
     po.identify(drive.system(), [short], truth.freed(*_free(kind)), throw=False)

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pneuopt as po
-from pneuopt.models.catalog import b32
 from problems.shared.b32 import FREE, NOISE, START, VALVE, integrate_loop, reference
 from problems.shared.claims import Claim, arguments, finish, frame
 
@@ -50,7 +49,7 @@ def main() -> "pd.DataFrame":
 
 def position_loop() -> list[Claim]:
     """The rig's controller reads its own noisy sensor; the log holds reference, position and pressures."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3), measured="position")
     given = (loop.parameters | truth).with_values(GAINS)
     t = np.arange(4000) * 1e-3
@@ -67,7 +66,7 @@ def position_loop() -> list[Claim]:
 
 def speed_loop() -> list[Claim]:
     """A controller of 2 ms in a log of 1 ms, with integral action; position and pressures logged."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     loop = po.ClosedLoop(drive.system(), po.PID(sample_time=2e-3))
     given = (loop.parameters | truth).with_values(SPEED_GAINS)
     t = np.arange(3000) * 1e-3
@@ -84,7 +83,7 @@ def speed_loop() -> list[Claim]:
 
 def skewed() -> list[Claim]:
     """One log with position and pressure_a, one with position and both pressures; the position comes 5 ms late."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     channels = {"one": ("position", "pressure_a"), "two": ("position", "pressure_a", "pressure_b")}
     logs = []
     for seed, (name, kept) in enumerate(channels.items()):
@@ -106,7 +105,7 @@ def skewed() -> list[Claim]:
 
 def outliers() -> list[Claim]:
     """1 % of the positions 20 to 50 standard deviations off."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     log = _noisy(integrate_loop(drive.system(), np.arange(4000) * 1e-3, truth), 1)
     log = log.select(["valve_voltage", "position", "pressure_a", "pressure_b"])
     random, x = np.random.default_rng(5), log.trajectory["position"].copy()
@@ -148,7 +147,7 @@ def wrong_noise(draws: int = 40) -> list[Claim]:
 
 def mixed() -> list[Claim]:
     """All channels at 1 kHz; the position alone at 500 Hz, 5 % missing; speed and one pressure at 1 kHz with jitter."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     system, random = drive.system(), np.random.default_rng(3)
     full = replace(_noisy(integrate_loop(system, np.arange(2000) * 1e-3, truth), 1), name="full")
     slow = replace(_noisy(integrate_loop(system, np.arange(1500) * 2e-3, truth), 2), name="slow")
@@ -166,7 +165,7 @@ def mixed() -> list[Claim]:
 
 def wrong_logs() -> list[Claim]:
     """A position with the wrong sign, and pressures whose gauge readings are taken for absolute: refused, in words."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     log = _noisy(integrate_loop(drive.system(), np.arange(1200) * 1e-3, truth), 1)
     log = log.select(["valve_voltage", "position", "pressure_a", "pressure_b"])
     read = log.trajectory
@@ -189,7 +188,7 @@ def wrong_logs() -> list[Claim]:
 
 def two_drives() -> list[Claim]:
     """Two logs, one of a drive with 15 % more Coulomb friction: the joint fit says no, the comparison names it."""
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     logs = []
     for seed, (name, coulomb) in enumerate({"mine": 40.0, "other": 46.0}.items()):
         run = integrate_loop(drive.system(), np.arange(2000) * 1e-3, truth.with_values({"friction.coulomb": coulomb}))
@@ -217,7 +216,7 @@ def _noisy(run: po.Trajectory, seed: int) -> po.Experiment:
 
 def _blind(truth: po.ParameterSet, free: tuple[str, ...]) -> po.ParameterSet:
     """The truth but for what is to be found, which stands at a drive's defaults."""
-    defaults = b32()[0].parameters
+    defaults = po.catalog.b32()[0].parameters
     return truth.with_values({n: defaults.value(n) for n in free}).freed(*free)
 
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import r25
 from pneuopt.plotting import BLUE, GREY, ORANGE, RED, axes_grid
 from problems.shared.claims import Claim
 from problems.shared.r25 import CLIP, PAPERS_PID, TRANSDUCER, Case, averaged, lagging, linearised, simulated
@@ -67,7 +66,11 @@ def moved(found: po.Linearisation, omega: float, mass: float) -> Moved:
 
 def _table() -> list[Claim]:
     columns = {"force": "N/V", "speed": "mm/sV", "travel": "um/V", "for_40N": "V", "for_40mm_s": "V"}
-    rigid, slow, mass = linearised(r25()), linearised(lagging(po.Viscous())), r25()[1].value("load.mass")
+    rigid, slow, mass = (
+        linearised(po.catalog.r25()),
+        linearised(lagging(po.Viscous())),
+        po.catalog.r25()[1].value("load.mass"),
+    )
     rows = []
     for omega, references in TABLE.items():
         values = moved(rigid, omega, mass).row
@@ -87,7 +90,7 @@ def _table() -> list[Claim]:
 
 def _papers_chatter() -> list[Claim]:
     """0.001 V at 1000 rad/s on R25's step of 1 V: what its sine moves, and the change of the whole response."""
-    at = moved(linearised(r25()), AT, r25()[1].value("load.mass"))
+    at = moved(linearised(po.catalog.r25()), AT, po.catalog.r25()[1].value("load.mass"))
     rows = [
         Claim("chatter.force", 1e3 * PAPERS * at.force, "mN", 0.8, "0.76 +- 0.02"),
         Claim("chatter.speed", PAPERS * at.speed, "m/s", 6e-8, "6.4e-8 +- 1e-9"),
@@ -135,7 +138,7 @@ def _hunting() -> list[Claim]:
 
 def _verdicts() -> list[Claim]:
     """On the paper's step of 1 V under LuGre friction, the same gains with and without."""
-    drive, p = r25(lugre=True)
+    drive, p = po.catalog.r25(lugre=True)
     loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(AT / (2 * pi)), measured="speed")
     gains = {f"pid.{n}": v if n == "Tf" else TRANSDUCER * v for n, v in PAPERS_PID.items()}
     given = (loop.parameters | p).with_values({**gains, "pid.lower": -CLIP, "pid.upper": CLIP})
@@ -152,8 +155,8 @@ def _verdicts() -> list[Claim]:
 
 def figure() -> "Figure":
     picture, ((amount, needed),) = axes_grid(1, 2, (3.6,))
-    omega, mass = np.geomspace(10, 3000, 200), r25()[1].value("load.mass")
-    for given, style, label in ((r25(), "-", "rigid spool"), (lagging(po.Viscous()), "--", "100 Hz spool")):
+    omega, mass = np.geomspace(10, 3000, 200), po.catalog.r25()[1].value("load.mass")
+    for given, style, label in ((po.catalog.r25(), "-", "rigid spool"), (lagging(po.Viscous()), "--", "100 Hz spool")):
         found = linearised(given)
         rows = np.array([moved(found, w, mass).row for w in omega])
         curves = ((0, 3, BLUE, "force on a stuck piston [N/V]", "40 N"), (1, 4, ORANGE, "speed [mm/s/V]", "40 mm/s"))

@@ -25,7 +25,7 @@ import casadi as ca
 import numpy as np
 from scipy import optimize, signal
 
-from pneuopt.models.catalog import DriveSet, r25
+import pneuopt as po
 from pneuopt.plotting import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 from problems.paper import paper_dither
 from problems.shared.arrays import Array, names, parameter_vector
@@ -89,7 +89,7 @@ def printed_flow(high: float, low: float) -> float:
 
 def smooth_flow(high: float, low: float) -> float:
     """The same of the drive's smooth kernel."""
-    drive, p = r25()
+    drive, p = po.catalog.r25()
     rounding = type(drive.valve.smoothing)()  # the default one, not the sharp one of R25
     scale = p.value("valve.conductance") * REFERENCE_DENSITY / HALF_TRAVEL
     return scale * float(drive.valve.law.flow(ca.SX(high), ca.SX(low), {}, rounding))
@@ -108,7 +108,7 @@ def _orifices() -> list[Claim]:
 
 def _coefficients() -> list[Claim]:
     """(3), (4) at the null by AD; and what the unrounded (1), (2) make of (16) by central differences."""
-    q = operating_point(*r25(), half_travel=HALF_TRAVEL)
+    q = operating_point(*po.catalog.r25(), half_travel=HALF_TRAVEL)
 
     def mass(x: float, p: float) -> float:
         opening = (x + sqrt(x**2 + ROUNDING**2)) / 2
@@ -131,7 +131,7 @@ def _coefficients() -> list[Claim]:
 
 def _balances() -> list[Claim]:
     """(5) to (8) in motion, off the centre: the rates of the ODE against the flows, relative."""
-    drive, p = r25()
+    drive, p = po.catalog.r25()
     state, voltage = {"position": 0.3, "speed": 0.4, "pressure_a": 4.4e5, "pressure_b": 4.0e5}, 1.7
     x, travel = [state[n] for n in names(drive.states)], voltage * PER_VOLT
     rates = np.array(drive.system().ode(0, x, [voltage], parameter_vector(p, p))[0]).ravel()
@@ -152,7 +152,7 @@ def _balances() -> list[Claim]:
 
 def _linear_chambers() -> list[Claim]:
     """(9), (10), (11): entries of the AD matrix against the paper's coefficients."""
-    found, q = linearised(r25()), OperatingPoint()
+    found, q = linearised(po.catalog.r25()), OperatingPoint()
     v, a, b = (found.states.index(n) for n in ("speed", "pressure_a", "pressure_b"))
     stiff = KAPPA * q.p_ai * q.A_a / q.V_0a
     return [
@@ -166,7 +166,7 @@ def _linear_chambers() -> list[Claim]:
 
 def _one_pressure() -> list[Claim]:
     """(12), (13): what p_b still does; (14): speed over p_La. And where the third order collapses, where not."""
-    found, q = linearised(r25()), operating_point(*r25(), half_travel=HALF_TRAVEL)
+    found, q = linearised(po.catalog.r25()), operating_point(*po.catalog.r25(), half_travel=HALF_TRAVEL)
     s = 5j  # [rad/s]
     state = np.linalg.solve(s * np.eye(3) - found.A, found.B).ravel()
     v, a, b = (state[found.states.index(n)] for n in ("speed", "pressure_a", "pressure_b"))
@@ -191,7 +191,7 @@ def _apart(point: OperatingPoint) -> float:
 
 
 def _equation_15() -> list[Claim]:
-    q = operating_point(*r25(), half_travel=HALF_TRAVEL)
+    q = operating_point(*po.catalog.r25(), half_travel=HALF_TRAVEL)
     w0 = natural_frequency(q)
     return [
         near("eq15.b0", spool_gain(q), 1270.12 / (PER_VOLT * TRANSDUCER * w0**2), 1e-6, "1/s"),
@@ -205,9 +205,9 @@ def _equation_15() -> list[Claim]:
 
 def _equation_16() -> list[Claim]:
     """(16) from the formulas, and by AD of the whole nonlinear drive; its third pole is its zero."""
-    top, bottom = second_order(operating_point(*r25(), half_travel=HALF_TRAVEL))
+    top, bottom = second_order(operating_point(*po.catalog.r25(), half_travel=HALF_TRAVEL))
     formulas = (bottom[1], bottom[2], top[0] * PER_VOLT * TRANSDUCER)
-    *by_ad, pole, zero = polynomials(r25())
+    *by_ad, pole, zero = polynomials(po.catalog.r25())
     rows, printed = [], (PRINTED_COEFFICIENTS[1], PRINTED_COEFFICIENTS[2], PRINTED_COEFFICIENTS[0])
     for label, values in (("formulas", formulas), ("ad", by_ad)):
         for name, value, reference in zip(("s", "constant", "gain"), values, printed, strict=True):
@@ -238,8 +238,8 @@ def _alternatives() -> list[Claim]:
     ]
 
 
-def _other(values: Mapping[str, float]) -> DriveSet:
-    drive, p = r25()
+def _other(values: Mapping[str, float]) -> po.catalog.DriveSet:
+    drive, p = po.catalog.r25()
     return drive, p.with_values(
         {**values, "valve.conductance": p.value("valve.conductance") * OTHER_GRADIENT / GRADIENT}
     )

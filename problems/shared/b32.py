@@ -18,7 +18,6 @@ from scipy import integrate
 
 import pneuopt as po
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compile_function
-from pneuopt.models.catalog import b32
 from problems.shared.arrays import names, parameter_vector
 
 if TYPE_CHECKING:
@@ -98,7 +97,7 @@ def exact(truth: po.ParameterSet, lugre: bool = False, *, seconds: float = 10.0,
 @functools.cache
 def sampled_loop(lugre: bool = False) -> tuple[po.System, Rollout]:
     """The drive with its command as a state, which the sampled loop sets at each instant."""
-    drive = b32(lugre)[0].system()
+    drive = po.catalog.b32(lugre)[0].system()
     command, wanted = po.Quantity("valve_voltage", "V"), po.Quantity("position_reference", "m", nominal=0.1)
 
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
@@ -127,7 +126,7 @@ def completed(rows: "pd.DataFrame") -> "pd.DataFrame":
 
 def simulation_seconds(log: po.Experiment, lugre: bool = False) -> float:
     """CPU seconds of one compiled scalar simulation of a record, the unit of cost."""
-    drive, truth = b32(lugre)
+    drive, truth = po.catalog.b32(lugre)
     system, data = drive.system(), log.trajectory
     rollout = Rollout(po.discretise(system).pieces, threads=1, lanes=1 if os.environ.get("PNEUOPT_CC") != "" else 0)
     start = np.array([[data[n][0] if n in data else 0.0 for n in names(system.states)]])

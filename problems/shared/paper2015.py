@@ -88,8 +88,7 @@ def operating_point(drive: po.PneumaticDrive, parameters: po.ParameterSet, half_
 
     Examples
     --------
-    >>> from pneuopt.models.catalog import r25
-    >>> point = operating_point(*r25(), half_travel=1e-3)
+    >>> point = operating_point(*po.catalog.r25(), half_travel=1e-3)
     >>> round(point.K_ma, 4), round(point.K_ca * 1e9, 4)
     (12.3856, 2.6593)
     """

@@ -10,7 +10,6 @@ from functools import cache
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import DriveSet, r25
 from problems.shared.arrays import Array
 
 TRANSDUCER = 20.0  # [V s/m] K_s
@@ -48,7 +47,7 @@ class Loop:
 @cache
 def simulated(case: Case, rtol: float = 1e-8) -> Loop:
     """The nonlinear loop from rest; derivative on the error, valve clipped at 5 V."""
-    drive, p = r25(case.lugre)
+    drive, p = po.catalog.r25(case.lugre)
     loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(), measured="speed")
     scaled = {f"pid.{n}": v if n == "Tf" else TRANSDUCER * v for n, v in case.gains.items()}
     chatter = {"dither.amplitude": case.amplitude, "dither.frequency": case.frequency / (2 * np.pi)}
@@ -58,7 +57,7 @@ def simulated(case: Case, rtol: float = 1e-8) -> Loop:
     return Loop(run.t, TRANSDUCER * run["speed"])
 
 
-def linearised(given: DriveSet) -> po.Linearisation:
+def linearised(given: po.catalog.DriveSet) -> po.Linearisation:
     """The drive at rest, by AD; position left out, which moves nothing at mid stroke."""
     drive, p = given
     rest = drive.rest(p)
@@ -69,7 +68,7 @@ def linearised(given: DriveSet) -> po.Linearisation:
     )
 
 
-def polynomials(given: DriveSet) -> tuple[float, float, float, float, float]:
+def polynomials(given: po.catalog.DriveSet) -> tuple[float, float, float, float, float]:
     """Of speed [V] over command [V]: the denominator's s and 1, the numerator, then the third pole and its zero."""
     found = linearised(given)
     poles, plain = np.linalg.eigvals(found.A), np.poly(found.A)
@@ -79,9 +78,9 @@ def polynomials(given: DriveSet) -> tuple[float, float, float, float, float]:
     return float(second[1]), float(second[2]), float(numerator[2]), third, float(-numerator[3] / numerator[2])
 
 
-def lagging(friction: po.Viscous | po.Stribeck | po.LuGre | po.Karnopp) -> DriveSet:
+def lagging(friction: po.Viscous | po.Stribeck | po.LuGre | po.Karnopp) -> po.catalog.DriveSet:
     """R25 behind a spool of 100 Hz, damping 0.7; friction of the same numbers by any model."""
-    drive, p = r25(lugre=True)
+    drive, p = po.catalog.r25(lugre=True)
     slow = replace(drive, friction=friction, valve=replace(drive.valve, spool=po.Spool.SECOND_ORDER))
     own = p.select(n for n in p if n in slow.parameters)
     return slow, (slow.parameters | own).with_values({"valve.bandwidth": 100.0, "valve.damping": 0.7})

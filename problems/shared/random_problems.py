@@ -17,7 +17,6 @@ import numpy as np
 
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
-from pneuopt.models import catalog
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from problems.shared.arrays import Array
@@ -140,7 +139,7 @@ def force_drive(rng: np.random.Generator) -> Plant:
     return Plant(loop, _freed(loop, loop.parameters.with_values(given), ranges, rng), 0.4, rng.uniform(0.4, 0.8))
 
 
-def _pneumatic(make: Callable[[], catalog.DriveSet]) -> Callable[[np.random.Generator], Plant]:
+def _pneumatic(make: Callable[[], po.catalog.DriveSet]) -> Callable[[np.random.Generator], Plant]:
     def drawn(rng: np.random.Generator) -> Plant:
         drive, rig = make()
         spread = ("load.mass", "valve.conductance", *(f"friction.{n}" for n in FRICTION))
@@ -171,10 +170,10 @@ KINDS: dict[str, Callable[[np.random.Generator], Plant]] = {
     "sampled_second_order": sampled_second_order,
     "friction_lag": friction_lag,
     "force_drive": force_drive,
-    "s25": _pneumatic(catalog.s25),
-    "s32": _pneumatic(catalog.s32),
-    "s40": _pneumatic(catalog.s40),
-    "t32": _pneumatic(catalog.t32),
+    "s25": _pneumatic(po.catalog.s25),
+    "s32": _pneumatic(po.catalog.s32),
+    "s40": _pneumatic(po.catalog.s40),
+    "t32": _pneumatic(po.catalog.t32),
 }
 
 

@@ -7,7 +7,6 @@ a dither of 1000 rad/s. Kp, Ki, Kd, the dither's amplitude and its offset are fr
 from math import pi
 
 import pneuopt as po
-from pneuopt.models.catalog import t32
 
 STEP = po.Step(0.2, horizon=1.0, start={"position": 0.05, "pressure_b": 3.5e5})
 VALUES = {"pid.Kp": 10.0, "pid.Ki": 40.0, "pid.Tf": 0.01, "pid.Tt": 0.1, "pid.lower": -5.0, "pid.upper": 5.0}
@@ -21,7 +20,7 @@ RANGES = {
 
 
 def benchmark() -> tuple[po.ClosedLoop, po.ParameterSet]:
-    drive, hardware = t32()
+    drive, hardware = po.catalog.t32()
     loop = po.ClosedLoop(drive.system(), po.PID(), po.Dither(frequency=1000 / (2 * pi)))
     own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     return loop, (hardware.fixed("*") | own).with_values(VALUES).with_bounds(RANGES).freed(*RANGES)

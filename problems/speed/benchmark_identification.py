@@ -32,7 +32,6 @@ from scipy.optimize import least_squares
 import pneuopt as po
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.identification.problem import EstimationProblem
-from pneuopt.models.catalog import b32
 from pneuopt.shooting.full_space import solve_full_space
 from problems.shared.arrays import Array
 from problems.shared.b32 import COARSE, FREE, LOGGED, NOISE, SAMPLE, VALVE, exact, generate, simulation_seconds
@@ -110,7 +109,7 @@ def _run_part(name: str) -> dict[str, float]:
 def ours() -> dict[str, float]:
     """CPU seconds of the fastest of three (one in the VM), beside the unit; and how far the answer is off."""
     system, truth, blind = _blind()
-    log = generate(*b32()).select(LOGGED)
+    log = generate(*po.catalog.b32()).select(LOGGED)
     fit, seconds, unit = po.identify(system, [log], blind), math.inf, math.inf
     for _ in range(5 if os.environ.get("PNEUOPT_CC") != "" else 1):
         unit = min(unit, simulation_seconds(log))
@@ -145,7 +144,7 @@ def length(seconds: float) -> dict[str, float]:
 def rival(limit: float) -> dict[str, float]:
     """SciPy, as a user would write it: a right-hand side in Python, the record in one shot, finite differences."""
     _, truth, blind = _blind()
-    log = generate(*b32()).select(LOGGED)
+    log = generate(*po.catalog.b32()).select(LOGGED)
     data, u = log.trajectory, np.asarray(log.trajectory["valve_voltage"])
     channels = [n for n in LOGGED if n in NOISE]
     measured = np.column_stack([data[n] / NOISE[n] for n in channels])
@@ -207,7 +206,7 @@ def _flow(conductance: float, upstream: float, downstream: float) -> float:
 def full_space(limit: float) -> dict[str, float]:
     """Our IPOPT path on the first second of the log, from the same start."""
     system, truth, blind = _blind()
-    whole = generate(*b32()).select(LOGGED)
+    whole = generate(*po.catalog.b32()).select(LOGGED)
     log = po.Experiment(whole.trajectory.rows(0, SHORT), whole.noise, name="b32")
     problem = EstimationProblem(system, (log,), system.parameters | blind, po.LeastSquares())
     posed = problem.transcription(_start(log, blind))
@@ -223,12 +222,12 @@ def full_space(limit: float) -> dict[str, float]:
 
 
 def _start(log: po.Experiment, blind: po.ParameterSet) -> Start:
-    system = b32()[0].system()
+    system = po.catalog.b32()[0].system()
     return system.starts({log.name: Log(log.trajectory, system.parameters | blind)})[0]
 
 
 def _blind() -> tuple[Any, po.ParameterSet, po.ParameterSet]:
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     return drive.system(), truth, truth.with_values({n: drive.parameters.value(n) for n in WANTED}).freed(*WANTED)
 
 
@@ -239,7 +238,10 @@ def _off(found: po.ParameterSet, truth: po.ParameterSet) -> float:
 
 def _record(seconds: float, *, noisy: bool = True) -> po.Experiment:
     """B32's log of any length."""
-    true, noise = exact(b32()[1], seconds=seconds, substeps=FINE), {n: NOISE[n] for n in LOGGED if n in NOISE}
+    true, noise = (
+        exact(po.catalog.b32()[1], seconds=seconds, substeps=FINE),
+        {n: NOISE[n] for n in LOGGED if n in NOISE},
+    )
     rng = np.random.default_rng(1)
     logged = {n: true[n] + noisy * sigma * rng.standard_normal(len(true)) for n, sigma in noise.items()}
     return po.Experiment(true.select(LOGGED).with_columns(logged), noise, name="b32")

@@ -26,7 +26,6 @@ from scipy.integrate import solve_ivp
 import pneuopt as po
 from pneuopt.dynamics.compiled.compiler import find_compiler
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult, compile_function
-from pneuopt.models.catalog import b32
 from pneuopt.quantities.errors import require
 from problems.shared.arrays import Array, names, parameter_vector
 from problems.shared.b32 import FREE, VALVE, generate
@@ -74,7 +73,7 @@ def main() -> "pd.DataFrame":
 
 
 def _record() -> Record:
-    drive, truth = b32()
+    drive, truth = po.catalog.b32()
     system, numbers = drive.system(), parameter_vector(drive.system().parameters, truth)
     log = generate(drive, truth).trajectory
     start = np.array([log[n][0] if n in log else 0.0 for n in names(system.states)])

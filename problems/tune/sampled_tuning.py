@@ -21,7 +21,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import t32
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from problems.shared.claims import Claim, arguments, design, finish, frame
 from problems.shared.t32 import RANGES, STEP, VALUES
@@ -73,7 +72,7 @@ def run(samples: Sequence[float] = SAMPLES) -> dict[str, Run]:
 
 
 def benchmark(sample_time: float | None) -> tuple[po.ClosedLoop, po.ParameterSet]:
-    drive, hardware = t32()
+    drive, hardware = po.catalog.t32()
     pid = po.PID() if sample_time is None else po.PID(sample_time=sample_time, delay=DELAY)
     loop = po.ClosedLoop(drive.system(), pid, po.Dither(frequency=20.0))  # of which the offset alone is used
     own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
 
 import pneuopt as po
-from pneuopt.models.catalog import s32
 from problems.shared.claims import Claim, arguments, design, finish, frame
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ class Job:
 
 
 def run() -> Job:
-    drive, rig = s32()
+    drive, rig = po.catalog.s32()
     loop = po.ClosedLoop(drive.system(), po.PID(sample_time=1e-3), po.Dither(frequency=100.0), measured="speed")
     own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
     nominal = {"supply.pressure": 6e5 + ATMOSPHERE, "load.mass": 5.0, "cylinder.start": 0.1}

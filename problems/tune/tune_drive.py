@@ -25,7 +25,6 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.models.catalog import s32
 from pneuopt.plotting import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 from problems.shared.claims import METRICS, Claim, arguments, design, finish, frame
 from problems.tune.supply_and_load import RANGES
@@ -80,7 +79,7 @@ def run() -> Job:
 
 def loops() -> tuple[po.ClosedLoop, po.Rig, po.ParameterSet]:
     """The loop as it is tuned, the rig that it is tried on, the hand tuning with its ranges."""
-    drive, hardware = s32()
+    drive, hardware = po.catalog.s32()
     pid, dither = po.PID(sample_time=SAMPLE), po.Dither(frequency=100.0)
     loop = po.ClosedLoop(drive.system(), pid, dither, sensor=po.SensorLag(FILTER + SAMPLE / 2))
     sticking = replace(drive, friction=po.Karnopp(po.Stribeck()))

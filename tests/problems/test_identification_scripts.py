@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pneuopt.models import catalog
+import pneuopt as po
 from problems.identify import interval_coverage, mismatch
 from problems.shared import b32
 
@@ -69,7 +69,7 @@ def test_the_rig_sticks_where_the_smooth_model_creeps(monkeypatch: pytest.Monkey
     assert np.max(np.abs(position - np.round(position))) < 1e-6
     assert log.noise["position"] == pytest.approx(1e-5 / np.sqrt(12))
     assert np.mean(np.diff(position) == 0) > 0.3
-    assert set(mismatch.WANTED) <= set(catalog.b32()[1])
+    assert set(mismatch.WANTED) <= set(po.catalog.b32()[1])
 
 
 @pytest.mark.slow

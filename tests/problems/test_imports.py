@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PUBLIC = {"pneuopt", "pneuopt.plotting", "pneuopt.models.catalog"}
+PUBLIC = {"pneuopt", "pneuopt.plotting"}
 SEARCH = "runs a search's own simulator and merit, to compare what finds the better design with them, and how fast"
 INSIDE = {
     "problems/shared/b32.py": "makes its logs by machine code, and times one simulation of it as the unit of cost",

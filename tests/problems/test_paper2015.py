@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from pneuopt.models.catalog import r25, s32
+import pneuopt as po
 from pneuopt.quantities.errors import InputError
 from problems.shared.paper2015 import (
     KAPPA,
@@ -129,10 +129,10 @@ def test_equation_16_as_printed() -> None:
 
 
 def test_the_symbols_read_off_the_nonlinear_drive() -> None:
-    found, record = operating_point(*r25(), half_travel=1e-3), OperatingPoint()
+    found, record = operating_point(*po.catalog.r25(), half_travel=1e-3), OperatingPoint()
     for name in ("K_ma", "K_mb", "K_ca", "K_cb", "A_a", "n", "m", "p_ai", "V_0a", "T_s", "M_L", "k_v"):
         assert getattr(found, name) == pytest.approx(getattr(record, name), rel=2e-9), name
-    drive, p = r25()
+    drive, p = po.catalog.r25()
     off = operating_point(drive, p.with_values({"cylinder.start": 0.3}), half_travel=1e-3)
     assert off.m == pytest.approx((1.3051087903e-4 + 0.7 * record.A_a) / (1.3051087903e-4 + 0.3 * record.A_a))
     assert off.K_ma == pytest.approx(record.K_ma, rel=1e-9)  # the valve knows no volume
@@ -140,6 +140,6 @@ def test_the_symbols_read_off_the_nonlinear_drive() -> None:
 
 def test_another_drive_has_no_such_symbols() -> None:
     with pytest.raises(InputError, match="rodless, with Viscous"):
-        operating_point(*s32(), half_travel=1e-3)
+        operating_point(*po.catalog.s32(), half_travel=1e-3)
     with pytest.raises(InputError, match="rodless, with Viscous"):
-        operating_point(*r25(lugre=True), half_travel=1e-3)
+        operating_point(*po.catalog.r25(lugre=True), half_travel=1e-3)

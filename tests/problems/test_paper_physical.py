@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from pneuopt.models.catalog import r25
+import pneuopt as po
 from pneuopt.models.friction import Viscous
 from problems.paper import paper_dither, paper_physical
 from problems.shared.claims import Claim
@@ -35,7 +35,7 @@ def test_what_a_volt_moves_holds() -> None:
 
 def test_a_lagging_spool_moves_less_above_its_bandwidth() -> None:
     slow = linearised(lagging(Viscous()))
-    rigid = linearised(r25())
+    rigid = linearised(po.catalog.r25())
     at = {w: [paper_dither.moved(found, w, 12.0).force for found in (rigid, slow)] for w in (10.0, 1000.0)}
     assert at[10.0][1] == pytest.approx(at[10.0][0], rel=1e-2)
     assert at[1000.0][1] < 0.5 * at[1000.0][0]

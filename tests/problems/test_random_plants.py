@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pneuopt.models import catalog
+import pneuopt as po
 from problems.identify import random_plants
 from problems.shared import b32
 
@@ -28,7 +28,7 @@ def test_its_logs_are_those_of_tight_integration(kind: str, monkeypatch: pytest.
     monkeypatch.setattr(random_plants, "SAMPLES", 1000)
     monkeypatch.setattr(random_plants, "NOISE", dict.fromkeys(b32.NOISE, 1e-12))
     monkeypatch.setattr(b32, "NOISE", dict.fromkeys(b32.NOISE, 1e-12))
-    drive, given = catalog.b32(kind == "lugre")
+    drive, given = po.catalog.b32(kind == "lugre")
     truth = given.with_values(random_plants.drawn(kind, 1003))
     ours = random_plants.generate(kind, truth, 1003).trajectory
     tight = b32.generate(drive, truth, seconds=1.0).trajectory
@@ -37,7 +37,7 @@ def test_its_logs_are_those_of_tight_integration(kind: str, monkeypatch: pytest.
 
 
 def test_encoder_and_outliers() -> None:
-    truth = catalog.b32()[1]
+    truth = po.catalog.b32()[1]
     plain, coarse = (random_plants.generate("stribeck", truth, 1, *extra) for extra in ((), (1e-4, 0.01)))
     sigma = coarse.noise["position"]
     off = np.abs(coarse.trajectory["position"] - plain.trajectory["position"]) > 10 * sigma
