@@ -1,6 +1,7 @@
-"""What a loop is worth, without any optimiser: the certificate of every design.
+"""What a loop is worth, without any optimiser: simulated responses, metrics, margins, limit cycles, air and energy.
 
-Responses, metrics, margins, limit cycles, air; requirements, scenarios, the rig, the dither's verdict. It imports
-neither `shooting` nor `tuning`, so that a proof shares nothing with the search; `tuning`, `studies` and the rooms above
-import it. A newcomer adds a requirement: a class with its `Metric` in `requirements`.
+`evaluate` is the certificate of a design: it simulates tightly and shares no step with the search that found the gains.
+So this room imports neither shooting nor tuning, and no models; identification, tuning, studies and what is above them
+may import it. A newcomer adds a requirement: a class with its `Metric` in a file of its own (`energy.py` shows one) and
+a row of `REQUIREMENT_KINDS` in `requirements.py`; files, tables and searches read that row.
 """

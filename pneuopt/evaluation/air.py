@@ -1,14 +1,14 @@
-"""How much air a response draws from the supply, in normal litres."""
+"""Air consumption of a response, in normal litres."""
 
 from pneuopt.evaluation.step_record import StepRecord, ValuesAndSlopes
 
-ANR_DENSITY = 1.185  # [kg/m^3] of air as normal litres count it: ISO 8778 (ANR), 100 kPa, 20 degC, 65 %
-LITRES_PER_CUBIC_METRE = 1e3  # in a cubic metre
-AIR_CHANNEL = "air"  # of a meter: mass flow from the supply [kg/s]
+ANR_DENSITY = 1.185  # density of air in the standard state of ISO 8778 (ANR: 100 kPa, 20 degC, 65 % humidity) [kg/m^3]
+LITRES_PER_CUBIC_METRE = 1e3
+AIR_CHANNEL = "air"  # the meter's channel with the mass flow drawn from the supply [kg/s]
 
 
 def air_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The volume of the air drawn from the step to the end [l(ANR)].
+    """Volume of the air that is drawn from the step to the end of the record [l(ANR)].
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Margins and peaks of many loops at once, as a search reads them; `margins` has those of one, to machine precision."""
+"""Margins and sensitivity peaks of many loops at once, for searches; `margins` gives one loop's exactly."""
 
 from collections.abc import Callable, Collection
 from math import inf
@@ -15,16 +15,16 @@ from pneuopt.dynamics.system import names
 from pneuopt.evaluation.margins import ComplexArray, batch_frequency_response, controller_parts
 from pneuopt.quantities.arrays import Array
 
-PEAK_REFINEMENTS, PEAK_GRID_POINTS = (
-    3,
-    9,
-)  # grids about a coarse peak, each within two steps of the last, and their frequencies
+# Finer grids about a coarse peak, each within two steps of the last, and the frequencies of each grid: fewer of either
+# show a sharp resonance too low, more cost time in proportion.
+PEAK_REFINEMENTS = 3
+PEAK_GRID_POINTS = 9
 
 
 def batch_margin_function(
     loop: ClosedLoop, omega: ArrayLike
 ) -> Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]:
-    """Margins and the like on a grid of frequencies, for many gains and operating points at once.
+    """Function that gives margins, sensitivities and noise gains for many gains and operating points at once.
 
     Parameters
     ----------
@@ -36,9 +36,10 @@ def batch_margin_function(
     -------
     callable
         ``(p, x, command, only) -> found``, shapes (m, n_parameters) in the order of ``loop.parameters``,
-        (m, n_plant_states) and (m,); the plant's other inputs are zero. Found is of shape (m,) for each name in `only`:
-        "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in `Margins`, crossings
-        interpolated, and "NoiseGain"; peaks refined between the grid's frequencies. What is impossible is not checked.
+        (m, n_plant_states) and (m,); the plant's other inputs are zero. The result has an array of shape (m,) for each
+        name in `only`: "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in
+        `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's frequencies. Arguments
+        are not checked, nor is the stability of the loops.
     """
     w = np.asarray(omega, dtype=float)
     plants = _plant_responses(loop, w)
@@ -72,7 +73,7 @@ def _refine_peaks(
     omega: Array,
     on_grid: Array,
 ) -> Array:
-    """The largest size of a response on a grid and, ever finer, about its two highest peaks there, shape (m,)."""
+    """Largest magnitude of a response, shape (m,), on a grid and on finer grids about its two highest peaks."""
     m, last = len(on_grid), len(omega) - 1
     edged = np.pad(on_grid, ((0, 0), (1, 1)), constant_values=-inf)
     is_peak = (on_grid >= edged[:, :-2]) & (on_grid >= edged[:, 2:])
@@ -93,23 +94,26 @@ def _refine_peaks(
 
 
 def _plant_responses(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], Callable[[Array], ComplexArray]]:
-    """Responses of the plant with sensor and hold at frequencies of shape (n,) or (m, n); `w` are typical ones."""
+    """Function that gives responses of plants with sensor and hold, at frequencies of shape (n,) or (m, n).
+
+    On the frequencies `w` it is checked that partial fractions are exact enough.
+    """
     plant = loop.plant
     x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
     command, output = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
     xdot, y = plant.ode(0, x, u, q)
-    scale = ca.DM([s.nominal for s in plant.states])  # which makes the eigenvectors' matrix well conditioned
+    scale = ca.DM([s.nominal for s in plant.states])  # scaled states make the matrix of eigenvectors well conditioned
     inward, outward = ca.diag(1 / scale), ca.diag(scale)
     A, B = (inward @ ca.jacobian(xdot, v) for v in (x, u[command]))
     C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
     matrices = compile_function(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
     n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
-    shapes, own = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
+    shapes, columns = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
 
     def linearise(p: Array, x: Array, commands: Array) -> Callable[[Array], ComplexArray]:
         us = np.zeros((len(p), u.numel()))
         us[:, command] = commands
-        found = [matrices(*row) for row in zip(x, us, p[:, own], strict=True)]
+        found = [matrices(*row) for row in zip(x, us, p[:, columns], strict=True)]
         A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
         plant, lag = _partial_fraction_response(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
         return lambda w: np.asarray((plant(w) + D) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
@@ -118,21 +122,21 @@ def _plant_responses(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Arra
 
 
 def _gain_margins(L: ComplexArray) -> Array:
-    """Crossings of -180 deg are interpolated in phase and logarithm of gain."""
+    """Gain margins, shape (m,); crossings of -180 deg are interpolated in phase and logarithm of gain."""
     phase, gain = np.angle(-L), np.log(np.abs(L))
     at, crossing = _interpolate_crossings(phase, gain, np.abs(np.diff(phase, axis=1)) < np.pi)
     return np.asarray(np.exp(_smallest_in_rows(np.where(crossing, -at, inf))))
 
 
 def _phase_margins(L: ComplexArray) -> Array:
-    """Crossings of gain one, likewise."""
+    """Phase margins, shape (m,) [deg]; crossings of gain one are interpolated likewise."""
     phase, gain = np.unwrap(np.angle(-L), axis=1), np.log(np.abs(L))
     at, crossing = _interpolate_crossings(gain, phase)
     return np.degrees(_smallest_in_rows(np.where(crossing, (at + np.pi) % (2 * np.pi) - np.pi, inf)))
 
 
 def _interpolate_crossings(values: Array, others: Array, allowed: Any = True) -> tuple[Array, NDArray[np.bool_]]:
-    """The others where the values cross zero, linear between neighbours, and whether they do."""
+    """Others at the zero crossings of the values, linear between neighbours, and a mask of the crossings."""
     step = np.diff(values, axis=1)
     crossing = (values[:, :-1] * values[:, 1:] <= 0) & (step != 0) & allowed
     share = -values[:, :-1] / np.where(crossing, step, 1.0)
@@ -140,7 +144,7 @@ def _interpolate_crossings(values: Array, others: Array, allowed: Any = True) ->
 
 
 def _smallest_in_rows(rows: Array) -> Array:
-    """The entry of each row that is smallest in size."""
+    """Entry of each row with the smallest magnitude."""
     return np.asarray(rows[np.arange(len(rows)), np.argmin(np.abs(rows), axis=1)])
 
 
@@ -156,9 +160,9 @@ _PEAK_FUNCTIONS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
 
 
 def _partial_fraction_response(A: Array, B: Array, C: Array, typical: Array) -> Callable[[Array], ComplexArray]:
-    """``C (jw I - A)^-1 B`` of m systems by partial fractions, shape (m, n); solved where those are inexact.
+    """Function for ``C (jw I - A)^-1 B`` of m systems, shape (m, n), by partial fractions; a solve where inexact.
 
-    At frequencies of shape (n,), the same for all, or (m, n).
+    It takes frequencies of shape (n,), the same for all systems, or (m, n).
     """
     try:
         poles, V = np.linalg.eig(A)
@@ -170,7 +174,7 @@ def _partial_fraction_response(A: Array, B: Array, C: Array, typical: Array) -> 
         return np.asarray((parts[:, None] / (1j * w[..., None] - poles[:, None])).sum(axis=-1))
 
     probe = typical[[0, len(typical) // 2, len(typical) - 1]]
-    with np.errstate(all="ignore"):  # a response of zero, a closed valve's, is solved for
+    with np.errstate(all="ignore"):  # a response of zero, a closed valve's, counts as inexact
         bad = ~(np.abs(sum_fractions(probe) / batch_frequency_response(A, B, C, probe) - 1) < 1e-6).all(axis=1)
 
     def response(w: Array) -> ComplexArray:

@@ -1,4 +1,4 @@
-"""Cases of a tuning: every reference on every plant that the design has to live with, the nominal one first."""
+"""Cases of a tuning: every reference on every plant that the design must suit, the nominal plant first."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,9 +21,9 @@ class TuningCase:
     ----------
     reference : Step
     scenario : str
-        Empty: the nominal plant.
+        Its name; empty for the nominal plant.
     values : mapping of str to float or Factor
-        What differs there.
+        The parameter values that differ from the nominal plant.
     """
 
     reference: Step
@@ -32,15 +32,15 @@ class TuningCase:
 
     @property
     def label(self) -> str:
-        """How a table heads it: "0 to 0.2 [load.mass high]"."""
+        """Heading of its column in a table: "0 to 0.2 [load.mass high]"."""
         return f"{self.reference.label} [{self.scenario}]" if self.scenario else self.reference.label
 
     def case_parameters(self, parameters: ParameterSet) -> ParameterSet:
-        """The parameters of this case's plant, and gains."""
+        """Parameters of this case: its plant and gains."""
         return apply_scenario(parameters, self.values)
 
     def case_vectors(self, p: Array, order: Sequence[str]) -> Array:
-        """The same on vectors of every parameter, shape (m, n_parameters), by copy."""
+        """Copy of parameter vectors, shape (m, n_parameters), with this case's values in place."""
         out = p.copy()
         for n, value in self.values.items():
             k = order.index(n)
@@ -48,21 +48,21 @@ class TuningCase:
         return out
 
     def slopes(self, names: Sequence[str]) -> Array:
-        """The derivative of this case's parameters to the candidate's, shape (n,): 0 where a value stands for it."""
+        """Derivatives of this case's parameters to the candidate's, shape (n,); 0 where the scenario fixes a value."""
         values = (self.values.get(n, Factor(1.0)) for n in names)
         return np.array([v.share if isinstance(v, Factor) else 0.0 for v in values])
 
     def initial(self, loop: ClosedLoop, parameters: ParameterSet) -> Array:
-        """The state in which the loop waits for the step.
+        """State in which the loop waits for the step.
 
         Raises
         ------
         InputError, ConvergenceError
-            As `ClosedLoop.initial`; the message names the scenario.
+            As from `ClosedLoop.initial`; the message names the scenario.
         """
-        own, step = self.case_parameters(parameters), self.reference
+        values, step = self.case_parameters(parameters), self.reference
         try:
-            return loop.initial(own, reference=step.initial, start=step.start)
+            return loop.initial(values, reference=step.initial, start=step.start)
         except ConvergenceError as error:
             raise ConvergenceError(f"{self._message_prefix}{error}", error.solution) from None
         except HardwareError as error:
@@ -78,16 +78,16 @@ class TuningCase:
 def cases(
     references: Sequence[Step], scenarios: Scenarios, parameters: ParameterSet, tuned: Collection[str] = ()
 ) -> tuple[TuningCase, ...]:
-    """Every reference on the nominal plant, then on each scenario's.
+    """Cases of every reference on the nominal plant, then on each scenario's plant.
 
     Parameters
     ----------
     references : sequence of Step
     scenarios : mapping of str to mapping
     parameters : ParameterSet
-        Those that a scenario may change.
+        The parameters that a scenario may change.
     tuned : collection of str
-        Those of them that a scenario may change by a factor only.
+        Names of tuned parameters, which a scenario may change by a `Factor` only.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def cases(
     """
     labels = [r.label for r in references]
     twice = next((n for n in labels if labels.count(n) > 1), "")
-    require(not twice, f"two references are {twice!r}, and tables tell them by that; leave one out")
+    require(not twice, f"two references are {twice!r}, and tables name them by that label; leave one out")
     for name, values in scenarios.items():
         require(bool(name), "a scenario needs a name: {'heavy load': {'load.mass': 8.0}}")
         _check_scenario(name, values, parameters, tuned)
@@ -111,6 +111,6 @@ def _check_scenario(
     for n, value in values.items():
         require(
             isinstance(value, Factor) or n not in tuned,
-            f"scenario {name!r}: {n} is tuned, so no scenario can give it a value; for a tolerance around it write "
+            f"scenario {name!r}: {n} is tuned, so no scenario can fix its value; for a tolerance around it write "
             f"tolerances(parameters, {{{n!r}: 0.01}})",
         )

@@ -1,7 +1,7 @@
-"""Means of sampled signals over a dither's period: along the record, and at its end.
+"""Mean of sampled signals over a dither period: along the record, and at its end.
 
-`period_mean` takes signals that are linear between samples. `DitherPeriodMean` takes signals whose integral is known, a
-state of the simulation: its means are as exact as that from ten samples a period on, where `period_mean` needs twenty.
+`period_mean` takes signals to be linear between samples and needs twenty samples a period. `DitherPeriodMean` takes
+signals with their integral, which is a state of the simulation, and is as exact as that state from ten samples on.
 """
 
 from dataclasses import dataclass
@@ -10,12 +10,16 @@ import numpy as np
 
 from pneuopt.quantities.arrays import Array
 
-FINAL_PERIODS = 5  # whole dither periods at the end of a record over which its final value is averaged
-TAIL_SHARE = 0.05  # of a record without dither, that counts as its end
+# Whole dither periods at the end of a record over which its final value is averaged: fewer average less noise, more
+# reach back into the transient.
+FINAL_PERIODS = 5
+# Share of a record that counts as its end, where ripple is read and a settling comes too late to count: a smaller one
+# sees less than a cycle of slow hunting, a larger one reaches back into the transient.
+TAIL_SHARE = 0.05
 
 
 def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) -> Array:
-    """Centred mean over one period of signals that are linear between samples, and `initial` before the first.
+    """Centred mean over one period of signals that are linear between samples and `initial` before the first.
 
     Parameters
     ----------
@@ -25,7 +29,7 @@ def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) ->
     period : float
         [s]
     at : ndarray, shape (k,)
-        Instants, half a period from the end at most [s].
+        Instants, at least half a period before the end [s].
 
     Returns
     -------
@@ -39,7 +43,7 @@ def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) ->
 
 
 def end_mean(t: Array, y: Array, period: float | None) -> Array:
-    """The final values as `step_metrics` reads them, shape (m,): the last sample, or the mean over the last periods."""
+    """Final values, shape (m,): the last sample, or with a period the mean over the last whole periods."""
     if period is None:
         return y[:, -1]
     t, y = tail(t, y, period)
@@ -47,7 +51,7 @@ def end_mean(t: Array, y: Array, period: float | None) -> Array:
 
 
 def tail(t: Array, y: Array, period: float | None) -> tuple[Array, Array]:
-    """The end of a record: its last periods, five or as many as there are, without dither its last 5 %."""
+    """End of a record: its last five periods, or as many as it has; without dither its last 5 %."""
     duration = (
         TAIL_SHARE * (t[-1] - t[0]) if period is None else period * min(FINAL_PERIODS, int((t[-1] - t[0]) / period))
     )
@@ -59,14 +63,14 @@ def tail(t: Array, y: Array, period: float | None) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class DitherPeriodMean:
-    """A centred mean over `period`, of integrals that are cubic between samples.
+    """Centred mean over a period, from an integral that is taken as cubic between samples.
 
     Parameters
     ----------
     period : float
         [s]
     spacing : float
-        Of the samples [s].
+        Spacing of the samples [s].
     """
 
     period: float
@@ -74,15 +78,15 @@ class DitherPeriodMean:
 
     @property
     def half_period_samples(self) -> int:
-        """Whole samples in half a period."""
+        """Number of whole samples in half a period."""
         return int(self.period / 2 / self.spacing + 1e-9)
 
     def mean_count(self, n: int) -> int:
-        """How many of n samples, from the first on, have a mean."""
+        """Number of samples, of n from the first on, that have a mean."""
         return max(0, n - self.half_period_samples - 1)
 
     def means(self, signal: Array, integral: Array, initial: float, stride: int = 1) -> Array:
-        """Means at every `stride`-th sample that has one.
+        """Return the means at every `stride`-th sample that has one.
 
         Parameters
         ----------
@@ -117,7 +121,7 @@ class DitherPeriodMean:
 
 
 def _integral(t: Array, y: Array, whole: Array, initial: float, at: Array) -> Array:
-    """From the first sample to `at`; `whole` is the integral to each sample."""
+    """Integral from the first sample to `at`, from the integrals `whole` up to each sample."""
     k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     ahead = at - t[k]
     inside: Array = whole[:, k] + ahead * (y[:, k] + 0.5 * ahead * (y[:, k + 1] - y[:, k]) / (t[k + 1] - t[k]))

@@ -1,4 +1,4 @@
-"""`judge_dither`: whether a dither is worth having, in numbers: the loop with and without it, and what it moves."""
+"""`judge_dither`: whether a dither is useful: the loop's metrics with and without it, and what the dither moves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,14 +24,16 @@ from pneuopt.quantities.parameters import ParameterSet
 if TYPE_CHECKING:
     import pandas as pd
 
-NEGLIGIBLE_AMPLITUDE = 1e-9  # of the amplitude is none, but averages and end values are read over the same periods
-MIN_LOOSENING_FORCE = (
-    0.5  # of the static friction: a force below half of it frees nothing in company of a working pressure
-)
+# Amplitude of the loop "without" dither, as a share of the judged one: at zero its means would not be read over the
+# same periods; a much larger one would act as a dither.
+NEGLIGIBLE_AMPLITUDE = 1e-9
+# Share of the static friction below which a dither's force on a piston at rest is said not to loosen it: the working
+# pressure gives the rest of the force, so a dither may loosen with less than all of it; lower promises too much.
+MIN_LOOSENING_FORCE = 0.5
 
 
 class Usefulness(Enum):
-    """What a dither does to a loop."""
+    """Verdict on a dither."""
 
     USEFUL = "useful"
     USELESS = "useless"
@@ -39,41 +41,46 @@ class Usefulness(Enum):
 
 
 class Criterion(NamedTuple):
-    """A metric by which dithers are judged: what it is called, by how much it has to change, of what."""
+    """A criterion on dithers: a metric's label and the least change that counts, relative to its value or absolute."""
 
     label: str
     min_change: float
     relative: bool
 
 
-CRITERIA: Mapping[str, Criterion] = {  # the first that changes decides, where some improve and some do not
-    "LimitCycleAmplitude": Criterion("limit cycle", 0.02, relative=False),  # of the step
+CRITERIA: Mapping[str, Criterion] = {  # where some improve and others do not, the first that changes decides
+    "LimitCycleAmplitude": Criterion("limit cycle", 0.02, relative=False),  # [fraction of the step]
     "SettlingTime": Criterion("settling time", 0.05, relative=True),
-    "SteadyStateError": Criterion("error that stays", 0.5, relative=False),  # [%]
+    "SteadyStateError": Criterion("steady-state error", 0.5, relative=False),  # [%]
     "IAE": Criterion("integral of the error", 0.05, relative=True),
     "Overshoot": Criterion("overshoot", 1.0, relative=False),  # [%]
 }
-PRICE_METRICS = {"Ripple": "ripple", "AirUse": "air", "ValveTravel": "valve travel", "PeakControl": "largest command"}
+PRICE_METRICS = {
+    "Ripple": "ripple",
+    "AirUse": "air consumption",
+    "ValveTravel": "valve travel",
+    "PeakControl": "largest command",
+}
 
 
 @dataclass(frozen=True)
 class DitherEffect:
-    """What a dither moves, by the balance of its first harmonic with openings and friction as they are; NaN: not known.
+    """Amplitudes that a dither causes, by harmonic balance of the nonlinear plant; NaN where they are not known.
 
     Attributes
     ----------
     amplitude, frequency : float
         [command's unit], [Hz]
     spool : float
-        The spool's swing [half travels].
+        Amplitude of the spool [half travels].
     valve_gain : float
-        What the valve's lag leaves of it [1].
+        Ratio of the spool's amplitude to the command's, which the valve's lag reduces [1].
     force : float
         Amplitude of the force on a piston held fast at rest [N].
     speed, travel : float
-        Amplitudes of a piston that moves at the reference [m/s], [m].
+        Amplitudes of a piston that moves at the reference's final speed [m/s], [m].
     drive_frequency : float
-        At which the load swings on the air in the chambers [Hz].
+        Natural frequency of the load on the air in the chambers, without friction [Hz].
     """
 
     amplitude: float
@@ -88,20 +95,20 @@ class DitherEffect:
 
 @dataclass(frozen=True, eq=False)
 class DitherVerdict:
-    """What `judge_dither` found; printed, it is what an engineer reads.
+    """Verdict of `judge_dither`: as text, the verdict in the first line and a reason in each further line.
 
     Attributes
     ----------
     usefulness : Usefulness
     reasons : tuple of str
-        What decided, the price, and why, in sentences.
+        What decided, the price and the mechanism, a sentence each.
     table : DataFrame
-        A row a metric of `evaluate`, columns "without" and "with": the worst over the references.
+        A row for each metric of `evaluate`, columns "without" and "with": the worst over the references.
     effect : DitherEffect
     baseline : str
-        What "without" is: the same gains, or a design of its own.
+        What "without" stands for: the same gains, or a design of its own.
     unit : str
-        The command's.
+        Unit of the command.
     """
 
     usefulness: Usefulness
@@ -125,22 +132,22 @@ def judge_dither(
     without: ParameterSet | None = None,
     band: float = 0.02,
 ) -> DitherVerdict:
-    """Certify a loop with and without its dither, and say whether it is worth having, and why.
+    """Evaluate a loop with and without its dither, and say whether the dither is useful, and why.
 
-    Better or worse is what changes by more than these: the settling time and the integral of the error by 5 %, the
-    error that stays by half a percent of the step, the overshoot by one, a limit cycle by two. Where some improve and
-    others do not, the first of limit cycle, settling time, error, integral, overshoot decides. A dither that swings the
-    signal by more than the step is harmful, whatever the average does.
+    A metric counts as better or worse where it changes by more than this: settling time and integral of the absolute
+    error by 5 %, steady-state error by 0.5 % of the step, overshoot by 1 %, a limit cycle's amplitude by 2 %. Where
+    some improve and others do not, the first of limit cycle, settling time, steady-state error, integral, overshoot
+    decides. A dither that swings the signal by more than the step is harmful, whatever the mean over its period does.
 
     Parameters
     ----------
     loop : ClosedLoop
     references : Step or sequence of Step
     parameters : ParameterSet
-        With the dither; its amplitude is positive.
+        Values of the design with dither, whose amplitude is positive.
     without : ParameterSet, optional
-        The design to compare with; its dither does not count. By default the same gains: what the dither does there.
-        Give the gains of a tuning without dither to see whether it is needed.
+        Values of the design to compare with, whose dither is switched off. By default the same gains, which shows what
+        the dither changes; the gains of a tuning without dither show whether a dither is needed at all.
     band : float
         Half width of the settling band, a fraction of the step.
 
@@ -170,10 +177,10 @@ def judge_dither(
     table = _compare_designs(loop, steps, plain, full, band)
     effect = dither_effect(loop, steps[0], full)
     sizes = [abs(s.size) for s in steps]
-    own = float(table["with"]["Ripple"]) if isnan(effect.speed) else 2 * effect.speed
-    size = _format_with_prefix(own, loop.feedback.unit)
-    coarse = [f"worse: it swings {loop.feedback.name} by {size}, more than the step itself"]
-    coarse = coarse if own > min(sizes) else []
+    swing = float(table["with"]["Ripple"]) if isnan(effect.speed) else 2 * effect.speed
+    size = _format_with_prefix(swing, loop.feedback.unit)
+    coarse = [f"worse: the dither swings {loop.feedback.name} by {size}, more than the step itself"]
+    coarse = coarse if swing > min(sizes) else []
     usefulness, found = _weigh_changes(table, max(sizes), loop, coarse)
     rival = "the same gains without it" if without is None else "a design of its own without it"
     return DitherVerdict(
@@ -182,15 +189,15 @@ def judge_dither(
 
 
 def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> DitherEffect:
-    """What the dither moves: on a `PneumaticDrive` all of it, on another plant the swing of the measured signal.
+    """Amplitudes that the dither causes: force, spool and motion on a `PneumaticDrive`, speed on other plants.
 
     Parameters
     ----------
     loop : ClosedLoop
     reference : Step
-        In whose final value the piston moves; where it starts is where it is held.
+        The piston moves at its final value, and is held at its start.
     parameters : ParameterSet
-        With the dither's amplitude and frequency.
+        Values with the dither's amplitude and frequency.
     """
     full = loop.parameters | parameters
     found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
@@ -217,7 +224,7 @@ def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -
 
 
 def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
-    """Why a dither does what it does, against valve, dead zone and stiction; a sentence each.
+    """Sentences on why the dither acts as it does: clipping, valve lag and dead zone, static friction, motion.
 
     Parameters
     ----------
@@ -225,33 +232,35 @@ def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: Parameter
     effect : DitherEffect
     parameters : ParameterSet
     """
-    p, e, told = (loop.parameters | parameters), effect, list[str]()
-    told += _describe_clipping(loop, p)
+    p, e, sentences = (loop.parameters | parameters), effect, list[str]()
+    sentences += _describe_clipping(loop, p)
     if not isnan(e.valve_gain):
         dead = p.value("valve.dead_zone")
         lag = f" at {p.value('valve.bandwidth'):.3g} Hz bandwidth" if "valve.bandwidth" in p else ""
         zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
-        follows = f"the spool follows {100 * e.valve_gain:.0f} % of it{lag}"
-        told.append(f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}")
+        follows = f"the spool follows {100 * e.valve_gain:.0f} % of the dither{lag}"
+        sentences.append(f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}")
     static = next((p.value(f"friction.{n}") for n in ("static", "coulomb") if f"friction.{n}" in p), nan)
     if not isnan(e.force):
         against = "" if isnan(static) else f" against a static friction of {static:.3g} N"
-        weak = ": it does not loosen it" if e.force < MIN_LOOSENING_FORCE * static else ""
-        told.append(f"on a piston at rest it makes +-{_format_with_prefix(e.force, 'N')}{against}{weak}")
-    if not isnan(e.speed):
-        told.append(
-            f"a moving one swings by +-{_format_with_prefix(e.speed, 'm/s')} and +-{_format_with_prefix(e.travel, 'm')}"
+        weak = ": too little to loosen it" if e.force < MIN_LOOSENING_FORCE * static else ""
+        sentences.append(
+            f"the force on a piston at rest swings by +-{_format_with_prefix(e.force, 'N')}{against}{weak}"
         )
+    if not isnan(e.speed):
+        speed, travel = _format_with_prefix(e.speed, "m/s"), _format_with_prefix(e.travel, "m")
+        sentences.append(f"a moving piston swings by +-{speed} and +-{travel}")
     if not isnan(e.drive_frequency):
         ratio = e.frequency / e.drive_frequency
-        told.append(f"its {e.frequency:.3g} Hz are {ratio:.2g} times the {e.drive_frequency:.3g} Hz of load on air")
-    return tuple(told)
+        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the air"
+        sentences.append(f"the dither's {e.frequency:.3g} Hz are {ratio:.2g} times {natural}")
+    return tuple(sentences)
 
 
 def _compare_designs(
     loop: ClosedLoop, steps: Sequence[Step], plain: ParameterSet, full: ParameterSet, band: float
 ) -> "pd.DataFrame":
-    """The worst over the references; a settling time that is never is infinite."""
+    """Worst metrics over the references, without and with dither; a loop that never settles takes infinitely long."""
     import pandas as pd
 
     columns = {}
@@ -263,10 +272,10 @@ def _compare_designs(
 
 
 def _weigh_changes(
-    table: "pd.DataFrame", size: float, loop: ClosedLoop, told: list[str]
+    table: "pd.DataFrame", size: float, loop: ClosedLoop, objections: list[str]
 ) -> tuple[Usefulness, tuple[str, ...]]:
-    """The verdict, and what it stands on, from what is told already: against it."""
-    signs = [-1] * len(told)
+    """Verdict and its reasons, from the changes of the metrics and the objections that are known beforehand."""
+    reasons, signs = [*objections], [-1] * len(objections)
     for metric, (words, least, relative) in CRITERIA.items():
         before, after = (float(table[c][metric]) for c in ("without", "with"))
         room = least * max(before, after) if relative else least * (size if "Limit" in metric else 1.0)
@@ -276,14 +285,14 @@ def _weigh_changes(
         change = (
             f"{words} {_format_metric(metric, before, loop)} without, {_format_metric(metric, after, loop)} with it"
         )
-        told.append(f"{'better' if after < before else 'worse'}: {change}")
+        reasons.append(f"{'better' if after < before else 'worse'}: {change}")
     if not signs:
         kept = ("SettlingTime", "SteadyStateError")
         figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), loop)}" for m in kept]
-        told.append(f"nothing changes: {', '.join(figures)}")
-    told.append("price: " + ", ".join(_price_clause(n, table, loop) for n in PRICE_METRICS if n in table.index))
+        reasons.append(f"nothing changes: {', '.join(figures)}")
+    reasons.append("price: " + ", ".join(_price_clause(n, table, loop) for n in PRICE_METRICS if n in table.index))
     verdict = Usefulness.USELESS if not signs else Usefulness.USEFUL if signs[0] > 0 else Usefulness.HARMFUL
-    return verdict, tuple(told)
+    return verdict, tuple(reasons)
 
 
 def _price_clause(metric: str, table: "pd.DataFrame", loop: ClosedLoop) -> str:
@@ -302,7 +311,7 @@ def _format_metric(metric: str, value: float, loop: ClosedLoop) -> str:
 
 
 def _format_with_prefix(value: float, unit: str) -> str:
-    """With a prefix that leaves no row of zeros.
+    """Value with its unit and an SI prefix that avoids leading zeros.
 
     Examples
     --------
@@ -316,7 +325,7 @@ def _format_with_prefix(value: float, unit: str) -> str:
 
 
 def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
-    """Where offset and amplitude alone run into the command's limits, or the valve's."""
+    """Sentence where offset and amplitude alone exceed the limits of the command or the valve; none otherwise."""
     low, high, whose = command_range(p)
     least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
     if low <= least and most <= high:
@@ -329,7 +338,7 @@ def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
 
 
 def _try_rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Rest | None:
-    """Where the plant stands or moves so; None where it cannot."""
+    """Rest or steady motion of the plant with these values; None where there is none."""
     if plant.rest_hook is None:
         return None
     try:
@@ -339,7 +348,7 @@ def _try_rest(plant: System, p: ParameterSet, known: Mapping[str, float]) -> Res
 
 
 def _state_harmonics(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Rest | None) -> dict[str, complex]:
-    """The first harmonics about a rest; empty where none is found."""
+    """First harmonics of the states about a rest; empty where the harmonic balance does not converge."""
     assert loop.dither is not None
     at = None if rest is None else {**rest.states, **rest.inputs}
     try:
@@ -349,7 +358,7 @@ def _state_harmonics(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Res
 
 
 def _clamp_piston(plant: System) -> System:
-    """The plant with its piston clamped: what moves it has no rate."""
+    """The plant with its piston clamped: position, speed and friction states have no rate."""
     t, x, u, p = (ca.SX.sym(n, plant.ode.size1_in(k)) for k, n in enumerate("txup"))
     xdot, y = plant.ode(t, x, u, p)
     clamped = [n in ("position", "speed") or n.startswith("friction.") for n in names(plant.states)]

@@ -1,21 +1,21 @@
-"""`EnergyUse`: the energy that a drive draws from its source, air or electricity, while it follows a step."""
+"""`EnergyUse`: the energy that a drive draws from its supply or motor while it follows a step."""
 
 from typing import final
 
 from pneuopt.evaluation.metric import AtMost, Metric, Source
 from pneuopt.evaluation.step_record import StepRecord, ValuesAndSlopes
 
-POWER_CHANNEL = "power"  # of a meter: drawn from the plant's source [W]
+POWER_CHANNEL = "power"  # the meter's channel with the power drawn from the plant's source [W]
 
 
 def energy_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The integral of the power from the step to the end [J]."""
+    """Integral of the power from the step to the end of the record [J]."""
     return record.metered_integral(POWER_CHANNEL)
 
 
 @final
 class EnergyUse(AtMost):
-    """Energy drawn from the plant's source, from the step to the end of the horizon [J].
+    """Energy that the plant draws from its source, from the step to the end of the horizon [J].
 
     Which power counts is what the plant's meter shows. Of a pneumatic drive it is the air power: the work that the air
     drawn could do in an isothermal expansion from supply to ambient pressure. An ideal gas of mass m with p V = m R T

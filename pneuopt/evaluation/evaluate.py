@@ -1,4 +1,4 @@
-"""`evaluate`: what a loop's gains are worth, by a simulation that shares nothing with the search; or on a rig."""
+"""`evaluate`: the certificate of a loop's gains, by a simulation that shares nothing with the search; or on a rig."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
-POINTS_PER_READING = 4  # points of the record a reading of the search's
+# Points of the simulated record for each reading of a search: with one, the record would miss what happens between the
+# search's readings just as the search does; more cost time in proportion.
+POINTS_PER_READING = 4
 
 
 def evaluate(
@@ -43,19 +45,19 @@ def evaluate(
     band: float = 0.02,
     envelope: Envelope = (),
 ) -> "pd.DataFrame":
-    """Certified metrics: by the tight independent simulation, at the given parameters.
+    """Metrics of a loop at the given parameters, by a tight simulation that no search shares (the certificate).
 
     Parameters
     ----------
     loop : ClosedLoop or Rig
-        What is measured is the plant's true signal, not what a sensor shows the controller of it. A rig's loop runs
-        behind the rig's actuator and sensors (`record`, seed 0), and is measured at the controller's samples;
-        PeakControl is then what gets through the actuator. Margins are those of a smooth loop: a rig has none.
+        The plant's true signal is measured, not a sensor's reading of it. A rig's loop runs with the rig's actuator
+        and sensors (`record`, seed 0) and is measured at the controller's samples; PeakControl is then that of the
+        command after the actuator. A rig has no margins, which are those of a smooth loop.
     references : Step or sequence of Step
-        Each from rest, or from steady motion.
+        Each step begins from rest or from steady motion.
     parameters : ParameterSet
     scenarios : mapping of str to mapping, optional
-        Further plants, or tolerances: of `corners`, `samples`, `draws`, `tolerances`.
+        Further plants or tolerances, from `corners`, `samples`, `draws` or `tolerances`.
     band : float
         Half width of the settling band around the reference, a fraction of the step.
     envelope : sequence of (float, float, float)
@@ -64,14 +66,14 @@ def evaluate(
     Returns
     -------
     DataFrame
-        A row a metric, a column a reference ("0 to 0.25"), then one a reference and scenario
-        ("0 to 0.25 [load.mass high]"): those of `step_metrics`, LimitCycleAmplitude [measured unit],
-        LimitCycleFrequency [Hz] and StickShare where it hunts, of a pneumatic drive AirUse [l(ANR)] and ValveTravel
-        [half travels], then, not for a rig,
-        MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin [deg] and NoiseGain [command's
-        unit/measured unit] of the loop linearised about the state and command in which the response ends, under
-        dither their means over its last period, with the slope that friction has at that speed, of drives that have a
-        load FrictionSlope [N s/m]; infinite, and the margins NaN, where that loop is unstable.
+        A row for each metric, a column for each reference ("0 to 0.25"), then one for each reference and scenario
+        ("0 to 0.25 [load.mass high]"). The rows: those of `step_metrics`; LimitCycleAmplitude [measured unit], 0
+        without hunting, LimitCycleFrequency [Hz] and StickShare; the metrics that the plant's meter shows, AirUse
+        [l(ANR)], ValveTravel [half travels] and EnergyUse [J]; and, not for a rig, those of the loop linearised about
+        the state and command in which the response ends, under dither about their means over its last period:
+        MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin [deg], NoiseGain [command's unit/measured
+        unit], and FrictionSlope [N s/m] for drives with a load. Where that loop is unstable, its margins are NaN, its
+        sensitivities and noise gain infinite.
 
     Raises
     ------
@@ -110,7 +112,7 @@ def evaluate(
 
 
 def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
-    """The response that `evaluate` measures, from rest or from steady motion.
+    """Response that `evaluate` measures, from rest or from steady motion.
 
     Parameters
     ----------
@@ -121,7 +123,7 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     Returns
     -------
     Trajectory
-        Of a loop states and outputs, simulated tightly, on a grid finer than the search's; of a rig the truth.
+        States and outputs of a loop, simulated tightly on a grid finer than a search's; for a rig, its truth.
     """
     return _respond(*_loop_and_rig(loop, [reference]), reference, parameters)
 
@@ -151,9 +153,9 @@ def _evaluate_case(
 
 
 def final_operating_point(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory) -> tuple[Array, float]:
-    """The plant's state, shape (n_plant_states,), and the command in which a response ends.
+    """State of the plant, shape (n_plant_states,), and command in which a response ends.
 
-    Under dither they are means over its last period: at an instant they depend on the dither's phase.
+    Under dither they are means over its last period, since at an instant they depend on the dither's phase.
     """
     rows = np.array([response[n] for n in (*(q.name for q in loop.plant.states), "control")])
     period = loop.dither_period(parameters) or np.inf
@@ -167,7 +169,7 @@ def final_operating_point(loop: ClosedLoop, parameters: ParameterSet, response: 
 def limit_cycle_metrics(
     loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
 ) -> dict[str, float]:
-    """The limit cycle in what follows the transient, for which the step's first 40 % are taken; amplitude 0: none.
+    """Metrics of the limit cycle after the transient, which takes the first 40 % after the step; amplitude 0: none.
 
     Returns
     -------
@@ -183,18 +185,18 @@ def limit_cycle_metrics(
 
 
 def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> dict[str, float]:
-    """FrictionSlope, the static friction's derivative to speed at a plant state [N s/m], of drives that have a load.
+    """FrictionSlope: derivative of the steady friction force to speed at a plant state [N s/m]; for drives with a load.
 
-    With this slope friction is in the linearised loop at low frequencies, its own states, bristles, following; a
-    negative one makes crawl likely.
+    This is the viscous friction of the linearised loop at low frequencies, where the bristles follow the speed. A
+    negative slope makes crawl likely.
     """
     states, full, axis = [q.name for q in loop.plant.states], loop.parameters | parameters, loop.plant.axis
     if axis is None or not any(n.startswith("friction.") for n in loop.plant.parameters):
         return {}
     A = loop.plant.linearise(x, {loop.command.name: command}, full).A
     v, z = states.index(axis.speed), [k for k, n in enumerate(states) if n.startswith("friction.")]
-    followed = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
-    return {"FrictionSlope": float(-full.value(axis.inertia) * (A[v, v] - followed))}
+    bristles = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
+    return {"FrictionSlope": float(-full.value(axis.inertia) * (A[v, v] - bristles))}
 
 
 def _margin_metrics(
@@ -214,10 +216,10 @@ def _margin_metrics(
 
 
 def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Step]) -> tuple[ClosedLoop, Rig | None]:
-    """The loop with the inputs of the references' disturbances, and the rig in which it runs, if any."""
+    """Loop with inputs for the references' disturbances, and the rig around it, if any."""
     rig = model if isinstance(model, Rig) else None
     loop = rig.loop if rig is not None else model
     if not isinstance(loop, ClosedLoop):
-        raise ModelError("this rig is a plant alone, which follows no reference; give it a ClosedLoop")
+        raise ModelError("this rig has no controller, so it follows no reference; make it of a ClosedLoop")
     loop = add_disturbances(loop, references)
     return loop, replace(rig, model=loop) if rig is not None else None

@@ -1,7 +1,7 @@
-"""Hunting and crawl: a sustained oscillation in a response or a log, found and measured.
+"""Detection of limit cycles, hunting and crawl, in a response or a log.
 
-A limit cycle repeats (its autocorrelation comes back), keeps its size (a ringing that dies out is none) and is what is
-left when the dither's own ripple is averaged away.
+A limit cycle repeats (its autocorrelation has a second peak), keeps its amplitude (a decaying ringing is none) and
+remains in the mean over a dither period.
 """
 
 from dataclasses import dataclass
@@ -15,19 +15,29 @@ from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
-TRANSIENT_SHARE = 0.4  # share of a record that is left out for the transient, unless a start is given
-MIN_CYCLES = 3  # at least, in what is looked at
-MIN_AUTOCORRELATION = 0.5  # least autocorrelation a period later: noise as strong as the cycle is allowed
-MAX_PERIOD_SPREAD = 0.35  # most relative spread of the periods; filtered noise has more
-WINDOWS_PER_PERIOD = 8  # parts of the period over which noise is averaged before zeros are looked for
-CROSSING_HYSTERESIS = 0.3  # hysteresis of the crossings, in standard deviations
-MIN_SUSTAINED_GROWTH, MAX_DECAY_GROWTH = (
-    log(0.98),
-    log(0.8),
-)  # growth per period: surely below the first, or just below the second, it dies out
-MIN_RELATIVE_AMPLITUDE = 0.01  # of the record's range: a smaller amplitude is none
-STANDSTILL_FRACTION = 0.02  # of the largest size in sight: a speed below it is a standstill
-PHASES_PER_CYCLE = 64
+# Share of a record that is left out for the transient, unless a start is given: a smaller one takes the transient's
+# ringing for a cycle, a larger one leaves too few cycles of slow hunting.
+TRANSIENT_SHARE = 0.4
+MIN_CYCLES = 3  # fewer cycles do not show whether they repeat; more miss slow hunting in a short record
+# Least autocorrelation one period later, relative to the variance: it allows noise as strong as the cycle; a smaller
+# one finds cycles in noise alone.
+MIN_AUTOCORRELATION = 0.5
+# Largest standard deviation of the periods, relative to their mean: filtered noise has more, a smaller one rejects
+# irregular hunting.
+MAX_PERIOD_SPREAD = 0.35
+# Moving averages per period that remove noise before zero crossings are sought: fewer flatten the cycle, more leave
+# noise and its crossings.
+WINDOWS_PER_PERIOD = 8
+# Swing on both sides that a zero crossing needs, in standard deviations: with less, noise crosses too; with more, a
+# cycle of varying amplitude loses crossings.
+CROSSING_HYSTERESIS = 0.3
+# Growth of the amplitude per period, as a logarithm. A ringing decays where its growth is below the first by two
+# standard errors, or below the second whatever its error.
+MIN_SUSTAINED_GROWTH = log(0.98)
+MAX_DECAY_GROWTH = log(0.8)
+MIN_RELATIVE_AMPLITUDE = 0.01  # share of the record's range below which an amplitude counts as none
+STANDSTILL_FRACTION = 0.02  # share of the largest speed below which a speed counts as standstill
+PHASES_PER_CYCLE = 64  # points of the mean cycle: fewer cut its peaks, more cost time
 
 
 @dataclass(frozen=True)
@@ -37,13 +47,13 @@ class LimitCycle:
     Attributes
     ----------
     amplitude : float
-        Half of peak to peak of the mean cycle [unit of the signal].
+        Half the peak-to-peak value of the mean cycle [unit of the signal].
     frequency : float
         [Hz]
     stick_share : float
-        Of a speed: the share of time at a standstill.
+        Share of the time at a standstill, where the signal is a speed.
     cycles : int
-        How many were seen.
+        Number of cycles in the record.
     """
 
     amplitude: float
@@ -52,7 +62,7 @@ class LimitCycle:
     cycles: int
 
     def describe(self, unit: str) -> str:
-        """In words.
+        """Describe the limit cycle in a clause.
 
         Examples
         --------
@@ -72,32 +82,32 @@ def find_limit_cycle(
     min_amplitude: float | None = None,
     standstill_speed: float | None = None,
 ) -> LimitCycle | None:
-    """Look for hunting in a signal under a constant reference.
+    """Find a limit cycle in a signal under a constant reference.
 
     Parameters
     ----------
     t : array_like, shape (n,)
         Time, strictly increasing [s].
     y : array_like, shape (n,)
-        A speed, say [unit].
+        The signal, a speed for example [unit].
     start : float, optional
-        From when on [s]; by default the first 40 % of the record are left to the transient.
+        Where the search starts [s]; by default after the first 40 % of the record, the transient.
     dither_period : float, optional
-        Average over this time first [s] (`ClosedLoop.dither_period`): a dither's ripple is no limit cycle.
-    least : float, optional
+        The mean over this time is taken first [s] (`ClosedLoop.dither_period`): a dither's ripple is no limit cycle.
+    min_amplitude : float, optional
         Smallest amplitude that counts [unit]; by default 1 % of the record's range.
-    still : float, optional
-        Up to which size a speed is a standstill [unit]; by default 2 % of the largest in sight.
+    standstill_speed : float, optional
+        Largest absolute speed that counts as standstill [unit]; by default 2 % of the largest after `start`.
 
     Returns
     -------
     LimitCycle or None
-        None for noise, for a ringing that dies out, and where fewer than three cycles are in sight.
+        None for noise, for a ringing that decays, and for fewer than three cycles.
 
     Raises
     ------
     InputError
-        If the record does not fit together or is too short to average.
+        If t and y differ in shape, time does not increase, y holds NaN, or the record is too short to average.
 
     Examples
     --------
@@ -137,7 +147,7 @@ def find_limit_cycle(
 
 
 def _detrend_signal(t: Array, y: Array, begin: float, period: float | None) -> tuple[Array, Array]:
-    """On an even grid from `begin` on: without the dither, without a straight line."""
+    """Time and signal on an even grid from `begin` on, the mean over a dither period, less its straight line."""
     edge = 0.0 if period is None else period / 2
     first, last = max(begin, t[0] + edge), t[-1] - edge
     require(first < last, f"the record of {t[-1] - t[0]:g} s is too short to average over {2 * edge:g} s")
@@ -147,7 +157,7 @@ def _detrend_signal(t: Array, y: Array, begin: float, period: float | None) -> t
 
 
 def _period_in_samples(swing: Array) -> int:
-    """Samples after which it comes back, by the autocorrelation's peak within a third of the record; 0: it does not."""
+    """Period in samples: the autocorrelation's second peak within a third of the record; 0 where there is none."""
     n = len(swing)
     power = np.abs(np.fft.rfft(swing, 2 * n)) ** 2
     r = np.fft.irfft(power)[: n // MIN_CYCLES] * n / (n - np.arange(n // MIN_CYCLES))
@@ -158,14 +168,14 @@ def _period_in_samples(swing: Array) -> int:
 
 
 def _remove_trend(swing: Array, lag: int) -> Array:
-    """Without the straight line through its means over whole periods, which a part of a period does not bend."""
+    """Signal less the straight line through its means over whole periods, on which part of a period has no effect."""
     whole = np.convolve(swing, np.ones(lag) / lag, "valid")
     line = np.polyfit(np.arange(len(whole)) + (lag - 1) / 2, whole, 1)
     return np.asarray(swing - np.polyval(line, np.arange(len(swing))))
 
 
 def _rising_crossings(t: Array, swing: Array) -> Array:
-    """Rising zero crossings whose swing passes `CROSSING_HYSTERESIS` standard deviations on both sides."""
+    """Instants of the rising zero crossings that pass `CROSSING_HYSTERESIS` standard deviations on both sides."""
     level = CROSSING_HYSTERESIS * np.std(swing)
     side = np.where(swing > level, 1, np.where(swing < -level, -1, 0))
     far = np.flatnonzero(side)
@@ -178,7 +188,7 @@ def _rising_crossings(t: Array, swing: Array) -> Array:
 
 
 def _is_decaying(sizes: Array) -> bool:
-    """Whether the cycles shrink: the logarithm's slope, with its standard error."""
+    """Whether the peak-to-peak values of the cycles decay, by the slope of their logarithm and its standard error."""
     k = np.arange(len(sizes)) - (len(sizes) - 1) / 2
     logs = np.log(np.maximum(sizes, 1e-300))
     slope = float(k @ logs / (k @ k))

@@ -1,6 +1,6 @@
-"""Frequency response and robustness margins of a loop, and the sensitivity as a smooth limit for a tuner.
+"""Frequency response and robustness margins of a loop, and its sensitivity as a smooth constraint for a search.
 
-How a tuner limits the maximum sensitivity Ms::
+A search limits the maximum sensitivity Ms like this::
 
     omega = frequency_grid(open_loop(loop, parameters), 20)   # or any grid of your own
     terms = sensitivity_terms(loop, omega, parameters)       # once
@@ -30,24 +30,24 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a loop is from instability; conventions of python-control.
+    """Robustness margins of a loop, with the conventions of python-control.
 
     Attributes
     ----------
     gain_margin : float
-        Factor on the gain that makes the loop oscillate, of several the closest to one; inf where there is none.
+        Factor on the gain at which the loop oscillates, the closest to one of several; inf where there is none.
     phase_margin : float
-        [deg], of several the smallest in size; inf where the gain never crosses one.
+        Phase margin [deg], the smallest magnitude of several; inf where the gain never crosses one.
     gain_crossover, phase_crossover : float
-        Where phase and gain margin are read [rad/s]; NaN where there is none.
+        Frequencies of the phase margin and of the gain margin [rad/s]; NaN where there is none.
     max_sensitivity : float
-        ``Ms = max |1/(1 + L(jw))|``; its inverse is the Nyquist curve's distance from -1.
+        ``Ms = max |1/(1 + L(jw))|``; its reciprocal is the Nyquist curve's distance from -1.
     max_sensitivity_frequency : float
         [rad/s]; inf if the sensitivity only approaches its maximum.
     max_complementary_sensitivity : float
         ``Mt = max |L(jw)/(1 + L(jw))|``, the resonance peak from reference to signal where the PID weights both alike.
     stable : bool
-        Whether the closed loop is stable; if not, the margins are no margins.
+        Whether the closed loop is stable; if not, the margins mean nothing.
     """
 
     gain_margin: float
@@ -61,7 +61,7 @@ class Margins:
 
 
 def margins(open_loop: Linearisation) -> Margins:
-    """Margins of ``L(s)`` under negative feedback (`open_loop`).
+    """Robustness margins of ``L(s)`` under negative feedback (`open_loop`).
 
     Crossings are bracketed on `frequency_grid` and refined to machine precision.
 
@@ -103,7 +103,7 @@ def margins(open_loop: Linearisation) -> Margins:
 
 
 def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float]) -> float:
-    """``max |C(jw)/(1 + L(jw))|``: how much of the measurement noise the command shows at worst.
+    """``max |C(jw)/(1 + L(jw))|``: the largest gain from measurement noise to the command.
 
     The maximum control sensitivity of B. Kristiansson and B. Lennartson, Robust and optimal tuning of PI and PID
     controllers, IEE Proc. Control Theory Appl. 149 (2002) 17-25; with a fast filter it is Kp + Kd/Tf.
@@ -167,7 +167,7 @@ def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> Comple
 
 
 def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
-    """Frequencies that show every feature of a loop, open and closed [rad/s].
+    """Frequency grid that resolves the features of a loop, open and closed [rad/s].
 
     Logarithmic from three decades below the slowest pole or zero to three above the fastest, denser at resonances.
     """
@@ -184,9 +184,9 @@ def frequency_grid(open_loop: Linearisation, per_decade: int = 200) -> Array:
 def sensitivity_terms(
     loop: ClosedLoop, omega: ArrayLike, parameters: ParameterSet, x: Array | None = None
 ) -> ca.Function:
-    """``|1 + L(jw)|^2`` as a smooth function of the PID's gains: at least ``1/Ms^2`` wherever Ms is kept.
+    """``|1 + L(jw)|^2`` as a smooth function of the PID's gains; ``1/Ms^2`` is its lower bound where Ms is kept.
 
-    The plant enters as numbers, its response at `parameters`; so a scenario with another plant has terms of its own.
+    The plant enters as numbers, its response at `parameters`, so each scenario needs its own terms.
 
     Parameters
     ----------
@@ -206,10 +206,14 @@ def sensitivity_terms(
     Raises
     ------
     ModelError
-        If a parameter of the plant is free: the terms would miss it.
+        If a parameter of the plant is free: the terms do not depend on it.
     """
     free = [n for n in parameters.free_names if n in loop.plant.parameters]
-    require(not free, f"{', '.join(free)}: free, but the sensitivity takes the plant as fixed; fix it", ModelError)
+    require(
+        not free,
+        f"{', '.join(free)}: free, but the sensitivity needs a fixed plant; fix it",
+        ModelError,
+    )
     w = np.asarray(omega, dtype=float)
     P = frequency_response(linear_plant(loop, parameters, x), w) * pade_delay_response(w, loop.dead_time)
     p = ca.SX.sym("p", len(loop.parameters))
@@ -228,21 +232,21 @@ def batch_frequency_response(A: Array, B: Array, C: Array, w: Array) -> ComplexA
 
 
 def controller_parts(gains: Iterable[Any], w: Any) -> tuple[Any, Any]:
-    """Real and imaginary part of the PID's response, numbers or symbols; gains Kp, Ki, Kd, Tf."""
+    """Real and imaginary part of the PID's frequency response, for gains Kp, Ki, Kd, Tf in numbers or symbols."""
     Kp, Ki, Kd, Tf = gains
     lag = 1 / (1 + (Tf * w) ** 2)
     return Kp + Kd * Tf * w**2 * lag, Kd * w * lag - Ki / w
 
 
 def _crossing_frequencies(function: Callable[[float], float], omega: Array, values: Array) -> list[float]:
-    """Roots between the grid's sign changes."""
+    """Frequencies at which a function is zero, bracketed by sign changes on the grid."""
     brackets = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
     exact = [float(w) for w in omega[values == 0]]
     return sorted(exact + [float(brentq(function, omega[k], omega[k + 1], xtol=1e-14 * omega[k])) for k in brackets])
 
 
 def _response_peak(response: Callable[[Array], ComplexArray], omega: Array, limit: float) -> tuple[float, float]:
-    """The largest size of a response and its frequency, refined from the grid; `limit` is its value at infinity."""
+    """Largest magnitude of a response and its frequency, refined from the grid; `limit` is its value at infinity."""
 
     def negative_magnitude(log_w: float) -> float:
         return -float(abs(response(np.array([np.exp(log_w)]))[0]))
@@ -269,6 +273,6 @@ def _zeros(open_loop: Linearisation) -> ComplexArray:
 
 
 def _is_stable(open_loop: Linearisation) -> bool:
-    """Allows for modes at the origin that the loop does not see (a position in a speed loop, an unused integral)."""
+    """Whether the closed loop is stable; poles at zero are allowed: a position in a speed loop, an unused integral."""
     poles = _loop_poles(open_loop)
     return bool(np.max(poles.real, initial=-1.0) <= 1e-7 * np.max(np.abs(poles), initial=1.0))

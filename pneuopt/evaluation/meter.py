@@ -1,4 +1,4 @@
-"""What a plant's meter shows of a response: air, the spool's travel, power, as metrics."""
+"""Metrics that are read off a plant's meter: air consumption, valve travel, energy."""
 
 from collections.abc import Collection, Mapping
 
@@ -16,17 +16,17 @@ from pneuopt.quantities.trajectories import Trajectory
 
 
 def meter_channels(plant: System) -> tuple[str, ...]:
-    """What a plant's meter shows: "air" [kg/s], "spool" [half travels], "power" [W]; nothing without a meter."""
+    """Channels of a plant's meter: "air" [kg/s], "spool" [half travels], "power" [W]; none without a meter."""
     return () if plant.meter is None else tuple(plant.meter.name_out())
 
 
 def needed_channels(metrics: Collection[str]) -> tuple[str, ...]:
-    """The channels of a meter that metrics are read from."""
+    """Channels of a meter that these metrics need."""
     return tuple(dict.fromkeys(c for name in metrics if name in METRICS for c in METRICS[name].channels))
 
 
 def check_channels(plant: System, metrics: Collection[str]) -> None:
-    """Refuse a metric that the plant's meter does not show.
+    """Refuse a metric whose channel the plant's meter lacks.
 
     Raises
     ------
@@ -37,27 +37,27 @@ def check_channels(plant: System, metrics: Collection[str]) -> None:
     for name in metrics:
         for channel in needed_channels([name]):
             if channel not in shown:
-                has = f"shows only {', '.join(shown)}" if shown else "has no meter"
-                raise InputError(f"{name} counts the plant's {channel}, and this plant {has}; leave it out")
+                reason = f"its meter shows only {', '.join(shown)}" if shown else "it has no meter"
+                raise InputError(f"this plant does not show {name}: {reason}, not {channel!r}; leave {name} out")
 
 
 def meter_outputs(
     loop: ClosedLoop, channels: Collection[str], x: ca.SX, u: ca.SX, p: ca.SX, control: ca.SX
 ) -> list[ca.SX]:
-    """Channels of the plant's meter, of a loop's vectors."""
+    """Symbolic outputs of the plant's meter in terms of the loop's states, inputs, parameters and command."""
     plant = loop.plant
     if plant.meter is None:
         return []
     order, signals = list(loop.parameters), names(loop.inputs)
     inputs = [control if q.name == loop.command.name else u[signals.index(q.name)] for q in plant.inputs]
-    own = ca.vertcat(*(p[order.index(n)] for n in plant.parameters))
-    found = plant.meter(0, x[: len(plant.states)], ca.vertcat(*inputs), own)
+    plant_parameters = ca.vertcat(*(p[order.index(n)] for n in plant.parameters))
+    found = plant.meter(0, x[: len(plant.states)], ca.vertcat(*inputs), plant_parameters)
     shown = dict(zip(meter_channels(plant), [found] if plant.meter.n_out() == 1 else found, strict=True))
     return [ca.SX(shown[channel]) for channel in channels]
 
 
 def metered_record(t: Array, channels: Mapping[str, Array], start: float) -> StepRecord:
-    """What a meter showed of many responses on one grid from `start` on; of the signal nothing.
+    """Record of the meter's channels alone, for many responses on one grid, from `start` on.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def metered_record(t: Array, channels: Mapping[str, Array], start: float) -> Ste
 
 
 def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory, start: float) -> dict[str, float]:
-    """The metrics that the plant's meter shows of one response, AirUse [l(ANR)] say; none of a plant without a meter.
+    """Metrics of one response that the plant's meter shows, AirUse [l(ANR)] for example; none without a meter.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajecto
     response : Trajectory
         The plant's states, "control", and the loop's inputs where the plant has more than the command.
     start : float
-        From when on is counted [s].
+        The instant from which the metrics count [s].
     """
     plant, shown = loop.plant, meter_channels(loop.plant)
     if plant.meter is None:

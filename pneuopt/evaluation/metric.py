@@ -1,4 +1,4 @@
-"""`Metric`: one record a figure of a loop, which requirements, searches, files and screen read; and what limits one."""
+"""`Metric`: a record for each figure of a loop, which requirements, searches, files and tables read; `Requirement`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from pneuopt.quantities.errors import require
 
 
 class Sense(Enum):
-    """Which side of a metric a limit stands on; the value is the name of the limit."""
+    """Direction of a limit on a metric; the value is the name of the field that holds it."""
 
     AT_MOST = "max"
     AT_LEAST = "min"
 
 
 class Source(Enum):
-    """What a metric is read from."""
+    """The signal or model that a metric is computed from."""
 
     RESPONSE = "the measured signal from the step on"
     COMMAND = "the command from the step on"
@@ -31,42 +31,42 @@ class Source(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Metric:
-    """What a figure of a loop is called, counted in, read from, and how a requirement on it counts.
+    """Name, unit and source of a figure of a loop, and how a requirement on it is checked.
 
     Parameters
     ----------
     name : str
         The row of `evaluate`, and the class of the requirement, if there is one.
     unit : str
-        SI, of a limit on it; "1": a number alone. "{command}" and "{measured}" stand for the loop's own units.
+        Unit of a limit on it, SI; "1" for a pure number. "{command}" and "{measured}" stand for the loop's units.
     source : Source
     percent : bool
-        The metric counts in percent, a limit is a fraction.
+        Whether tables show the metric in percent; a limit on it is a fraction all the same.
     sense : Sense
     limits : (float, float)
-        Between which a limit has to be, both excluded.
+        A limit must lie between these, both excluded.
     advice : str
-        What the message about a limit that is not between them adds.
+        Remedy that is added to the message about a limit outside them.
     floor : float
-        The smallest value that counts in an objective.
+        Smaller values count as this one in an objective.
     cost : callable, optional
-        Metrics to values that shall be small, where they are no values that shall be small already.
+        Maps the metric to a value that shall be small; needed where the metric itself shall be large.
     headline : bool
-        It stands in every table of a tuning, whatever was asked for.
+        Whether every table of a tuning shows it, even where no requirement names it.
     slope : callable, optional
-        Of a `StepRecord`: rows and their derivatives, shapes (m, R) and (m, R, N), of which the metric is the largest,
-        a fraction where it counts in percent; without one no gradient search knows the metric.
+        Maps a `StepRecord` to rows and their derivatives, shapes (m, R) and (m, R, N); the metric is the largest row,
+        as a fraction where it is shown in percent. A gradient search cannot use a metric without one.
     channels : tuple of str
-        Of the plant's meter, that it is read from.
+        Channels of the plant's meter that it needs.
     exact : bool
-        `TwoPhase` has an equation for it.
+        Whether `TwoPhase` has an equation for it.
     shown : bool
-        It stands on the screen and may be asked for in a study.
+        Whether the screen shows it and a study may ask for it.
 
     Raises
     ------
     InputError
-        If it has no name or no unit.
+        If its name or its unit is missing.
     """
 
     name: str
@@ -86,29 +86,29 @@ class Metric:
 
     def __post_init__(self) -> None:
         require(bool(self.name), f"a metric needs a name, the one in {self.unit!r} has none")
-        require(bool(self.unit), f"{self.name}: a metric needs a unit; of a number alone it is '1'")
+        require(bool(self.unit), f"{self.name}: a metric needs a unit; for a pure number write '1'")
 
     def unit_in(self, command: str, measured: str) -> str:
-        """The unit of a limit, in a loop whose command and measured signal have these."""
+        """Unit of a limit in a loop, given the units of its command and its measured signal."""
         return self.unit.format(command=command, measured=measured)
 
     def shown_unit(self, command: str, measured: str) -> str:
-        """The unit of the metric in a table, "%" or "l(ANR)" say; empty for a number alone."""
+        """Unit of the metric in a table, "%" or "l(ANR)" for example; empty for a pure number."""
         unit = self.unit_in(command, measured)
         return "%" if self.percent else "" if unit == "1" else unit
 
     @property
     def factor(self) -> float:
-        """The metric over the fraction that a limit is: 100 where it counts in percent, else 1."""
+        """Ratio of the metric to its limit's scale: 100 for a metric in percent, whose limit is a fraction, else 1."""
         return 100 if self.percent else 1
 
     def largest(self, record: StepRecord) -> Array:
-        """The metric of each response, the largest of its rows, shape (m,), in the unit of `evaluate`."""
+        """Metric of each response, the largest of its rows, shape (m,), in the unit that `evaluate` shows."""
         assert self.slope is not None
         return np.asarray(self.factor * np.maximum(self.floor, self.slope(record)[0].max(axis=1)))
 
     def requirement_value(self, metric: Any) -> Any:
-        """What shall be small, of a number or an array: a fraction of a percentage, a margin's reciprocal."""
+        """Value that shall be small, from a metric or an array of them: percent as a fraction, a margin as 1/margin."""
         with np.errstate(divide="ignore"):
             return metric / self.factor if self.cost is None else self.cost(metric)
 
@@ -126,7 +126,7 @@ class Metric:
 
 
 class Requirement:
-    """What a loop shall do: an objective, a weighted term of one, or with a bound a limit; a class for each metric."""
+    """A requirement on a loop: an objective, a weighted term of one, or, with a bound, a limit; a class each metric."""
 
     metric: ClassVar[Metric]
 

@@ -1,4 +1,4 @@
-"""Figures of a step response, with python-control's keys, relative to the step's size."""
+"""Metrics of a step response, with python-control's keys, relative to the step's size."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,9 @@ from pneuopt.evaluation.step_record import StepRecord, without_slopes
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
-MIN_SETTLED_PERIODS = 2  # of the dither, at least, of a response that has settled
+# Dither periods that a response must stay in its band to count as settled: with fewer, one that just passes through the
+# band counts too; more ask for longer records.
+MIN_SETTLED_PERIODS = 2
 
 ROW_METRICS = tuple(name for name, metric in METRICS.items() if metric.slope is not None)
 
@@ -24,7 +26,7 @@ Envelope = Sequence[tuple[float, float, float]]
 
 
 class BandCentre(Enum):
-    """What the settling band lies around."""
+    """Centre of the settling band."""
 
     FINAL = "the final value, as python-control; the band is a fraction of the change"
     REFERENCE = "the reference; the band is a fraction of the step"
@@ -46,12 +48,12 @@ def step_metrics(
     envelope: Envelope = (),
     scale: float | None = None,
 ) -> dict[str, float]:
-    """Measure a step response.
+    """Compute the metrics of a step response.
 
     Parameters
     ----------
     t : array_like, shape (n,)
-        Time, strictly increasing [s]; samples before `start` are left out.
+        Time, strictly increasing [s]; samples before `start` do not count.
     y : array_like, shape (n,)
         The measured signal [unit].
     reference_final, initial : float
@@ -63,21 +65,22 @@ def step_metrics(
     band_centre : BandCentre
         Centre of the band.
     dither_period : float, optional
-        Average over this time first, without phase shift [s]: a whole number of dither periods (`Dither.period`).
+        The signal is averaged over this time first, without phase shift [s]: whole dither periods (`Dither.period`).
     control : array_like, shape (n,), optional
         The command, for PeakControl and ControlRate [its unit]; it is not averaged.
     sample_time : float, optional
-        Of the controller that holds the command, over which ControlRate is read [s]; by default from sample to sample.
+        Sample time of the controller that holds the command, over which ControlRate is computed [s]; by default from
+        sample to sample of the record.
     final : float, optional
-        The final value where it is known (a dc gain) [unit]; by default the last sample, with dither the mean over the
-        last periods (five, or as many as there are).
+        The final value where it is known, from a dc gain [unit]; by default the last sample, with dither the mean over
+        the last five periods, or as many as there are.
     envelope : sequence of (float, float, float)
         Instants after the step, in order [s], each with the lower and upper bound that hold from then on, as fractions
         of the step: 0 is `initial`, 1 the reference.
     scale : float, optional
-        For a disturbance, at `start`, of a loop whose reference stays: what stands for the step's size [unit].
-        Overshoot is then the largest deviation, either side, SettlingTime the time until it is back in the band, Peak
-        its value; nothing rises, RiseTime and Undershoot are 0. In the envelope 0 lies by `scale` below the reference.
+        Stands for the step's size where a disturbance begins at `start` and the reference stays [unit]. Overshoot is
+        then the largest deviation on either side, Peak the signal there, SettlingTime the time until the signal is back
+        in the band, RiseTime and Undershoot 0. In the envelope, 0 lies by `scale` below the reference.
 
     Returns
     -------
@@ -85,9 +88,9 @@ def step_metrics(
         RiseTime
             From 10 to 90 % of the change from `initial` to the final value [s].
         SettlingTime
-            From `start` until the response is in the band for good, interpolated linearly [s]; NaN if it never settles:
-            it ends outside, or enters for good only in the last 5 % of the record after `start`, with dither in its
-            last two periods if those are longer: what passes through the band looks so as well.
+            From `start` until the response stays in the band, interpolated linearly [s]. NaN if it never settles: it
+            ends outside the band, or enters it for good only in the last 5 % of the record after `start`, with dither
+            in the last two periods if those are longer, where a response that only passes through looks the same.
         SettlingMin, SettlingMax
             Range after 90 % is reached [unit].
         Overshoot, OvershootFinal
@@ -99,23 +102,23 @@ def step_metrics(
         SteadyStateValue, SteadyStateError
             The final value [unit]; its distance from the reference, in % of the step.
         Ripple
-            Peak to peak of the signal as it is, over the last periods, without dither over the last 5 % [unit].
+            Peak to peak of the raw signal over the last periods, without dither over the last 5 % [unit].
         IAE, ISE, ITAE
-            Integrals from the step to the record's end of the error's size [s], of its square [s], and of its size
-            times the time since the step [s^2]; the error is the distance from the reference over the step's size.
+            Integrals from the step to the record's end of the absolute error [s], of its square [s], and of the
+            absolute error times the time since the step [s^2]; errors are relative to the step's size.
         StepEnvelope
-            Largest distance from the middle of `envelope`, over its half width: at most 1 where the response keeps it;
-            only with an envelope.
+            Largest distance from the middle of `envelope` over its half width, at most 1 where the response stays
+            inside; only with an envelope.
         PeakControl
             Largest absolute command, dither included [its unit]; NaN without `control`.
         ControlRate
-            Largest change of the command over time, dither included [its unit/s]; NaN without `control`. It begins
-            with the first command after the step: the jump of a proportional gain is not in it.
+            Largest rate of change of the command, dither included [its unit/s]; NaN without `control`. It starts
+            from the first command after the step, so that the jump of a proportional gain does not count.
 
     Raises
     ------
     InputError
-        If the record does not fit together, holds NaN, or is too short for the dither's period.
+        If shapes differ, time does not increase, the record holds NaN, or it is too short for the dither's period.
 
     Examples
     --------
@@ -166,7 +169,7 @@ def batch_metrics(
     scale: float | None = None,
     meter: Mapping[str, Array] | None = None,
 ) -> dict[str, Array]:
-    """Measure many step responses on one grid at once; see `step_metrics`.
+    """Compute the metrics of many step responses on one grid at once; see `step_metrics`.
 
     Parameters
     ----------
@@ -174,11 +177,11 @@ def batch_metrics(
     y, control : ndarray, shape (m, n)
         A row a response.
     only : collection of str, optional
-        What is asked for; what takes its time is left out where it is not in it.
+        Metrics that are needed; others are left out where they cost time.
     averaged : ndarray, shape (m, k), optional
-        Means over the dither's period at the first k samples from the step on, where they are known.
+        Means over the dither's period at the first k samples from the step on, where they are known already.
     meter : mapping of str to ndarray, shape (m, n), optional
-        What the plant's meter showed, by channel.
+        Channels of the plant's meter.
 
     Returns
     -------
@@ -226,7 +229,7 @@ def _to_step_record(
     *,
     is_step: bool,
 ) -> StepRecord:
-    """The responses as readers of rows see them."""
+    """Record of the responses from which the metrics with rows are computed."""
     return StepRecord(
         raw.t,
         without_slopes(error),
@@ -295,7 +298,7 @@ def _period_averages(record: _Samples, initial: float, period: float) -> Array:
 
 
 def _rise_metrics(record: _Samples, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:
-    """Time from 10 to 90 %, and the range from there on; NaN where 90 % is never reached."""
+    """Time from 10 to 90 % and the range after it; NaN where 90 % is never reached."""
     if not _wants(only, "RiseTime", "SettlingMin", "SettlingMax"):
         return {}
     change = steady - initial
@@ -313,7 +316,7 @@ def _rise_metrics(record: _Samples, initial: float, steady: Array, only: Collect
 
 
 def _first_crossing_times(t: Array, z: Array, level: float) -> Array:
-    """When each row first reaches the level, if it does."""
+    """Instants at which each row first reaches the level; meaningless in rows that never do."""
     k = np.argmax(z >= level, axis=1)
     before = np.maximum(k - 1, 0)
     low, high = _pick_samples(z, before), _pick_samples(z, k)
@@ -323,7 +326,7 @@ def _first_crossing_times(t: Array, z: Array, level: float) -> Array:
 
 
 def _settling_times(record: _Samples, centre: Array, width: Array, latest: float) -> Array:
-    """The last crossing of the band, linear between samples; NaN for one after `latest`."""
+    """Instant of the last crossing of the band, linear between samples; NaN if it is after `latest`."""
     t, y = record.t, record.y
     outside = np.abs(y - centre[:, None]) > width[:, None]
     k = len(t) - 1 - np.argmax(outside[:, ::-1], axis=1)
@@ -360,7 +363,7 @@ def _overshoot_metrics(
 
 
 def _deviation_metrics(record: _Samples, reference: float, size: float) -> dict[str, Array]:
-    """What a response that should not move shows in place of rise and overshoot."""
+    """Peak deviation of a response to a disturbance, which takes the place of rise and overshoot."""
     k = np.argmax(np.abs(record.y - reference), axis=1)
     peak, none = _pick_samples(record.y, k), np.zeros(len(record.y))
     beyond = 100 * np.abs(peak - reference) / abs(size)

@@ -1,4 +1,4 @@
-"""`record`: what a real rig would log, with everything in it that the models for identification and tuning leave out.
+"""`record`: the log that a real rig would give, with the effects that models for identification and tuning leave out.
 
 Between two samples the plant is integrated as in `simulate`, event by event with Karnopp's friction. Beyond that a rig
 has a valve that lags behind its command in position (hysteresis) and ignores small ones, sensors with lag, noise and
@@ -28,20 +28,20 @@ from pneuopt.quantities.trajectories import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What `record` returns.
+    """A rig's log with the truth behind it, as `record` returns them.
 
     Attributes
     ----------
     experiment : Experiment
-        What the rig logs at its samples: commands, references, readings with their noise; "feedback" is what the
-        controller saw.
+        The log at the rig's samples: commands, references, readings with their noise; "feedback" is the signal that
+        the controller used.
     truth : Trajectory
-        States and outputs of the plant at the same instants, "control" behind the actuator, with Karnopp's friction
-        "stuck".
+        States and outputs of the plant at the same instants, "control" after the actuator, and "stuck" with Karnopp's
+        friction.
     events : tuple of Event
-        With Karnopp's friction: when the piston broke away, reversed or stuck.
+        Instants at which the piston broke away, reversed or stuck; only with Karnopp's friction.
     parameters : ParameterSet
-        Those that generated it.
+        The values that generated the log.
     """
 
     experiment: Experiment
@@ -66,19 +66,19 @@ def record(
     ----------
     rig : Rig
     inputs : Trajectory
-        Of a loop "reference", of a plant alone its actuated input; and the plant's other inputs. Each is held from an
-        instant of the log to the next: those of this trajectory for a plant alone, the controller's samples, from
-        ``inputs.t[0]`` on, for a loop.
+        "reference" for a loop, the actuated input for a plant alone; and the plant's other inputs. Each is held from
+        one instant of the log to the next. The instants are those of this trajectory for a plant alone, and the
+        controller's samples from ``inputs.t[0]`` on for a loop.
     parameters : ParameterSet
-        A missing one keeps the model's default.
+        Missing parameters keep the model's defaults.
     seed : int
-        Of the noise: the same seed gives the same log.
+        Seed of the noise: the same seed gives the same log.
     initial : mapping of state to value, or array, optional
-        As for `simulate`, of the plant or of the loop.
+        Initial state of the plant or the loop, as for `simulate`.
     name : str
-        Of the experiment.
+        Name of the experiment.
     rtol : float
-        Tolerance of a step of the integration.
+        Relative tolerance of the integration.
 
     Returns
     -------
@@ -127,62 +127,64 @@ def record(
 
 
 class _CommandPlayer:
-    """Commands that are given beforehand."""
+    """Source of commands that are known beforehand: a plant without a controller."""
 
     def __init__(self, rig: Rig, log_inputs: Trajectory) -> None:
         self._name, self._commands = rig.command.name, log_inputs[rig.command.name]
         self.initial_command = float(self._commands[0])
 
     def act(self, k: int, readings: Mapping[str, float]) -> float:  # noqa: ARG002 - as `_SampledController`
-        """The command at sample k."""
+        """Return the command at sample k."""
         return float(self._commands[k])
 
     def columns(self) -> dict[str, ArrayLike]:
-        """What it logs."""
+        """Columns that it adds to the log."""
         return {self._name: self._commands}
 
 
 class _SampledController:
-    """The loop's own controller, acting on a plant whose one state is what was read."""
+    """The loop's controller, run on a stand-in plant whose only state is the latest reading."""
 
     def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, log_inputs: Trajectory, x: Array) -> None:
         loop.check(parameters)
-        seen = loop.feedback
-        echo = define([seen], [loop.command], [seen], loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y))
-        echoing = replace(loop, plant=echo, sensor=None)
-        self._update, self._p = compile_function(echoing.update), echoing.parameter_vector(parameters)
-        plant, own = x[: len(rig.plant.states)], x[1 - len(echoing.states) :]
-        self._rig, self._loop, self._fed, self._x = rig, loop, log_inputs, own
-        self._command = names(echoing.states).index("pid.command")
-        self.initial_command = float(own[self._command - 1])
-        still = np.zeros(len(rig.plant.inputs))
+        signal = loop.feedback
+        echo_plant = define(
+            [signal], [loop.command], [signal], loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y)
+        )
+        echo_loop = replace(loop, plant=echo_plant, sensor=None)
+        self._update, self._p = compile_function(echo_loop.update), echo_loop.parameter_vector(parameters)
+        plant_state, controller_state = x[: len(rig.plant.states)], x[1 - len(echo_loop.states) :]
+        self._rig, self._loop, self._inputs, self._x = rig, loop, log_inputs, controller_state
+        self._command = names(echo_loop.states).index("pid.command")
+        self.initial_command = float(controller_state[self._command - 1])
+        no_input = np.zeros(len(rig.plant.inputs))
         self._first_reading = _plant_outputs(
-            rig, log_inputs.t[0], plant, still, parameter_vector(rig.plant.parameters, parameters)
-        )[seen.name]
+            rig, log_inputs.t[0], plant_state, no_input, parameter_vector(rig.plant.parameters, parameters)
+        )[signal.name]
         self._feedback_values, self._commands = list[float](), list[float]()
         self._position: float | None = None
 
     def act(self, k: int, readings: Mapping[str, float]) -> float:
-        """The command at sample k."""
+        """Return the command at sample k, and advance the controller by one sample."""
         self._feedback_values.append(self._feedback(readings))
-        now, reference = self._fed.t[k], self._fed["reference"][k]
-        after = self._update(now, np.append(self._feedback_values[-1], self._x), [reference], self._p)[0]
+        t, reference = self._inputs.t[k], self._inputs["reference"][k]
+        after = self._update(t, np.append(self._feedback_values[-1], self._x), [reference], self._p)[0]
         self._x = after[1:]
         self._commands.append(float(after[self._command]))
         return self._commands[-1]
 
     def columns(self) -> dict[str, ArrayLike]:
-        """What it logs."""
+        """Columns that it adds to the log."""
         name = self._loop.feedback.name
         reference = f"{name}_reference" if f"{name}_reference" in CHANNELS else "reference"
         return {
-            reference: self._fed["reference"],
+            reference: self._inputs["reference"],
             self._loop.command.name: self._commands,
             "feedback": self._feedback_values,
         }
 
     def _feedback(self, readings: Mapping[str, float]) -> float:
-        """What the controller takes for its measured signal."""
+        """Measured signal as the controller gets it: a sensor's reading, or a speed differentiated from an encoder."""
         wanted, source = self._loop.feedback.name, self._rig.feedback
         if source == wanted:
             return readings[wanted]
@@ -204,7 +206,7 @@ def _run_samples(
     p: Array,
     random: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Run from sample to sample; the readings, a row a sample, and what gets through the actuator."""
+    """Run from sample to sample; return the readings, a row a sample, and the commands after the actuator."""
     inputs, column = names(rig.plant.inputs), names(rig.plant.inputs).index(rig.command.name)
     u = np.column_stack([log_inputs[n] if n != rig.command.name else np.zeros(len(log_inputs)) for n in inputs])
     spool, sensors = source.initial_command, [rig.sensors[n] for n in rig.channels]
@@ -223,18 +225,18 @@ def _run_samples(
 
 
 def _append_sensor_states(rig: Rig, t: float, x: Array, u: Array, p: Array) -> Array:
-    """The plant's state, and the sensors' at rest with it."""
+    """State of the plant, followed by the sensors' states at rest with it."""
     y = _plant_outputs(rig, t, x, u, p)
     return np.append(x, [y[n] for n in rig.channels if rig.sensors[n].lag > 0])
 
 
 def _plant_outputs(rig: Rig, t: float, x: Array, u: Array, p: Array) -> dict[str, float]:
-    """The plant's, by name."""
+    """Outputs of the plant by name."""
     return dict(zip(names(rig.plant.outputs), np.array(rig.plant.ode(t, x, u, p)[1]).ravel().tolist(), strict=True))
 
 
 def _resample_inputs(rig: Rig, inputs: Trajectory) -> Trajectory:
-    """The inputs of the model at the instants of the log."""
+    """Inputs of the model at the instants of the log."""
     rows, t, slack = input_rows(rig.model.inputs, inputs), inputs.t, 1e-9
     if rig.loop is not None:
         h = rig.loop.pid.sample_time or 0.0

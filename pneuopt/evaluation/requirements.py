@@ -1,8 +1,9 @@
-"""What a tuned loop shall do, as types: each is an objective, a weighted term of one, or with a bound a limit.
+"""Requirements on a tuned loop, a class each: an objective, a weighted term of one, or, with a bound, a limit.
 
-Values are fractions of the step's size, seconds, or the command's unit: `Overshoot(max=0.05)` is 5 %. Margins and the
-like are those of the loop linearised about the state in which the response ends, the moving reference: friction counts
-with its slope at that speed. A gain or phase margin has a `min`; as a term its reciprocal is minimised.
+Values are fractions of the step's size, seconds, or the command's unit: `Overshoot(max=0.05)` is 5 %. Margins,
+sensitivities and the noise gain are those of the loop linearised about the state in which the response ends; in a speed
+loop that state moves, and friction counts with its slope at that speed. A gain or phase margin has a `min`; as a term
+its reciprocal is minimised.
 
 A new requirement is a class with its `Metric`, in a file of its own or here, and a row of `REQUIREMENT_KINDS`.
 """
@@ -107,7 +108,7 @@ class SteadyStateError(AtMost):
 @final
 @dataclass(frozen=True)
 class StepEnvelope(Requirement):
-    """The response between bounds that vary over time: distance from their middle over their half width, the largest.
+    """Bounds on the response that vary over time: the largest distance from their middle over their half width.
 
     Parameters
     ----------
@@ -115,7 +116,7 @@ class StepEnvelope(Requirement):
         Instants after the step [s], in order, each with the lower and upper bound that hold from then to the next, as
         fractions of the step: 0 is where it begins, 1 the reference.
     max : float or None
-        1: the bounds are kept; None: a term only.
+        1 keeps the response within the bounds; None makes it a term of the objective only.
 
     Examples
     --------
@@ -138,7 +139,7 @@ class StepEnvelope(Requirement):
 
 @final
 class IAE(AtMost):
-    """Integral of the error's size from the step to the end of the horizon, over the step's size [s]."""
+    """Integral of the absolute error from the step to the end of the horizon, over the step's size [s]."""
 
     metric = Metric("IAE", "s", Source.RESPONSE, slope=iae_rows)
 
@@ -152,7 +153,7 @@ class ISE(AtMost):
 
 @final
 class ITAE(AtMost):
-    """Integral of the error's size times the time since the step, over the step's size [s^2]."""
+    """Integral of the absolute error times the time since the step, over the step's size [s^2]."""
 
     metric = Metric("ITAE", "s^2", Source.RESPONSE, slope=itae_rows)
 
@@ -166,28 +167,28 @@ class PeakControl(AtMost):
 
 @final
 class ControlRate(AtMost):
-    """Largest change of the command over time, dither included, the jump at the step left out [its unit/s]."""
+    """Largest rate of change of the command, dither included, without the jump at the step [its unit/s]."""
 
     metric = Metric("ControlRate", "{command}/s", Source.COMMAND, slope=control_rate_rows)
 
 
 @final
 class Ripple(AtMost):
-    """Peak to peak of the signal, not averaged, over the last dither periods or 5 % of the record [measured unit]."""
+    """Peak to peak of the raw signal over the last dither periods, or the last 5 % of the record [measured unit]."""
 
     metric = Metric("Ripple", "{measured}", Source.RESPONSE)
 
 
 @final
 class AirUse(AtMost):
-    """What a pneumatic drive draws from its supply, from the step to the end of the horizon [l(ANR), ISO 8778]."""
+    """Air consumption of a pneumatic drive from the step to the end of the horizon [l(ANR), ISO 8778]."""
 
     metric = Metric("AirUse", "l(ANR)", Source.METER, slope=air_rows, channels=(AIR_CHANNEL,))
 
 
 @final
 class MaxSensitivity(AtMost):
-    """``Ms = max |1/(1 + L(jw))|``, the inverse of the Nyquist curve's distance from -1; 1.2 is careful, 2 is bold."""
+    """``Ms = max |1/(1 + L(jw))|``, the reciprocal of the Nyquist curve's distance from -1; 1.2 is cautious, 2 bold."""
 
     metric = Metric("MaxSensitivity", "1", Source.LINEAR_LOOP, limits=(1.0, inf), headline=True, exact=True)
 
@@ -201,7 +202,7 @@ class MaxComplementarySensitivity(AtMost):
 
 @final
 class GainMargin(AtLeast):
-    """Factor on the loop's gain, up or down, that makes it oscillate; at least 2 is usual."""
+    """Factor on the loop's gain, up or down, at which the loop oscillates; at least 2 is usual."""
 
     metric = Metric(
         "GainMargin",
@@ -216,7 +217,7 @@ class GainMargin(AtLeast):
 
 @final
 class PhaseMargin(AtLeast):
-    """Phase by which the loop at gain one stays clear of -180 deg [deg]."""
+    """Distance of the open loop's phase from -180 deg where its gain is one [deg]."""
 
     metric = Metric(
         "PhaseMargin",
@@ -230,7 +231,7 @@ class PhaseMargin(AtLeast):
 
 @final
 class NoiseGain(AtMost):
-    """``max |C(jw)/(1 + L(jw))|``, from measurement noise to the command [its unit/measured unit]; see `noise_gain`."""
+    """``max |C(jw)/(1 + L(jw))|``, the gain from measurement noise to the command [its unit/measured unit]."""
 
     metric = Metric("NoiseGain", "{command}/({measured})", Source.LINEAR_LOOP)
 
@@ -255,18 +256,18 @@ REQUIREMENT_KINDS: tuple[type[Requirement], ...] = (
     PhaseMargin,
     NoiseGain,
 )
-"""Every kind of requirement, a row each; in this order tables show them."""
+"""Every kind of requirement, a row each, in the order of the tables."""
 
 ROBUSTNESS_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.source is Source.LINEAR_LOOP)
 
 
 def _travel_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The spool's way, to and fro."""
+    """Distance that the spool travels in both directions together."""
     spool, _ = record.meter["spool"]
     return without_slopes(np.abs(np.diff(spool, axis=1)).sum(axis=1)[:, None])
 
 
-_FIGURES = (
+_REPORTED_METRICS = (
     Metric("LimitCycleAmplitude", "{measured}", Source.RESPONSE),
     Metric("LimitCycleFrequency", "Hz", Source.RESPONSE),
     Metric("StickShare", "1", Source.RESPONSE),
@@ -283,14 +284,14 @@ _FIGURES = (
 METRICS: Mapping[str, Metric] = {
     metric.name: metric
     for source in Source
-    for metric in (*(kind.metric for kind in REQUIREMENT_KINDS), *_FIGURES)
+    for metric in (*(kind.metric for kind in REQUIREMENT_KINDS), *_REPORTED_METRICS)
     if metric.source is source
 }
-"""By name every metric, source by source: those that a requirement may limit, and the further figures of `evaluate`."""
+"""Every metric by name, grouped by source: those that a requirement may limit, and those that are reported only."""
 
 
 def upper_limit(requirement: Requirement) -> float:
-    """The largest allowed value of `requirement_values`: a margin's is the reciprocal of its `min`; inf without."""
+    """Largest allowed value, on the scale of `requirement_values`: 1/min of a margin; inf without a limit."""
     limit = user_limit(requirement)
     if limit is None:
         return inf
@@ -298,7 +299,7 @@ def upper_limit(requirement: Requirement) -> float:
 
 
 def describe_value(requirement: Requirement, value: float) -> tuple[str, str]:
-    """A value as `requirement_values` gives it, and what is allowed, as the user writes them: ("1.8", "at least 2").
+    """A value of `requirement_values` and its limit, written as the user writes them: ("1.8", "at least 2").
 
     Examples
     --------
@@ -310,49 +311,49 @@ def describe_value(requirement: Requirement, value: float) -> tuple[str, str]:
 
 
 def user_value(requirement: Requirement, value: float) -> float:
-    """A value as `requirement_values` gives it, as the user writes it: a margin itself."""
+    """A value of `requirement_values` on the user's scale: a margin itself, not its reciprocal."""
     if requirement.metric.sense is Sense.AT_LEAST:
         return 1 / value if value else inf
     return value
 
 
 def user_limit(requirement: Requirement) -> float | None:
-    """The limit as the user writes it, `max` or `min`."""
+    """Limit on the user's scale, `max` or `min`; None without."""
     limit: float | None = getattr(requirement, requirement.metric.sense.value)
     return limit
 
 
 def with_user_limit(requirement: Requirement, limit: float | None) -> Requirement:
-    """The same with another limit, as the user writes it, `max` or `min`, by copy."""
+    """Copy of a requirement with another limit on the user's scale, `max` or `min`."""
     key: dict[str, Any] = {requirement.metric.sense.value: limit}
     same: Any = requirement
     return replace(same, **key)  # type: ignore[no-any-return]
 
 
 def with_upper_limit(requirement: Requirement, value: float) -> Requirement:
-    """The same with another largest value of `requirement_values`, by copy."""
+    """Copy of a requirement with another limit, on the scale of `requirement_values`."""
     return with_user_limit(requirement, 1 / value if requirement.metric.sense is Sense.AT_LEAST else value)
 
 
 def metric_name(requirement: Requirement) -> str:
-    """The metric that a requirement reads, a column of `evaluate`."""
+    """Name of the metric that a requirement limits, a row of `evaluate`."""
     return requirement.metric.name
 
 
 def requirement_values(metrics: Mapping[str, Value]) -> dict[str, Value]:
-    """The requirements' values from metrics, numbers or arrays, all of which shall be small.
+    """Values of the requirements, from metrics or arrays of them, all on scales where small is good.
 
-    Fractions where metrics are in percent; a margin's reciprocal, of a gain margin below one the margin itself.
+    A metric in percent becomes a fraction, a margin its reciprocal; a gain margin below one stays as it is.
     """
     limited = (kind.metric for kind in REQUIREMENT_KINDS if kind.metric.name in metrics)
     return {metric.name: metric.requirement_value(metrics[metric.name]) for metric in limited}
 
 
 def larger_is_better(metric: str) -> bool:
-    """Whether the smallest value of a metric, a row of `evaluate`, is the worst."""
+    """Whether the smallest value of a metric is its worst."""
     return metric in METRICS and METRICS[metric].sense is Sense.AT_LEAST
 
 
 def percent_factor(metric: str) -> float:
-    """A metric, a row of `evaluate`, over the fraction that a limit on it is: 100 where it counts in percent."""
+    """Ratio of a metric to its limit's scale: 100 for a metric in percent, else 1."""
     return METRICS[metric].factor if metric in METRICS else 1

@@ -1,4 +1,4 @@
-"""A response: the loop's inputs and samples under a reference, and what is read off its outputs and its end."""
+"""A loop's response to a reference: its inputs, its sampling, its metrics and the operating point of its margins."""
 
 import math
 
@@ -14,12 +14,13 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-# Samples of a response where the loop has no sample time: fewer blur a settling time, more cost time.
+# Samples of a response of a loop without sample time: fewer blur a settling time, more cost time in proportion.
 RESPONSE_SAMPLES = 1000
-# Readings of a sampled loop: so many a horizon, and between the least and the most a sample.
+# Readings of a sampled loop over a horizon, and the least and most of them a sample: with fewer, the signal leaves the
+# settling band between two readings unseen; more cost time in proportion.
 READINGS_A_HORIZON, MIN_READINGS_A_SAMPLE, MAX_READINGS_A_SAMPLE = 1000, 2, 16
-# Samples a period of a continuous dither: at six, its average claimed 47 ms on a drive with friction where 63 ms are
-# certified; more cost time in proportion.
+# Samples a period of a continuous dither: with six, the averaged response of a drive with friction seems to settle in
+# 47 ms where it takes 63 ms; more cost time in proportion.
 SAMPLES_A_DITHER_PERIOD = 20
 
 
@@ -31,9 +32,9 @@ def measure(
     band: float,
     envelope: Envelope = (),
 ) -> dict[str, float]:
-    """The metrics of a simulated response, the settling band around the reference.
+    """Metrics of a simulated response, with the settling band around the reference.
 
-    What counts is the plant's own signal, whatever a sensor shows the controller of it.
+    They are read off the plant's true signal, not off a sensor's reading of it.
 
     Parameters
     ----------
@@ -59,7 +60,7 @@ def measure(
 def linearise_open_loop(
     loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step | None = None
 ) -> Linearisation:
-    """The open loop for margins, about a plant state x under a command, and under what disturbs it in the end."""
+    """Open loop for margins, linearised about a plant state x, a command and the final disturbances of a reference."""
     others = {} if reference is None else {disturbance_input(n): v for n, v in reference.disturbance.items()}
     return open_loop(
         add_disturbances(loop, [reference] if reference else []), parameters, x, {loop.command.name: command, **others}
@@ -67,7 +68,7 @@ def linearise_open_loop(
 
 
 def loop_inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
-    """The loop's inputs under a reference; those that the reference does not name are zero."""
+    """Inputs of the loop under a reference; those that the reference does not name are zero."""
     run = reference.trajectory(step)
     others = [q.name for q in loop.inputs if q.name not in run]
     return run.with_columns({n: np.zeros(len(run)) for n in others})
@@ -76,7 +77,7 @@ def loop_inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
 def sample_spacing(
     loop: ClosedLoop, reference: Step, parameters: ParameterSet, samples_a_period: int = SAMPLES_A_DITHER_PERIOD
 ) -> float:
-    """Samples' distance [s]: the controller's, or a fine one on which the step's instant lies."""
+    """Spacing of the samples [s]: the controller's sample time, or a fine one that divides the step's instant."""
     if loop.pid.sample_time is not None:
         return loop.pid.sample_time
     rate = highest_dither_frequency(loop, parameters)
@@ -86,7 +87,7 @@ def sample_spacing(
 
 
 def readings_a_sample(loop: ClosedLoop, reference: Step) -> int:
-    """How often a response is read in a sample: between two of them it may leave the band."""
+    """Readings of a response per sample of the controller."""
     h = loop.pid.sample_time
     if h is None:
         return 1
@@ -96,7 +97,7 @@ def readings_a_sample(loop: ClosedLoop, reference: Step) -> int:
 
 
 def highest_dither_frequency(loop: ClosedLoop, parameters: ParameterSet) -> float:
-    """The highest frequency that the dither may get [Hz]; 0 without dither."""
+    """Highest frequency that the dither may take in a tuning [Hz]; 0 without dither."""
     if loop.dither is None:
         return 0.0
     frequency = (loop.parameters | parameters)["dither.frequency"]
@@ -104,7 +105,7 @@ def highest_dither_frequency(loop: ClosedLoop, parameters: ParameterSet) -> floa
 
 
 def command_range(p: ParameterSet) -> tuple[float, float, str]:
-    """Between which values the command acts, and what ends it: the controller's limits, or the valve's span."""
+    """Lowest and highest command that still acts, and what saturates there: the controller or the valve."""
     low, high, whose = -math.inf, math.inf, "the command"
     if "pid.lower" in p:
         low, high = p.value("pid.lower"), p.value("pid.upper")

@@ -1,4 +1,4 @@
-"""`Rig`: a plant behind real hardware, its `Sensor`s and its `Actuator`; `record` runs it and gives its log."""
+"""`Rig`: a plant or a loop with real hardware around it, `Sensor`s and an `Actuator`; `record` gives its log."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -17,7 +17,7 @@ from pneuopt.quantities.parameters import Quantity
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a channel's reading does to the truth: a lag of first order, then white noise, then rounding.
+    """A sensor of one channel: a lag of first order, then white noise, then rounding to a resolution.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Sensor:
 
     @property
     def standard_deviation(self) -> float:
-        """Standard deviation of noise and rounding together, the rounding taken as uniform [unit of the channel].
+        """Standard deviation of noise and rounding together; rounding counts as uniform noise [unit of the channel].
 
         Examples
         --------
@@ -50,22 +50,22 @@ class Sensor:
         return float(np.hypot(self.noise, self.resolution / np.sqrt(12)))
 
     def reading(self, value: float, noise: float) -> float:
-        """The digital value, `noise` being a draw of the standard normal distribution."""
+        """Return the digital value; `noise` is a draw of the standard normal distribution."""
         noisy = value + self.noise * noise
         return self.resolution * round(noisy / self.resolution) if self.resolution else noisy
 
 
 @dataclass(frozen=True)
 class Actuator:
-    """What a valve, or an amplifier, makes of a command: hysteresis, then a dead zone.
+    """An imperfect valve or amplifier: hysteresis of the command, then a dead zone.
 
     Parameters
     ----------
     hysteresis : float
         Width of the loop, as catalogues give it [unit of the command]: a play operator of half that width.
     dead_zone : float
-        Half width of the commands around zero that do nothing [unit of the command]; beyond it the rest counts. The
-        overlap of a `ProportionalValve` has its own parameter.
+        Half width of the range around zero in which a command does nothing [unit of the command]; beyond it the
+        command acts less this half width. The overlap of a `ProportionalValve` is a parameter of the valve instead.
     """
 
     hysteresis: float = 0.0
@@ -77,7 +77,7 @@ class Actuator:
             require(0 <= value < inf, f"Actuator: {name} must not be negative, got {value:g}; 0 is none")
 
     def apply_hysteresis(self, command: float, before: float) -> float:
-        """The play operator: where the spool goes from `before` [unit of the command].
+        """Position of the spool by the play operator, which moves it from `before` [unit of the command].
 
         Examples
         --------
@@ -89,13 +89,13 @@ class Actuator:
         return min(max(before, command - half), command + half)
 
     def apply_dead_zone(self, value: float) -> float:
-        """What is left beyond the dead zone [unit of the command]."""
+        """Command less the half width of the dead zone, and zero inside it [unit of the command]."""
         return value - min(max(value, -self.dead_zone), self.dead_zone)
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A plant, alone or in a sampled loop, behind real hardware.
+    """A plant, alone or in a sampled loop, with real hardware around it.
 
     Parameters
     ----------
@@ -103,18 +103,18 @@ class Rig:
         With Karnopp's friction (`ForceDrive(Karnopp(Stribeck()))`) it sticks and slips. A loop is sampled; the rig's
         sensors stand in for the loop's own.
     sensors : mapping of str to Sensor
-        By the plant's output: what is measured, and logged.
+        Sensors by the plant's output; these outputs are measured and logged.
     actuator : Actuator
     encoder : Encoder
-        Where a speed loop gets its speed from, unless there is a sensor for it: from that of the position, whose
-        readings it rounds to its own resolution.
+        Source of a speed loop's speed where no sensor measures it: the encoder rounds the position sensor's readings
+        to its resolution and differentiates them.
     actuated : str, optional
-        Of a plant alone: the input that the actuator drives; by default its only one.
+        The input that the actuator drives, for a plant alone; by default its only input.
 
     Raises
     ------
     ModelError
-        If the loop is continuous, its dither analogue, or what it feeds back not measured.
+        If the loop is continuous, its dither is analogue, or no sensor measures its feedback.
     UnknownNameError
         If a sensor's output or the input is unknown.
     """
@@ -130,12 +130,12 @@ class Rig:
         _ = self.command
         if self.loop is not None:
             _check_loop(self.loop)
-            message = f"the controller needs {self.feedback!r}, which is not measured; add it to sensors"
+            message = f"the controller needs {self.feedback!r}, which no sensor measures; add it to sensors"
             require(self.feedback in self.sensors, message, ModelError)
 
     @property
     def loop(self) -> ClosedLoop | None:
-        """The loop behind the sensors; None where the plant is alone."""
+        """The loop; None where the plant is alone."""
         return self.model if isinstance(self.model, ClosedLoop) else None
 
     @property
@@ -145,7 +145,7 @@ class Rig:
 
     @cached_property
     def command(self) -> Quantity:
-        """The plant's input behind the actuator."""
+        """Input of the plant that the actuator drives."""
         if self.loop is not None:
             return self.loop.command
         inputs = {q.name: q for q in self.plant.inputs}
@@ -156,7 +156,7 @@ class Rig:
 
     @property
     def feedback(self) -> str | None:
-        """The channel that the controller reads, the encoder's where it derives a speed; None without a controller."""
+        """Channel that the controller reads, the position where an encoder gives the speed; None without a loop."""
         if self.loop is None:
             return None
         wanted = self.loop.feedback.name
@@ -169,7 +169,7 @@ class Rig:
 
     @cached_property
     def sensor_system(self) -> System:
-        """The plant with an output "sensor.*" a sensor, and a state of that name where it lags."""
+        """The plant with an output "sensor.*" for each sensor, and a state of that name for each lag."""
         plant = self.plant
         shown = {f"sensor.{q.name}": q for q in plant.outputs if q.name in self.channels}
         lags = {n: self.sensors[q.name].lag for n, q in shown.items()}

@@ -1,7 +1,7 @@
-"""Scenarios: the plants that a design has to live with: corners, samples of a box, samples of a fit's covariance.
+"""Scenarios: further plants that a design must suit: corners of a box, samples of it, draws of a fit's covariance.
 
-Each is a mapping from a name to the values that differ, as `sweep` and `tune` take it. `tolerances` spreads gains that
-are still to be found, by factors.
+Scenarios are a mapping from a name to the parameter values that differ from the nominal plant, as `sweep` and `tune`
+take it. `tolerances` varies parameters that are still to be tuned, by factors.
 """
 
 import itertools
@@ -24,18 +24,20 @@ AxisNames = str | tuple[str, ...]
 Spread = float | tuple[float, float]
 Spreads = Mapping[str, Spread] | Mapping[AxisNames, Spread]
 ScenarioValues = dict[str, dict[str, float]]
-MAX_CORNERS = 4096
-MAX_DRAWS_PER_SAMPLE = 1000  # for each sample that has to lie within the bounds
+MAX_CORNERS = 4096  # plants, 12 axes: each one is simulated for every candidate, and another axis doubles their number
+# Draws until a sample lies within the bounds: fewer refuse a covariance that reaches beyond them, more only delay the
+# error where hardly any draw fits.
+MAX_DRAWS_PER_SAMPLE = 1000
 
 
 @dataclass(frozen=True)
 class Factor:
-    """A value relative to the one that a candidate has: a tolerance of what is still to be tuned.
+    """A parameter value as a multiple of a candidate's: a tolerance on a parameter that is still to be tuned.
 
     Parameters
     ----------
     share : float
-        1.01: one per cent more.
+        The factor; 1.01 is one per cent more.
     """
 
     share: float
@@ -49,15 +51,15 @@ NO_SCENARIOS: Scenarios = MappingProxyType({})  # no scenario: the nominal plant
 
 
 def corners(parameters: ParameterSet, spreads: Spreads) -> ScenarioValues:
-    """Every combination of least and greatest: 2^n plants for n axes.
+    """Plants at the corners of a box: every combination of least and greatest value, 2^n plants for n axes.
 
     Parameters
     ----------
     parameters : ParameterSet
         The nominal values, and the bounds.
     spreads : mapping of str, or tuple of str, to float or pair
-        An axis each: parameters, or patterns, that move together, and by how much: a fraction of each one's value, 0.3
-        for +-30 %, or the least and the greatest value [SI].
+        The axes of the box. A key names parameters, or patterns of names, that vary together; its value is a fraction
+        of each parameter's value, 0.3 for +-30 %, or the least and the greatest value [SI].
 
     Returns
     -------
@@ -92,15 +94,16 @@ def tolerances(
     *,
     seed: int = 0,
 ) -> Scenarios:
-    """Every combination of least and greatest factor on parameters that are tuned, or on any other; or some between.
+    """Tolerances on parameters, tuned ones included: every combination of least and greatest factor, or draws between.
 
     Parameters
     ----------
     parameters : ParameterSet
     shares : mapping of str, or tuple of str, to float
-        An axis each: parameters, or patterns, that move together, and by what fraction of a candidate's value.
+        The axes. A key names parameters, or patterns, that vary together; its value is the fraction of a candidate's
+        value by which they vary.
     count : int, optional
-        Draw so many from the box, uniformly, instead of its corners.
+        Number of uniform draws from the box, instead of its corners.
     seed : int
 
     Returns
@@ -127,7 +130,7 @@ def tolerances(
 
 
 def apply_scenario(parameters: ParameterSet, values: Mapping[str, float | Factor]) -> ParameterSet:
-    """The parameters of one scenario; a factor may leave the bounds, which are a candidate's own.
+    """Parameters of one scenario; a factor may leave the bounds, which hold for the candidate itself.
 
     Parameters
     ----------
@@ -141,13 +144,13 @@ def apply_scenario(parameters: ParameterSet, values: Mapping[str, float | Factor
 
 
 def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int = 0) -> ScenarioValues:
-    """Plants drawn uniformly from the box whose corners `corners` gives; errors as there.
+    """Plants drawn uniformly from the box whose corners `corners` gives, with the same errors.
 
     Parameters
     ----------
     parameters : ParameterSet
     spreads : mapping
-        As for `corners`: what shares an axis moves together.
+        As for `corners`; parameters on one axis vary together.
     count : int
     seed : int
 
@@ -169,14 +172,15 @@ def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int
 
 
 def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, seed: int = 0) -> ScenarioValues:
-    """Plants drawn from a fit's covariance: what the logs leave open, correlations included.
+    """Plants drawn from a fit's covariance: the uncertainty that the logs leave, correlations included.
 
     Parameters
     ----------
     parameters : ParameterSet
-        The estimates, and the bounds, within which every draw lies.
+        The estimates, and the bounds within which every draw lies.
     covariance : DataFrame
-        Of `IdentificationResult`: rows and columns by parameter. One searched by its logarithm is drawn so.
+        `IdentificationResult.covariance`: rows and columns by parameter. A parameter that is searched by its logarithm
+        is drawn by it.
     count : int
     seed : int
 
@@ -188,15 +192,15 @@ def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, s
     Raises
     ------
     InputError
-        If the covariance holds a parameter that the set has not, or no number: the data did not determine it.
+        If the covariance names a parameter that the set lacks, or holds NaN: the logs could not identify that one.
     """
     require(count >= 1, f"count must be at least 1, got {count}")
     names = [str(n) for n in covariance.index]
     check_names("parameter", names, parameters, "covariance")
     matrix = covariance.to_numpy(dtype=float)
     unknown = [n for n, row in zip(names, matrix, strict=True) if not np.isfinite(row).all()]
-    told = f"{' and '.join(unknown)} have no covariance: the fit did not determine them; give corners instead"
-    require(not unknown, told)
+    message = f"no covariance of {' and '.join(unknown)}: the fit could not identify them; give corners instead"
+    require(not unknown, message)
     centre = np.array([parameters.value(n) for n in names])
     log = np.array([parameters[n].log for n in names])
     scale = np.where(log, centre, 1.0)
@@ -211,7 +215,7 @@ def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, s
 
 
 def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
-    """Each axis's parameters at its low and at its high end."""
+    """Parameter values of each axis at its low and its high end."""
     require(len(spreads) > 0, "no spread: give at least one parameter and how far it spreads")
     out: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
     taken: dict[str, str] = {}
@@ -248,7 +252,7 @@ def _merge_values(parts: Iterator[dict[str, float]]) -> dict[str, float]:
 
 
 def _square_root(matrix: Array) -> Array:
-    """A factor F with F F' the matrix, which rounding may have left a little short of positive."""
+    """Factor F with F F' equal to the matrix; eigenvalues that rounding made negative count as zero."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 

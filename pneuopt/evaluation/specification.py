@@ -1,4 +1,4 @@
-"""`Specification`: the objective and the limits of a tuning, checked, and what values are worth by them."""
+"""`Specification`: the checked objective and limits of a tuning; it weighs values and finds violated limits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,16 +26,16 @@ Kind = type | tuple[type, ...]
 
 @dataclass(frozen=True, eq=False)
 class Specification:
-    """An objective and its limits, checked.
+    """Objective and limits of a tuning, checked by `specify`.
 
     Attributes
     ----------
     weights : mapping of Requirement to float
-        The terms of the objective.
+        The terms of the objective with their weights.
     limits : tuple of Requirement
         At most one of a kind, the tightest.
     band : float
-        The settling band, the same wherever one is named; 2 % otherwise.
+        Half width of the settling band, a fraction of the step; 2 % unless a requirement names another.
     """
 
     weights: Mapping[Requirement, float]
@@ -44,20 +44,20 @@ class Specification:
 
     @property
     def envelope(self) -> EnvelopeBounds:
-        """The bounds of its `StepEnvelope`; none without."""
+        """Bounds of the `StepEnvelope`; empty without one."""
         return next((q.bounds for q in (*self.weights, *self.limits) if isinstance(q, StepEnvelope)), ())
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The names of what it limits or minimises."""
+        """Names of the metrics that it limits or minimises."""
         return tuple(dict.fromkeys(metric_name(q) for q in (*self.weights, *self.limits)))
 
     def limit(self, kind: Kind) -> float:
-        """The largest value allowed for this kind of requirement, as `most`; inf where there is none."""
+        """Largest value allowed for this kind of requirement, as `upper_limit`; inf without a limit."""
         return next((upper_limit(q) for q in self.limits if isinstance(q, kind)), inf)
 
     def weight(self, kind: Kind) -> float:
-        """The weight of this kind of requirement in the objective; 0 where it is no term."""
+        """Weight of this kind of requirement in the objective; 0 where it is no term."""
         return next((w for q, w in self.weights.items() if isinstance(q, kind)), 0.0)
 
     def concerns(self, kind: Kind) -> bool:
@@ -65,9 +65,10 @@ class Specification:
         return self.weight(kind) > 0 or self.limit(kind) < inf
 
     def tighten(self, margin: float, peaks: float) -> "Specification":
-        """Band and values allowed smaller by `margin`, a share; peak control and sensitivities by the share `peaks`.
+        """Copy with band and limits smaller by the share `margin`; peak control and sensitivities by the share `peaks`.
 
-        An optimum lies on its limits: found on tightened ones, it keeps those asked for when simulated and printed.
+        An optimum lies on its limits. One that is found on tightened limits still keeps the requested ones when it is
+        simulated independently and its gains are rounded for print.
         """
         room: dict[type, float] = {SettlingTime: 0.0}
         room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
@@ -75,19 +76,19 @@ class Specification:
         return replace(self, limits=limits, band=self.band * (1 - margin))
 
     def without(self, kind: Kind) -> "Specification":
-        """The same without the limit of this kind, by copy."""
+        """Copy without the limit of this kind."""
         return replace(self, limits=tuple(q for q in self.limits if not isinstance(q, kind)))
 
     def with_band(self, band: float) -> "Specification":
-        """Another settling band, by copy."""
+        """Copy with another settling band."""
         return replace(self, band=band)
 
     def objective(self, values: Mapping[str, float]) -> float:
-        """The weighted sum, of values by kind as `read` gives them."""
+        """Weighted sum of values by metric, as `requirement_values` gives them."""
         return sum(weight * values[metric_name(q)] for q, weight in self.weights.items())
 
     def violations(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
-        """The limits that `values` do not keep, NaN among them; `slack` is relative."""
+        """Limits that `values` violate, which a NaN does too; `slack` is relative to the limit."""
         return tuple(q for q in self.limits if not values[metric_name(q)] <= upper_limit(q) * (1 + slack))
 
 
@@ -99,7 +100,7 @@ def specify(
     Parameters
     ----------
     minimise : Requirement, or mapping of Requirement to weight
-        A term with a bound is a limit as well.
+        The objective; a term with a bound is a limit as well.
     subject_to : sequence of Requirement
 
     Raises
@@ -115,15 +116,15 @@ def specify(
     0.4
     """
     weights = dict(minimise) if isinstance(minimise, Mapping) else {minimise: 1.0}
-    require(len(weights) > 0, "minimise is empty: name at least one requirement, SettlingTime() say")
+    require(len(weights) > 0, "minimise is empty: name at least one requirement, SettlingTime() for example")
     for q in (*weights, *subject_to):
         known = ", ".join(k.__name__ for k in REQUIREMENT_KINDS)
         require(isinstance(q, Requirement), f"{q!r} is no requirement; write {known}, as in Overshoot(max=0.05)")
     for q, weight in weights.items():
         require(0 < weight < inf, f"the weight of {metric_name(q)} must be positive, got {weight:g}")
     for q in subject_to:
-        told = f"{metric_name(q)} in subject_to has no limit; write {metric_name(q)}({q.metric.sense.value}=...)"
-        require(upper_limit(q) < inf, told)
+        message = f"{metric_name(q)} in subject_to has no limit; write {metric_name(q)}({q.metric.sense.value}=...)"
+        require(upper_limit(q) < inf, message)
     terms = [metric_name(q) for q in weights]
     require(len(set(terms)) == len(terms), f"minimise names a kind of requirement twice: {', '.join(terms)}")
     bands = {q.band for q in (*weights, *subject_to) if isinstance(q, SettlingTime)}
@@ -140,17 +141,17 @@ def specify(
 
 
 def _check_envelope(tube: EnvelopeBounds, requirements: Sequence[Requirement], band: float) -> None:
-    """Refuse an envelope in which no response can be that does what else is asked for."""
+    """Refuse an envelope that contradicts another requirement, so that no response keeps both."""
     start, (last, low, up) = tube[0], tube[-1]
-    begins = start[0] > 0 or start[1] <= 0 <= start[2]
-    told = f"StepEnvelope: at the step itself the bounds are {start[1]:g} to {start[2]:g}, but the response is at 0"
-    require(begins, f"{told}; let them include 0 there, or begin later")
+    allows_start = start[0] > 0 or start[1] <= 0 <= start[2]
+    message = f"StepEnvelope: at the step itself the bounds are {start[1]:g} to {start[2]:g}, but the response is at 0"
+    require(allows_start, f"{message}; let them include 0 there, or begin later")
     for q in requirements:
         near = band if isinstance(q, SettlingTime) else q.max if isinstance(q, SteadyStateError) else None
-        asked = f"{metric_name(q)} asks for 1 to within {near}"
-        told = f"StepEnvelope: from {last:g} s on the bounds are {low:g} to {up:g}, {asked}"
-        require(near is None or (low <= 1 + near and up >= 1 - near), f"{told}; move the bounds, or leave one out")
+        other = f"{metric_name(q)} asks for 1 to within {near}"
+        message = f"StepEnvelope: from {last:g} s on the bounds are {low:g} to {up:g}, {other}"
+        require(near is None or (low <= 1 + near and up >= 1 - near), f"{message}; move the bounds, or leave one out")
         if isinstance(q, Overshoot) and q.max is not None:
             t, lower, _ = max(tube, key=lambda row: row[1])
-            told = f"StepEnvelope: from {t:g} s on the lower bound is {lower:g}, Overshoot allows {1 + q.max:g}"
-            require(lower <= 1 + q.max, f"{told}; lower the bound, or raise Overshoot's max")
+            message = f"StepEnvelope: from {t:g} s on the lower bound is {lower:g}, Overshoot allows {1 + q.max:g}"
+            require(lower <= 1 + q.max, f"{message}; lower the bound, or raise Overshoot's max")

@@ -1,7 +1,7 @@
-"""`StepRecord`: responses to a step with their derivatives, and how metrics are read off them, a row an instant.
+"""`StepRecord`: responses to a step with their derivatives, and the rows of each metric, one for each instant.
 
-A metric is the largest of its rows. What certifies a design reads that largest value; a search by gradients reads every
-row with its derivative, for the largest of several is not smooth where another one takes over.
+A metric is the largest of its rows. `evaluate` reads that largest value. A gradient search reads every row with its
+derivative, because the maximum of several rows is not smooth where another row becomes the largest.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,43 +15,43 @@ from pneuopt.quantities.errors import require
 
 ValuesAndSlopes = tuple[Array, Array]
 RowReader = Callable[["StepRecord"], ValuesAndSlopes]
-SAMPLE_SHARE = (
-    0.999  # of a controller's sample, by which an instant counts as one sample later: above it rounding counts
-)
+# Share of a controller's sample time after which an instant counts as one sample later: nearer 1, rounding of the
+# instants decides; well below 1, the command's change within a sample would count.
+SAMPLE_SHARE = 0.999
 
 
 def without_slopes(values: Array) -> ValuesAndSlopes:
-    """Values that nobody differentiates: by no unknown."""
+    """Values with derivatives to no unknowns, shape (..., 0)."""
     return values, np.zeros((*values.shape, 0))
 
 
 @dataclass(frozen=True, eq=False)
 class StepRecord:
-    """m responses to one step on one grid, and how they move with N unknowns; N is 0 where nobody asks.
+    """Responses of m loops to one step on one grid, and derivatives to N unknowns; N is 0 without a gradient search.
 
     Parameters
     ----------
     t : ndarray, shape (n,)
-        From the step on, counted from there [s].
+        Time since the step [s].
     error : tuple of ndarray, shapes (m, K) and (m, K, N)
-        Distance of the averaged signal from the reference at the first K of every `stride`-th sample, a fraction of the
-        step, and its derivatives to the unknowns.
+        Distance of the averaged signal from the reference at the first K nodes, which are every `stride`-th sample, as
+        a fraction of the step; and its derivatives to the unknowns.
     final_error : tuple of ndarray, shapes (m, 1) and (m, 1, N)
-        Likewise at the end.
+        The same at the end of the record.
     command : tuple of ndarray, shapes (m, n) and (m, n, C), optional
-        [the command's unit], and its derivatives to the C columns that were simulated.
+        The command [its unit] and its derivatives to the C simulated columns, which `chain` maps to the unknowns.
     meter : mapping of str to tuple of ndarray
-        Likewise what the plant's meter shows, by channel.
+        The meter's channels by name, with derivatives as for the command.
     chain : ndarray, shape (m, C, N)
-        How the columns move with the unknowns.
+        Derivatives of the columns to the unknowns.
     stride : int
-        Samples from node to node.
+        Samples between two nodes.
     sample_time : float, optional
-        Of the controller that holds the command [s].
+        Sample time of the controller that holds the command [s].
     envelope : sequence of (float, float, float)
-        Instants after the step [s], each with the bounds from then on, as fractions of the step.
+        Instants after the step [s], each with the lower and upper bound from then on, as fractions of the step.
     is_step : bool
-        False: the reference stays, and what moves the signal is a disturbance.
+        False where the reference stays and a disturbance moves the signal.
     """
 
     t: Array
@@ -67,11 +67,11 @@ class StepRecord:
 
     @cached_property
     def nodes(self) -> Array:
-        """Instants of the error, shape (K,) [s]."""
+        """Instants at which the error is known, shape (K,) [s]."""
         return self.t[:: self.stride][: self.error[0].shape[1]]
 
     def largest(self, values: Array, slopes: Array) -> ValuesAndSlopes:
-        """The largest size of each stretch as long as that between nodes; of all where nobody differentiates."""
+        """Largest absolute value between each two nodes; without derivatives, of the whole record."""
         edges = np.arange(0, values.shape[1], max(1, self.stride)) if self.chain.shape[-1] else np.zeros(1, dtype=int)
         parts = np.split(np.abs(values), edges[1:], axis=1)
         k = np.array([edge + part.argmax(axis=1) for edge, part in zip(edges, parts, strict=True)]).T
@@ -79,7 +79,7 @@ class StepRecord:
         return np.abs(values[rows, k]), np.sign(values[rows, k])[..., None] * self._to_unknowns(slopes[rows, k])
 
     def metered_integral(self, channel: str) -> ValuesAndSlopes:
-        """The integral of a channel of the meter over time, a row a response."""
+        """Integral of a channel of the meter over time, a row a response."""
         (values, slopes), weights = self.meter[channel], trapezoidal_weights(self.t)
         by_column = np.einsum("k,mkc->mc", weights, slopes)[:, None]
         return (values @ weights)[:, None], self._to_unknowns(by_column)
@@ -87,12 +87,12 @@ class StepRecord:
     def error_integral(
         self, weights: Array, of: Callable[[Array], Array], slope: Callable[[Array], Array]
     ) -> ValuesAndSlopes:
-        """A weighted sum over the nodes of a function of the error, a row a response."""
+        """Weighted sum over the nodes of a function of the error, a row a response."""
         error, slopes = self.error
         return (of(error) @ weights)[:, None], np.einsum("mk,mkn->mn", slope(error) * weights, slopes)[:, None]
 
     def error_between(self, begin: float, end: float) -> ValuesAndSlopes:
-        """The error at the nodes of a span and at its ends, linear between nodes."""
+        """Error at the nodes of a time span and at its ends, linear between nodes."""
         (error, by_unknown), t = self.error, self.nodes
         at = np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])
         k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
@@ -105,13 +105,13 @@ class StepRecord:
 
 
 def trapezoidal_weights(t: Array) -> Array:
-    """Of samples, so that a weighted sum is the integral by the trapezoidal rule [s]."""
+    """Weights of samples with which a sum is the integral by the trapezoidal rule [s]."""
     h = np.diff(t)
     return np.asarray(0.5 * (np.append(h, 0.0) + np.append(0.0, h)))
 
 
 def overshoot_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The error; of what should not move, on either side."""
+    """The error beyond the reference; under a disturbance, where the signal should not move, on either side."""
     error, slopes = record.error
     if record.is_step:
         return error, slopes
@@ -119,28 +119,28 @@ def overshoot_rows(record: StepRecord) -> ValuesAndSlopes:
 
 
 def steady_state_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The size of the error at the end."""
+    """The absolute error at the end."""
     error, slopes = record.final_error
     return np.abs(error), np.sign(error)[..., None] * slopes
 
 
 def iae_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The integral of the error's size."""
+    """The integral of the absolute error."""
     return record.error_integral(trapezoidal_weights(record.nodes), np.abs, np.sign)
 
 
 def ise_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The integral of the error's square."""
+    """The integral of the squared error."""
     return record.error_integral(trapezoidal_weights(record.nodes), np.square, lambda error: 2 * error)
 
 
 def itae_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The integral of the error's size times the time since the step."""
+    """The integral of the absolute error times the time since the step."""
     return record.error_integral(trapezoidal_weights(record.nodes) * record.nodes, np.abs, np.sign)
 
 
 def envelope_rows(record: StepRecord) -> ValuesAndSlopes:
-    """Distance from the middle of the envelope over its half width, on both sides."""
+    """Distance from the middle of the envelope over its half width, a row each side."""
     last, first = record.nodes[-1], record.error
     values, slopes = [np.zeros((len(first[0]), 1))], [np.zeros((len(first[0]), 1, first[1].shape[-1]))]
     ends = [*(begin for begin, _, _ in record.envelope[1:]), np.inf]
@@ -154,13 +154,13 @@ def envelope_rows(record: StepRecord) -> ValuesAndSlopes:
 
 
 def peak_control_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The command's size."""
+    """The absolute command."""
     assert record.command is not None
     return record.largest(*record.command)
 
 
 def control_rate_rows(record: StepRecord) -> ValuesAndSlopes:
-    """The command's change from sample to sample; of a held one, which jumps, over the controller's own sample."""
+    """Rate of change of the command from sample to sample; of a held command over the controller's sample time."""
     assert record.command is not None
     (u, slopes), t, h = record.command, record.t, record.sample_time
     if h is None:

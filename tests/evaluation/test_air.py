@@ -97,6 +97,6 @@ def test_the_meter_is_no_output_and_watched_only_where_air_is_asked_for() -> Non
 def test_air_of_a_plant_that_draws_none_is_refused() -> None:
     loop = ClosedLoop(FirstOrder().system(), PID())
     given = loop.parameters.with_bounds({"pid.Kp": (0.5, 2.0)}).freed("pid.Kp")
-    with pytest.raises(InputError, match="AirUse counts the plant's air, and this plant has no meter"):
+    with pytest.raises(InputError, match="this plant does not show AirUse: it has no meter"):
         Simulator(loop, [Step(1.0)], search_space(loop, given), spec=specify(AirUse(max=1.0)))
     assert "AirUse" not in evaluate(loop, Step(1.0), given).index

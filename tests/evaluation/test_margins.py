@@ -129,7 +129,7 @@ def test_sensitivity_terms_have_exact_derivatives(second_order: System) -> None:
 
 def test_a_free_plant_parameter_is_refused(second_order: System) -> None:
     loop = ClosedLoop(second_order, PID())
-    with pytest.raises(ModelError, match=r"plant\.k: free, but the sensitivity takes the plant as fixed"):
+    with pytest.raises(ModelError, match=r"plant\.k: free, but the sensitivity needs a fixed plant"):
         sensitivity_terms(loop, [1.0], loop.parameters.freed("plant.k"))
 
 

@@ -219,7 +219,7 @@ def test_bad_input_is_named() -> None:
         Encoder(filter=-1.0)
     with pytest.raises(UnknownNameError, match=r"Rig: sensors: unknown output 'positon'; did you mean 'position'"):
         Rig(loop, {"positon": Sensor()})
-    with pytest.raises(ModelError, match="the controller needs 'position', which is not measured"):
+    with pytest.raises(ModelError, match="the controller needs 'position', which no sensor measures"):
         Rig(loop, {})
     with pytest.raises(ModelError, match="a rig's controller is sampled"):
         Rig(ClosedLoop(loop.plant, PID()), {"speed": Sensor()})

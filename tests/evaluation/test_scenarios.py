@@ -93,7 +93,7 @@ def test_bad_input_is_named() -> None:
     many = ParameterSet({f"p{k}": Parameter(1.0, "1") for k in range(13)})
     with pytest.raises(InputError, match="13 axes have 8192 corners"):
         corners(many, {f"p{k}": 0.1 for k in range(13)})
-    with pytest.raises(InputError, match=r"load\.mass have no covariance"):
+    with pytest.raises(InputError, match=r"no covariance of load\.mass"):
         draws(RIG, pd.DataFrame([[math.nan]], ["load.mass"], ["load.mass"]), 3)
     at_edge = RIG.with_bounds({"load.mass": (5.0, 5.0)})
     with pytest.raises(InputError, match="none lies within the bounds"):
