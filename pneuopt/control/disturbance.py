@@ -45,7 +45,7 @@ def _add_plant_disturbances(plant: System, wanted: list[str]) -> System:
 
     def wrap(function: ca.Function) -> ca.Function:
         arguments, given = [t, x, ca.vertcat(u, d), p], ["t", "x", "u", "p"]
-        found = list(function(t, x, us, ps))
+        found = function.call([t, x, us, ps])  # a list, whatever the number of outputs
         return ca.Function(function.name(), arguments, found, given, list(function.name_out()))
 
     units = {q.name: q.unit for q in plant.inputs} | {n: q.unit for n, q in plant.parameters.items()}

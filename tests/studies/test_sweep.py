@@ -311,7 +311,7 @@ def test_systems_travel(name: str, threads: Executor) -> None:
 
     system = SYSTEMS[name]
     copy: System = pickle.loads(pickle.dumps(system))
-    assert (repr(copy), copy.start_hook) == (repr(system), system.start_hook)
+    assert (repr(copy), repr(copy.start_hook)) == (repr(system), repr(system.start_hook))
     x, u, p = (np.full(system.ode.size1_in(i), 0.3) for i in (1, 2, 3))
     for ours, theirs in zip(copy.ode(0, x, u, p), system.ode(0, x, u, p), strict=True):
         assert np.array_equal(np.array(ours), np.array(theirs))
