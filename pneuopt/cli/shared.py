@@ -12,7 +12,6 @@ import numpy as np
 
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.terminal import make_console, show_output_files
-from pneuopt.evaluation.requirements import EnvelopeBounds, SettlingTime, StepEnvelope
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult
@@ -83,18 +82,6 @@ def warn_of_status(path: Path, what: str = "fit") -> None:
 def warn(message: str) -> None:
     """Say on standard error what does not stop the command."""
     make_console(error=True).print(f"warning: {message}", soft_wrap=True)
-
-
-def settling_band(task: Tuning) -> float:
-    """The settling band that the requirements name; 2 % otherwise."""
-    requirements = (*task.minimise, *task.subject_to)
-    return next((q.band for q in requirements if isinstance(q, SettlingTime)), 0.02)
-
-
-def step_envelope(task: Tuning) -> EnvelopeBounds:
-    """The bounds over time that the requirements name; none without."""
-    requirements = (*task.minimise, *task.subject_to)
-    return next((q.bounds for q in requirements if isinstance(q, StepEnvelope)), ())
 
 
 def figure_writers(path: Path, figures: Mapping[str, "Figure"]) -> Writers:

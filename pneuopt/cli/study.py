@@ -14,7 +14,6 @@ from pneuopt.cli.shared import (
     file_hashes,
     finish,
     read_fit_and_tuning,
-    settling_band,
     warn_of_status,
 )
 from pneuopt.cli.show_loops import metric_units, show_cases, show_front
@@ -70,7 +69,7 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
         cases = grid(parameters, {axis.name: axis.points for axis in axes})
     except InputError as error:
         raise InputError(f"{file}: [axes] {error}") from None
-    certify = partial(evaluate, task.loop, task.references, band=study.band or settling_band(task))
+    certify = partial(evaluate, task.loop, task.references, band=study.band or task.specification.band)
     with progress("certifying", quiet=quiet) as report_progress:
         table = sweep(certify, parameters, cases, progress=report_progress)
     verdict, status = _grid_verdict(table, len(task.references))
@@ -103,7 +102,7 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
             task.references,
             parameters,
             minimise=(first, second),
-            subject_to=[q for q in task.subject_to if metric_name(q) != metric_name(second)],
+            subject_to=[q for q in task.specification.limits if metric_name(q) != metric_name(second)],
             scenarios=task.scenarios(parameters),
             points=front_spec.points,
             until=until,
@@ -134,7 +133,7 @@ def _front_requirements(
 ) -> tuple[Requirement, Requirement, float | None]:
     """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
     where = f"{study.path}: [pareto]"
-    given = {metric_name(q): q for q in (*task.minimise, *task.subject_to)}
+    given = {metric_name(q): q for q in (*task.specification.weights, *task.specification.limits)}
     first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
     ends = {"lower": front_spec.lower, "upper": front_spec.upper}
     begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
@@ -155,7 +154,7 @@ def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, 
     if kind.__name__ in given:
         return given[kind.__name__]
     require(kind is not StepEnvelope, f"{where}: the tuning says no bounds for step_envelope; add them under [limits]")
-    plain: Requirement = SettlingTime(settling_band(task)) if kind is SettlingTime else kind()
+    plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
     return plain
 
 

@@ -17,9 +17,7 @@ from pneuopt.cli.shared import (
     file_hashes,
     finish,
     read_fit_and_tuning,
-    settling_band,
     stats_and_provenance,
-    step_envelope,
     write_csv,
 )
 from pneuopt.cli.show_loops import (
@@ -59,15 +57,14 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     outputs.check([fit, tuning], "bode")
     task, parameters = read_fit_and_tuning(fit, tuning)
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
-    require(bool(task.minimise), f"{tuning}: says nothing to minimise; {remedy}")
+    require(bool(task.specification.weights), f"{tuning}: says nothing to minimise; {remedy}")
     require(len(task.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
     with progress("tuning", quiet=quiet) as report_progress:
         result = tune(
             task.loop,
             task.references,
             parameters,
-            minimise=task.minimise,
-            subject_to=task.subject_to,
+            minimise=task.specification,
             scenarios=task.scenarios(parameters),
             method=task.method,
             throw=False,
@@ -81,7 +78,7 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     else:
         word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
         show_rejection(console, tuning, result.stats, parameters, word)
-        show_metrics(console, result.certified, task.loop, title=word, limits=task.subject_to)
+        show_metrics(console, result.certified, task.loop, title=word, limits=task.specification.limits)
         show_relaxations(console, result.relaxations)
     if result.status.code is Code.INTERRUPTED:
         console.print("no file is written")
@@ -105,10 +102,10 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
         task.references,
         parameters,
         scenarios=scenarios,
-        band=settling_band(task),
-        envelope=step_envelope(task),
+        band=task.specification.band,
+        envelope=task.specification.envelope,
     )
-    show_metrics(make_console(), metrics, task.loop, limits=task.subject_to)
+    show_metrics(make_console(), metrics, task.loop, limits=task.specification.limits)
     writers: Writers = {}
     if outputs.output is not None:
         runs = [_with_reference(r) for r in _simulate_responses(task, parameters)]
@@ -131,8 +128,7 @@ def _validate_on_new_plants(task: Tuning, parameters: ParameterSet, result: Tuni
         task.loop,
         task.references,
         result.parameters,
-        minimise=task.minimise,
-        subject_to=task.subject_to,
+        minimise=task.specification,
         scenarios=plants,
     )
 
@@ -140,7 +136,9 @@ def _validate_on_new_plants(task: Tuning, parameters: ParameterSet, result: Tuni
 def _show_design(console: "Console", task: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
     """Show gains, metrics, the validation on new plants and the dither's verdict; returns the last two as tables."""
     show_gains(console, before, result.parameters)
-    show_metrics(console, result.certified, task.loop, before=_initial_metrics(task, before), limits=task.subject_to)
+    show_metrics(
+        console, result.certified, task.loop, before=_initial_metrics(task, before), limits=task.specification.limits
+    )
     show_requirements(console, result.requirements, result.active, task.loop)
     slopes = [v for n, v in result.stats.items() if n.startswith("friction_slope")]
     axis = task.loop.plant.axis
@@ -165,7 +163,7 @@ def _show_design(console: "Console", task: Tuning, before: ParameterSet, result:
 def _show_dither_verdict(console: "Console", task: Tuning, parameters: ParameterSet) -> dict[str, Any]:
     """Show the dither's verdict; returns nothing where the loop cannot be simulated without dither."""
     try:
-        verdict = judge_dither(task.loop, task.references, parameters, band=settling_band(task))
+        verdict = judge_dither(task.loop, task.references, parameters, band=task.specification.band)
     except ConvergenceError as error:
         console.print(f"no verdict on the dither: {error}", soft_wrap=True)
         return {}
@@ -181,8 +179,8 @@ def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | 
             task.references,
             parameters,
             scenarios=task.scenarios(parameters),
-            band=settling_band(task),
-            envelope=step_envelope(task),
+            band=task.specification.band,
+            envelope=task.specification.envelope,
         )
     except (ConvergenceError, InputError):
         return None
@@ -206,7 +204,7 @@ def _simulate_response(loop: ClosedLoop, reference: Step, parameters: ParameterS
         return run
     others = {q.name: np.zeros(len(run)) for q in plant.inputs if q.name not in run}
     whole = run.with_columns({**others, loop.command.name: run["control"]})
-    return run.with_columns({"friction.force": friction_force(plant, whole, loop.parameters | parameters)})
+    return run.with_columns({"friction.force": friction_force(plant, whole, parameters)})
 
 
 def _simulate_initial_response(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
@@ -222,7 +220,7 @@ def _loop_figures(task: Tuning, parameters: ParameterSet, before: ParameterSet |
     first = responses[0]
     earlier = None if first.before is None or before is None else _open_loop(task.loop, before, first.before)
     bode = plot_bode(_open_loop(task.loop, parameters, first.run), earlier)
-    return {"": plot_steps(responses, band=settling_band(task)), "bode": bode}
+    return {"": plot_steps(responses, band=task.specification.band), "bode": bode}
 
 
 def _open_loop(loop: ClosedLoop, parameters: ParameterSet, run: Trajectory) -> Linearisation:

@@ -218,6 +218,13 @@ class ClosedLoop:
         Tf = float(self.gains(list(value.values()))[3])
         self.pid.check({**without_prefix(value, "pid"), "Tf": Tf}, self.command.unit)
 
+    def complete(self, parameters: ParameterSet) -> ParameterSet:
+        """A set with every parameter of the loop: the given ones, and the loop's defaults for those that are missing.
+
+        The loop's come first, in the order of `ClosedLoop.parameters`; what else `parameters` holds follows.
+        """
+        return self.parameters | parameters
+
     def parameter_vector(self, parameters: ParameterSet) -> Array:
         """The vector p of `parameters` in the loop's order; a missing one keeps the loop's default."""
         return np.array([parameters.value(n) if n in parameters else q.value for n, q in self.parameters.items()])
@@ -287,7 +294,7 @@ class ClosedLoop:
             or `start` names what this plant does not start from.
         """
         self.check(parameters)
-        parameters = set_sliding_direction(self, parameters, reference)
+        parameters = set_sliding_direction(self, self.complete(parameters), reference)
         p = self.parameter_vector(parameters)
         value = dict(zip(self.parameters, p, strict=True))
         if x_plant is None:

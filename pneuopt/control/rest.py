@@ -101,10 +101,19 @@ def find_rest(
 
 
 def set_sliding_direction(loop: WiredLoop, parameters: ParameterSet, reference: float) -> ParameterSet:
-    """The parameters with which a loop begins: Karnopp's friction already slides where the plant moves."""
+    """Set the direction in which Karnopp's friction already slides where the plant moves at the start.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+        Every parameter of the loop.
+    reference : float
+        The speed so far [m/s, or rad/s].
+    """
     if loop.feedback.name != "speed" or FRICTION_DIRECTION not in loop.parameters:
         return parameters
-    return (loop.parameters | parameters).with_values({FRICTION_DIRECTION: float(np.sign(reference))})
+    return parameters.with_values({FRICTION_DIRECTION: float(np.sign(reference))})
 
 
 def unobservable_states(plant: System, measured: str) -> tuple[str, ...]:

@@ -163,7 +163,7 @@ def judge_dither(
         If a simulation stops.
     """
     steps = [references] if isinstance(references, Step) else list(references)
-    full = loop.parameters | parameters
+    full = loop.complete(parameters)
     require(loop.dither is not None, "there is no dither to judge: ClosedLoop(plant, pid, Dither())")
     require(full.value(DITHER_AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")
     plain = full if without is None else full | without
@@ -199,7 +199,7 @@ def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -
     parameters : ParameterSet
         Values with the dither's amplitude and frequency.
     """
-    full = loop.parameters | parameters
+    full = loop.complete(parameters)
     found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
     moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, {"speed": reference.final}))
     if "speed" in moving:
@@ -231,8 +231,9 @@ def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: Parameter
     loop : ClosedLoop
     effect : DitherEffect
     parameters : ParameterSet
+        Every parameter of the loop.
     """
-    p, e, sentences = (loop.parameters | parameters), effect, list[str]()
+    p, e, sentences = parameters, effect, list[str]()
     sentences += _describe_clipping(loop, p)
     if not isnan(e.valve_gain):
         dead = p.value("valve.dead_zone")

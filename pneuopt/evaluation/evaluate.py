@@ -106,7 +106,7 @@ def evaluate(
 
     steps = [references] if isinstance(references, Step) else list(references)
     inner, rig = _loop_and_rig(loop, steps)
-    full = inner.parameters | parameters
+    full = inner.complete(parameters)
     every = cases(steps, scenarios, full)
     return pd.DataFrame({case.label: _evaluate_case(inner, rig, case, full, band, envelope) for case in every})
 
@@ -125,7 +125,8 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     Trajectory
         States and outputs of a loop, simulated tightly on a grid finer than a search's; for a rig, its truth.
     """
-    return _respond(*_loop_and_rig(loop, [reference]), reference, parameters)
+    inner, rig = _loop_and_rig(loop, [reference])
+    return _respond(inner, rig, reference, inner.complete(parameters))
 
 
 def _respond(loop: ClosedLoop, rig: Rig | None, reference: Step, parameters: ParameterSet) -> Trajectory:
@@ -190,13 +191,13 @@ def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command
     This is the viscous friction of the linearised loop at low frequencies, where the bristles follow the speed. A
     negative slope makes crawl likely.
     """
-    states, full, axis = [q.name for q in loop.plant.states], loop.parameters | parameters, loop.plant.axis
+    states, axis = [q.name for q in loop.plant.states], loop.plant.axis
     if axis is None or not any(n.startswith("friction.") for n in loop.plant.parameters):
         return {}
-    A = loop.plant.linearise(x, {loop.command.name: command}, full).A
+    A = loop.plant.linearise(x, {loop.command.name: command}, parameters).A
     v, z = states.index(axis.speed), [k for k, n in enumerate(states) if n.startswith("friction.")]
     bristles = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
-    return {"FrictionSlope": float(-full.value(axis.inertia) * (A[v, v] - bristles))}
+    return {"FrictionSlope": float(-parameters.value(axis.inertia) * (A[v, v] - bristles))}
 
 
 def _margin_metrics(

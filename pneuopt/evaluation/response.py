@@ -97,10 +97,10 @@ def readings_a_sample(loop: ClosedLoop, reference: Step) -> int:
 
 
 def highest_dither_frequency(loop: ClosedLoop, parameters: ParameterSet) -> float:
-    """Highest frequency that the dither may take in a tuning [Hz]; 0 without dither."""
+    """Highest frequency that the dither may take in a tuning [Hz]; 0 without dither; `parameters` are complete."""
     if loop.dither is None:
         return 0.0
-    frequency = (loop.parameters | parameters)["dither.frequency"]
+    frequency = parameters["dither.frequency"]
     return frequency.upper if frequency.free else frequency.value
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
+from types import MappingProxyType
 
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
@@ -22,6 +23,7 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.quantities.errors import require
 
 Kind = type | tuple[type, ...]
+NO_WEIGHTS: Mapping[Requirement, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class Specification:
     Attributes
     ----------
     weights : mapping of Requirement to float
-        The terms of the objective with their weights.
+        The terms of the objective with their weights; empty where a file only describes a loop.
     limits : tuple of Requirement
         At most one of a kind, the tightest.
     band : float
@@ -92,21 +94,23 @@ class Specification:
         return tuple(q for q in self.limits if not values[metric_name(q)] <= upper_limit(q) * (1 + slack))
 
 
-def specify(
-    minimise: Requirement | Mapping[Requirement, float], subject_to: Sequence[Requirement] = ()
-) -> Specification:
+Objective = Requirement | Mapping[Requirement, float] | Specification
+
+
+def specify(minimise: Objective, subject_to: Sequence[Requirement] = ()) -> Specification:
     """Check an objective and its limits.
 
     Parameters
     ----------
-    minimise : Requirement, or mapping of Requirement to weight
-        The objective; a term with a bound is a limit as well.
+    minimise : Requirement, mapping of Requirement to weight, or Specification
+        The objective; a term with a bound is a limit as well. A Specification, which is checked already, comes alone.
     subject_to : sequence of Requirement
 
     Raises
     ------
     InputError
-        If a limit has no bound, a weight is not positive, a kind is weighted twice, or bands or envelopes differ.
+        If there is nothing to minimise, a limit has no bound, a weight is not positive, a kind is weighted twice, or
+        bands or envelopes differ.
 
     Examples
     --------
@@ -115,8 +119,22 @@ def specify(
     >>> spec.objective({"SettlingTime": 0.3, "Overshoot": 0.05, "MaxSensitivity": 1.5})
     0.4
     """
-    weights = dict(minimise) if isinstance(minimise, Mapping) else {minimise: 1.0}
-    require(len(weights) > 0, "minimise is empty: name at least one requirement, SettlingTime() for example")
+    if isinstance(minimise, Specification):
+        require(len(subject_to) == 0, "minimise is a Specification, which holds its limits; leave subject_to out")
+        spec = minimise
+    else:
+        spec = specify_limits(subject_to, dict(minimise) if isinstance(minimise, Mapping) else {minimise: 1.0})
+    require(len(spec.weights) > 0, "minimise is empty: name at least one requirement, SettlingTime() for example")
+    return spec
+
+
+def specify_limits(
+    subject_to: Sequence[Requirement], weights: Mapping[Requirement, float] = NO_WEIGHTS
+) -> Specification:
+    """Check limits that may stand without an objective, as a file that only describes a loop has them.
+
+    Errors are as for `specify`.
+    """
     for q in (*weights, *subject_to):
         known = ", ".join(k.__name__ for k in REQUIREMENT_KINDS)
         require(isinstance(q, Requirement), f"{q!r} is no requirement; write {known}, as in Overshoot(max=0.05)")

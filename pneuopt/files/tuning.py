@@ -14,7 +14,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios, Spread, corners, samples, tolerances
-from pneuopt.evaluation.specification import specify
+from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.loop import (
     LOOP_SECTIONS,
     TUNABLE_SECTIONS,
@@ -57,9 +57,8 @@ class Tuning:
     references : tuple of Step
     parameters : ParameterSet
         "pid.*", "dither.*", "sensor.*" and "feedforward.*", the free ones within finite bounds.
-    minimise : mapping of Requirement to float
-        Weights; empty where the file only describes a loop.
-    subject_to : tuple of Requirement
+    specification : Specification
+        Objective and limits, checked; without terms of an objective where the file only describes a loop.
     scenarios : callable
         Of the nominal parameters: the plants and tolerances beside them.
     validation_scenarios : callable
@@ -71,8 +70,7 @@ class Tuning:
     loop: ClosedLoop
     references: tuple[Step, ...]
     parameters: ParameterSet
-    minimise: Mapping[Requirement, float]
-    subject_to: tuple[Requirement, ...]
+    specification: Specification
     scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
     validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
     method: Method | None = None
@@ -102,15 +100,14 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
         require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
     require("pid" in table, f"{path}: no controller; add a section [pid]")
     loop, parameters = read_loop_sections(table, plant, path)
-    minimise, subject_to = _read_objective(table, path), _read_requirements(table, loop, path)
-    if minimise:
-        construct_at(lambda: specify(minimise, subject_to), f"{path}: [minimise] and [limits]")
+    weights, limits = _read_objective(table, path), _read_requirements(table, loop, path)
+    spec = construct_at(lambda: specify_limits(limits, weights), f"{path}: [minimise] and [limits]")
     drawn = (
         partial(read, table.get("scenarios", {}), str(path)) for read in (read_scenarios, read_validation_scenarios)
     )
     method = read_method(table.get("method", {}), f"{path}: [method]")
     references, (tried, fresh) = _references(table, loop, path), drawn
-    return Tuning(loop, references, parameters, minimise, subject_to, tried, fresh, method)
+    return Tuning(loop, references, parameters, spec, tried, fresh, method)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") -> None:

@@ -89,7 +89,7 @@ def _check_travel(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
     reference, own = case.reference, case.case_parameters(space.parameters)
     begin = float(case.initial(loop, space.parameters)[states.index("position")])
     for stop in stops:
-        limit = stop.limit(loop.parameters | own)
+        limit = stop.limit(own)
         left = stop.side * (limit - begin)
         if loop.feedback.name == "position":
             far, remedy = stop.side * (reference.final - begin), "take a smaller step"
@@ -143,7 +143,7 @@ def _holding_command(loop: ClosedLoop, case: TuningCase, space: Space, value: fl
 
 def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> tuple[Array, float]:
     """The plant's state and the command with the measured signal at a value, as an integral action finds them."""
-    own, acting = case.case_parameters(loop.parameters | space.parameters), replace(loop, pid=PID(loop.pid.sample_time))
+    own, acting = case.case_parameters(space.parameters), replace(loop, pid=PID(loop.pid.sample_time))
     own = own | ParameterSet({"pid.Ki": replace(acting.parameters["pid.Ki"], value=1.0)})
     start = {n: v for n, v in case.reference.start.items() if n == "position"}
     return find_rest(acting, set_sliding_direction(acting, own, value), value, start)
@@ -152,7 +152,7 @@ def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, valu
 def _describe_command_excess(
     loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, command: float, value: float
 ) -> str:
-    own, unit = case.case_parameters(loop.parameters | space.parameters), loop.command.unit
+    own, unit = case.case_parameters(space.parameters), loop.command.unit
     takes = f"holding {value:.4g} {loop.feedback.unit} takes {command:.4g} {unit}"
     if loop.pid.limits:
         low, high = own.value("pid.lower"), own.value("pid.upper")
@@ -184,7 +184,7 @@ def _check_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
 
 def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
     """Of the plant's response to a slow command, where it follows the reference; 0 where that is unknown."""
-    reference, own = case.reference, case.case_parameters(loop.parameters | space.parameters)
+    reference, own = case.reference, case.case_parameters(space.parameters)
     try:
         x, command = _find_operating_point(loop, case, space, reference.final)
         plant = linear_plant(loop, own, x, {loop.command.name: command})

@@ -28,7 +28,7 @@ from pneuopt.evaluation.requirements import (
     with_user_limit,
 )
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
-from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -40,7 +40,7 @@ from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.screening import first_population
 from pneuopt.tuning.search import Search, end_point
 from pneuopt.tuning.simulator import to_records
-from pneuopt.tuning.tune import prepare_search
+from pneuopt.tuning.tune import prepare_search, prepare_task
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,9 +118,8 @@ def pareto_front(
     last = None if until is None else upper_limit(with_user_limit(second, until))
     message = f"a front from {metric_name(second)} {user_limit(second)} until {until} ends before it begins"
     require(last is None or last < upper_limit(second), message)
-    both = prepare_search(
-        loop, references, parameters, {first: 1.0, second: 1.0}, subject_to, scenarios, method, progress
-    )
+    spec = specify({first: 1.0, second: 1.0}, subject_to)
+    both = prepare_search(prepare_task(loop, references, parameters, spec, scenarios), method, progress)
     front = _Front(both, first, second, last)
     with suppress(KeyboardInterrupt):
         front.find_designs(points)

@@ -148,7 +148,7 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
         If nothing is free, something is free that is not the controller's (dither and feedforward included), or a bound
         is missing.
     """
-    full = loop.parameters | parameters.select(n for n in parameters if n in loop.parameters)
+    full = loop.complete(parameters).select(loop.parameters)
     free = tuple(n for n in parameters.free_names if n in loop.parameters)
     require(len(free) > 0, 'nothing is free; mark what may be tuned: parameters.freed("pid.K*", "dither.offset")')
     divisors = {"dither.frequency", *(f"pid.{n}" for n in loop.pid.positive_parameters)}

@@ -5,7 +5,7 @@ A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or s
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from pneuopt.control.disturbance import add_disturbances
@@ -15,7 +15,7 @@ from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.requirements import PeakControl, Requirement
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
-from pneuopt.evaluation.specification import specify
+from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
@@ -26,7 +26,7 @@ from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, relax
 from pneuopt.tuning.space import Space, clip_level, search_space
 
-__all__ = ["TuningResult", "prepare_search", "tune"]
+__all__ = ["TuningResult", "prepare_search", "prepare_task", "tune"]
 INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)  # limits may be why
 
 
@@ -35,7 +35,7 @@ def tune(
     references: Step | Sequence[Step],
     parameters: ParameterSet,
     *,
-    minimise: Requirement | Mapping[Requirement, float],
+    minimise: Objective,
     subject_to: Sequence[Requirement] = (),
     scenarios: Scenarios = NO_SCENARIOS,
     method: Method | None = None,
@@ -53,7 +53,8 @@ def tune(
     parameters : ParameterSet
         Of plant, controller and dither. The free ones ("pid.*", "dither.*", "feedforward.*") are tuned and need two
         finite bounds each.
-    minimise : Requirement, or mapping of Requirement to weight
+    minimise : Requirement, mapping of Requirement to weight, or Specification
+        A Specification, such as a tuning's file holds, brings its limits along: `subject_to` is then left out.
     subject_to : sequence of Requirement
         Each with its bound, `max` or `min`.
     scenarios : mapping of str to mapping, optional
@@ -94,20 +95,21 @@ def tune(
     (True, True)
     """
     begun = time.perf_counter()
-    posed = (loop, references, parameters, minimise, subject_to, scenarios)
-    search = prepare_search(*posed, method, progress)
+    task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios)
+    search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
     if method is None and successor is not None and not result.status.converged:
-        search = prepare_search(*posed, successor, progress)
+        search = prepare_search(task, successor, progress)
         result = search.run()
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
-    felt = search.space.names
-    unfelt = [n for n in search_space(loop, parameters).names if n not in felt]
-    note = f"{', '.join(unfelt)} left as given: without effect on a linear loop's average" if unfelt else ""
+    tuned = search.space.names
+    untuned = [n for n in task.space.names if n not in tuned]
+    note = f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""
+    found = {n: result.parameters.value(n) for n in tuned} if result.status.converged else {}
     result = replace(
         result,
-        parameters=parameters | result.parameters.select(felt if result.status.converged else ()),
+        parameters=parameters.with_values(found),
         status=result.status.with_remedies(note),
         stats={**result.stats, "seconds": time.perf_counter() - begun},
     )
@@ -116,30 +118,45 @@ def tune(
     return result
 
 
-def prepare_search(
+def prepare_task(
     loop: ClosedLoop,
     references: Step | Sequence[Step],
     parameters: ParameterSet,
-    minimise: Requirement | Mapping[Requirement, float],
-    subject_to: Sequence[Requirement] = (),
+    spec: Specification,
     scenarios: Scenarios = NO_SCENARIOS,
-    method: Method | None = None,
-    progress: ProgressCallback | None = None,
-) -> Search:
-    """The search that a tuning is, everything checked; parameters and errors as for `tune`."""
+) -> TuningTask:
+    """Check what is to be tuned, and that its limits can be kept at all; parameters and errors as for `tune`."""
     check_smooth(loop.plant)
     steps = [references] if isinstance(references, Step) else list(references)
     loop = add_disturbances(loop, steps)
-    spec = specify(minimise, subject_to)
     require(len(steps) > 0, "no reference to tune for; give a Step")
     space = search_space(loop, parameters)
     spec = spec.without(PeakControl) if clip_level(loop, space.parameters) <= spec.limit(PeakControl) else spec
     check_feasibility(loop, cases(steps, scenarios, space.parameters, space.names), space, spec)
-    task = TuningTask(loop, tuple(steps), scenarios, space, spec)
+    return TuningTask(loop, tuple(steps), scenarios, space, spec)
+
+
+def prepare_search(task: TuningTask, method: Method | None = None, progress: ProgressCallback | None = None) -> Search:
+    """The search that a method makes for a task, over the free parameters that have an effect on what it solves.
+
+    Parameters
+    ----------
+    task : TuningTask
+    method : Method, optional
+        By default the first that suits the task.
+    progress : callable, optional
+
+    Raises
+    ------
+    InputError
+        If the method cannot tune this task, or nothing that is free has an effect.
+    """
     if method is None:
         method = choose_method(task)
     else:
         method.check(task)
-    felt = Space(space.parameters, tuple(n for n in space.names if n not in method.parameters_without_effect))
-    require(len(felt.names) > 0, f"{', '.join(space.names)}: without effect on a linear loop; free a gain as well")
-    return Search(replace(task, space=felt), method, progress or (lambda _: None))
+    names = tuple(n for n in task.space.names if n not in method.parameters_without_effect)
+    free = ", ".join(task.space.names)
+    require(len(names) > 0, f"{free}: without effect on a linear loop; free a gain as well")
+    space = Space(task.space.parameters, names)
+    return Search(replace(task, space=space), method, progress or (lambda _: None))

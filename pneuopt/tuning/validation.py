@@ -15,7 +15,7 @@ from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, user_limit
 from pneuopt.evaluation.scenarios import Scenarios
-from pneuopt.evaluation.specification import Specification, specify
+from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -57,7 +57,7 @@ def validate_design(
     references: Step | Sequence[Step],
     parameters: ParameterSet,
     *,
-    minimise: Requirement | Mapping[Requirement, float],
+    minimise: Objective,
     subject_to: Sequence[Requirement] = (),
     scenarios: Scenarios,
 ) -> DesignValidation:
@@ -103,7 +103,7 @@ def validate_design(
     spec = specify(minimise, subject_to)
     steps = [references] if isinstance(references, Step) else list(references)
     loop = add_disturbances(loop, steps)
-    full = loop.parameters | parameters.select(n for n in parameters if n in loop.parameters)
+    full = loop.complete(parameters).select(loop.parameters)
     values = _simulate_plants(loop, steps, full, spec, scenarios)
     plants = [str(n) for n in values]
     worst = {str(n): plants[_rank_order(row.to_numpy(dtype=float), str(n))[-1]] for n, row in values.iterrows()}

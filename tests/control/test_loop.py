@@ -30,6 +30,15 @@ def test_the_loop_lists_its_signals_with_units(axis: System) -> None:
     assert all(f"{q.name} [{q.unit}]" in text for q in (*loop.states, *loop.inputs, *loop.outputs))
 
 
+def test_a_completed_set_keeps_what_is_given_and_fills_in_the_rest(second_order: System) -> None:
+    loop = ClosedLoop(second_order, PID(limits=False))
+    given = loop.parameters.with_values({"pid.Kp": 3.0})
+    full = loop.complete(given.select(["pid.Kp"]))
+    assert list(full) == list(loop.parameters)
+    assert full == given
+    assert loop.complete(full) == full
+
+
 def test_a_continuous_loop_follows_python_control(second_order: System, run: Run) -> None:
     loop = ClosedLoop(second_order, PID())
     t, _, y = run(loop, loop.parameters.with_values(TUNED), 1.0, 1e-3, 0.6)

@@ -172,10 +172,10 @@ horizon = "1 s"
 """
     (tmp_path / "tuning.toml").write_text(text)
     task = read_tuning(tmp_path / "tuning.toml", AXIS.plant)
-    (term,), (limit,) = task.minimise, task.subject_to
+    (term,), (limit,) = task.specification.weights, task.specification.limits
     assert isinstance(term, kind)
     assert isinstance(limit, kind)
-    assert (user_limit(term), task.minimise[term]) == (None, 2.0)
+    assert (user_limit(term), task.specification.weights[term]) == (None, 2.0)
     assert user_limit(limit) == pytest.approx(row.limit)
 
 

@@ -13,7 +13,7 @@ from pneuopt.evaluation.requirements import (
     SettlingTime,
     StepEnvelope,
 )
-from pneuopt.evaluation.specification import specify
+from pneuopt.evaluation.specification import specify, specify_limits
 from pneuopt.quantities.errors import InputError
 
 TUBE, OTHER = ((0.0, -0.1, 1.1), (0.5, 0.9, 1.1)), ((0.0, -0.2, 1.2),)
@@ -70,6 +70,20 @@ def test_the_envelope_is_that_of_a_term_or_limit() -> None:
     assert specify(SettlingTime()).envelope == ()
     assert specify(SettlingTime(), [StepEnvelope(TUBE)]).envelope == TUBE
     assert specify(StepEnvelope(TUBE, max=None)).limits == ()
+
+
+def test_a_checked_specification_stands_for_objective_and_limits() -> None:
+    spec = specify({SettlingTime(0.05): 1.0}, [Overshoot(0.1)])
+    assert specify(spec) is spec
+    with pytest.raises(InputError, match="leave subject_to out"):
+        specify(spec, [Overshoot(0.2)])
+
+
+def test_limits_without_an_objective_describe_a_loop_but_tune_nothing() -> None:
+    spec = specify_limits([SettlingTime(0.05, max=0.5)])
+    assert (spec.weights, spec.band) == ({}, 0.05)
+    with pytest.raises(InputError, match="minimise is empty"):
+        specify(spec)
 
 
 @pytest.mark.parametrize(
