@@ -22,6 +22,7 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.tuning.linearised import SMOOTH_REQUIREMENTS, LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.responses import to_records
 from pneuopt.tuning.screening import (
     SIMULATION_PEAK_MARGIN,
     BestPoint,
@@ -33,7 +34,7 @@ from pneuopt.tuning.screening import (
     screening_result,
     short_screening,
 )
-from pneuopt.tuning.simulator import Simulator, to_records
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 from pneuopt.tuning.sqp import SQP, LinearisedPoint, descend
 

@@ -23,8 +23,9 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.readings import CONTROL_OUTPUT, loop_pieces
+from pneuopt.tuning.responses import is_sound
 from pneuopt.tuning.rows import Lanes, reading_times
-from pneuopt.tuning.simulator import Simulator, is_sound
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.sqp import LinearisedPoint, RowGroups
 
 ROW_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.slope is not None)

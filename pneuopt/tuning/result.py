@@ -27,7 +27,8 @@ from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.relaxation import describe_relaxations
-from pneuopt.tuning.simulator import Simulator, worst_values
+from pneuopt.tuning.responses import worst_values
+from pneuopt.tuning.simulator import Simulator
 
 if TYPE_CHECKING:
     import pandas as pd

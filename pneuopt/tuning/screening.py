@@ -25,7 +25,8 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.readings import WORST_MERIT, penalty_settling_time
-from pneuopt.tuning.simulator import Responses, Simulator, to_records
+from pneuopt.tuning.responses import Responses, to_records
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
 LIMIT_TOLERANCE = 1e-4  # by which a search may end on the wrong side of a limit; the certificate decides

@@ -12,6 +12,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.relaxation import relax_all, relaxation_row, relaxation_specification
+from pneuopt.tuning.responses import to_records
 from pneuopt.tuning.result import (
     MAX_CERTIFIED_EXCESS,
     Certifier,
@@ -20,7 +21,7 @@ from pneuopt.tuning.result import (
     with_relaxations,
 )
 from pneuopt.tuning.screening import merit
-from pneuopt.tuning.simulator import Simulator, to_records
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
 MARGINS_TO_TRY = 3  # margins tried, each twice the one before

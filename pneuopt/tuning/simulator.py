@@ -1,8 +1,7 @@
 """`Simulator`: how many candidates respond to the references, at once and compiled, and what is read off them."""
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -14,16 +13,16 @@ from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.meter import check_channels, needed_channels
 from pneuopt.evaluation.metric import Source
-from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS, larger_is_better, requirement_values
+from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, loop_inputs, readings_a_sample, sample_spacing
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, has_integral, loop_pieces, read_metrics
+from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, is_sound, to_records
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
-RUNAWAY_LEVEL = 1e12
 HEADLINES = {name: metric.source is Source.LINEAR_LOOP for name, metric in METRICS.items() if metric.headline}
 BASE_METRICS = (*(name for name, linear in HEADLINES.items() if not linear), "Ripple", "Excess")
 BASE_MARGINS = tuple(name for name, linear in HEADLINES.items() if linear)
@@ -127,7 +126,7 @@ class Simulator:
         rates = [float(case.case_vectors(given, order)[0, order.index("dither.frequency")]) for case in self.cases]
         return [dither.period(rate, self.loop.pid.sample_time) for rate in rates]
 
-    def respond(self, points: Array, band: float, lanes: Mask | None = None) -> "Responses":
+    def respond(self, points: Array, band: float, lanes: Mask | None = None) -> Responses:
         """Simulate candidates.
 
         Parameters
@@ -144,7 +143,7 @@ class Simulator:
         measured = LaneMetrics.empty(len(rows), starts.shape[1], self.response_metrics)
         for chunk in self._chunks(case):
             self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
-        return Responses(self, wanted, p, measured)
+        return Responses(wanted, p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
     def values(self, points: Array, spec: Specification) -> dict[str, Array]:
         """What the requirements read, the worst over the cases, shape (m,) each.
@@ -164,6 +163,10 @@ class Simulator:
         responses = self.respond(point[None], spec.band)
         margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
         return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
+
+    def _read_margins(self, p: Array, case: Indices, x_end: Array, commands: Array) -> dict[str, Array]:
+        """Margins and peaks of loops linearised about the points in which their lanes end."""
+        return self.robustness(p, *self.operating_points(p, case, x_end, commands), self.margin_metrics)
 
     def operating_points(self, p: Array, case: Indices, x_end: Array, commands: Array) -> tuple[Array, Array]:
         """The plant's states and commands in which lanes end; under dither their means over its last period.
@@ -240,7 +243,7 @@ class Simulator:
             own = np.flatnonzero(self._grid_of[case] == g)
             yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
 
-    def _measure(self, out: "LaneMetrics", chunk: Indices, case: Indices, starts: Array, p: Array, band: float) -> None:
+    def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: float) -> None:
         if not len(chunk):
             return
         u, t, h, steps = self.pad(case)
@@ -293,107 +296,9 @@ class Simulator:
         return list(along[np.isfinite(along).all(axis=1)])
 
 
-@dataclass(frozen=True, eq=False)
-class LaneMetrics:
-    """What m lanes showed.
-
-    Attributes
-    ----------
-    metrics : dict of str to ndarray, shape (m,)
-        Of `step_metrics`, and "Excess", the mean error near the end, for what never settles; infinite where the
-        response runs away.
-    sound : ndarray of bool, shape (m,)
-        False where the response runs away.
-    x_end : ndarray, shape (m, n_states)
-    command : ndarray, shape (m,)
-        Where the responses end.
-    """
-
-    metrics: dict[str, Array]
-    sound: Mask
-    x_end: Array
-    command: Array
-
-    @staticmethod
-    def empty(m: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
-        """For m lanes, to be filled."""
-        return LaneMetrics(
-            {n: np.full(m, np.inf) for n in read}, np.zeros(m, dtype=bool), np.empty((m, n_states)), np.empty(m)
-        )
-
-
-class Responses:
-    """Simulated candidates; their margins, a frequency response each, are computed only where asked for.
-
-    Attributes
-    ----------
-    values : dict of str to ndarray, shape (m,)
-        What the requirements read but for margins, the worst over the cases that were run.
-    """
-
-    def __init__(self, simulator: Simulator, lanes: Mask, p: Array, measured: LaneMetrics) -> None:
-        self._simulator, self._lanes, self._p, self._measured = simulator, lanes, p, measured
-        metrics = {n: self.table(n).max(axis=1) for n in simulator.response_metrics}
-        self.values = {**requirement_values(metrics), "Excess": metrics["Excess"]}
-
-    def table(self, metric: str) -> Array:
-        """One metric, shape (m, n_cases); minus infinity where a case was not run."""
-        return self.to_table(self._measured.metrics[metric])
-
-    def by_case(self) -> dict[str, Array]:
-        """The values of each case that was run, shape (n_lanes,), as `lanes` lists them row by row."""
-        metrics = self._measured.metrics
-        return {**requirement_values(metrics), "Excess": metrics["Excess"]}
-
-    def with_margins(self, rows: Mask) -> dict[str, Array]:
-        """The values of some candidates, with their margins."""
-        chosen = {n: value[rows] for n, value in self.values.items()}
-        margins = requirement_values(self.margin_metrics(rows))
-        ran = self._lanes[rows]
-        return chosen | {n: np.max(np.where(ran, table, -np.inf), axis=1) for n, table in margins.items()}
-
-    def margin_metrics(self, rows: Mask) -> dict[str, Array]:
-        """Margins and peaks of some candidates, a column a case; NaN and infinite where the response runs away."""
-        measured, names = self._measured, self._simulator.margin_metrics
-        found = {n: np.full(len(measured.sound), np.nan if larger_is_better(n) else np.inf) for n in names}
-        row, case = np.nonzero(self._lanes)
-        wanted = measured.sound & rows[row]
-        if wanted.any():
-            p = self._p[wanted]
-            ends = measured.x_end[wanted], measured.command[wanted]
-            points = self._simulator.operating_points(p, case[wanted], *ends)
-            for n, value in self._simulator.robustness(p, *points, names).items():
-                found[n][wanted] = value
-        return {n: self.to_table(value)[rows] for n, value in found.items()}
-
-    def to_table(self, lanes: Array) -> Array:
-        """Numbers of the lanes as a table, shape (m, n_cases); minus infinity where a case was not run."""
-        table = np.full(self._lanes.shape, -np.inf)
-        table[self._lanes] = lanes
-        return table
-
-
-def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
-    """The values of one candidate after another."""
-    rows = zip(*(value.tolist() for value in values.values()), strict=True)
-    return [dict(zip(values, row, strict=True)) for row in rows]
-
-
-def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
-    """The largest of each value over the cases; NaN wins."""
-    return {n: float(np.max([values[n] for values in found])) for n in found[0]}
-
-
 def _select_rows(y: Array, rows: Mask) -> Array:
     """Some rows, the time axis as contiguous as it was."""
     return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)
-
-
-def is_sound(y: Array, x_end: Array) -> Mask:
-    """Which lanes did not run away."""
-    with np.errstate(all="ignore"):
-        tame = np.all(np.abs(y) < RUNAWAY_LEVEL, axis=(1, 2))
-    return np.asarray(tame & np.isfinite(x_end).all(axis=1))
 
 
 def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> Array | None:

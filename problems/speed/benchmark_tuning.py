@@ -45,8 +45,9 @@ import pneuopt as po
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.tuning.condensed import run_gradient_search
+from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.screening import merit
-from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, search_space
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame

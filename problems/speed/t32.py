@@ -27,8 +27,9 @@ from scipy.optimize import differential_evolution
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
+from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.screening import merit, run_screening
-from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, search_space
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame

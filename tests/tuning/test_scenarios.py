@@ -20,8 +20,9 @@ from pneuopt.models.linear import Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.screening import MeritFunction, Screening, run_screening
-from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase

@@ -25,8 +25,9 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.screening import MeritFunction, Screening, run_screening
-from pneuopt.tuning.simulator import Responses, Simulator
+from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase, is_linear

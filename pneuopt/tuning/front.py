@@ -1,0 +1,365 @@
+"""`Front`: the designs between two requirements, found by epsilon constraint.
+
+The first requirement is minimised for a row of limits on the second, from the design that is best by the first to the
+one that is best by the second, which two full tunings find. Each design is the start of its neighbours', in both
+directions, so that a branch of local minima that one end leads into is left for the other's; a design that another
+beats, or one of many points spread over the gains' box, is searched for again from there.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import nan
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pneuopt.evaluation.requirements import (
+    Requirement,
+    metric_name,
+    user_value,
+    with_upper_limit,
+)
+from pneuopt.evaluation.specification import Specification
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError
+from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.solution import Solution
+from pneuopt.tuning.method import LimitPath, Method, SearchResult
+from pneuopt.tuning.relaxation import limits_with_settling
+from pneuopt.tuning.responses import to_records
+from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.screening import first_population
+from pneuopt.tuning.search import Search, end_point
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LOG_SPACING_RATIO = 8.0  # ratio of the ends from which on the limits lie evenly in the logarithm
+MAX_IMPROVEMENT_ROUNDS = 2  # of searching again for designs that others beat
+RIVAL_SAMPLES = 2000  # points at which all requirements are read: branches that neither end leads to
+MIN_IMPROVEMENT = 1e-3  # relative, by which another design has to be better
+SECONDARY_WEIGHT = (
+    1e-3  # weight of the other requirement at an end: of designs that are equally good, the best by the other
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """One point of a front.
+
+    Attributes
+    ----------
+    limit : float
+        On the second requirement, as `read` gives it.
+    result : TuningResult or None
+        None: not reached.
+    seconds, solver_seconds : float
+    """
+
+    limit: float
+    result: TuningResult | None = None
+    seconds: float = 0.0
+    solver_seconds: float = 0.0
+
+
+@dataclass(eq=False)
+class Front:
+    """The designs of a front while they are searched for.
+
+    Parameters
+    ----------
+    base_search : Search
+        For both requirements at once; each design's search is made from it.
+    first, second : Requirement
+        The one that is minimised, and the one whose limit moves along the front.
+    last : float or None
+        The limit on the second with which the front ends, as `upper_limit` counts; None: the best that it can be.
+    designs : list of Design
+        From the best by the first to the best by the second.
+    """
+
+    base_search: Search
+    first: Requirement
+    second: Requirement
+    last: float | None
+    designs: list[Design] = field(default_factory=list)
+
+    def find_designs(self, points: int) -> None:
+        """All designs; again where one between the ends shows that an end was none."""
+        self.designs = [Design(nan)] * points
+        for k, q in ((0, self.first), (-1, self.second)):
+            self.designs[k] = self._find_end(q)
+        ends = [self.designs[0], self.designs[-1]]
+        for _ in range(MAX_IMPROVEMENT_ROUNDS):
+            done = self.designs
+            try:
+                self._fill_between(ends, points)
+            except KeyboardInterrupt:
+                self.designs = max((self.designs, done), key=_count_successes)
+                raise
+            better = [self._best(self.first), self._best(self.second)]
+            if better == ends or len(self.designs) == 1:
+                break
+            pairs = zip((self.first, self.second), ends, better, strict=True)
+            ends = [old if old is new else self._find_end(q, new.result) for q, old, new in pairs]
+
+    def _best(self, requirement: Requirement) -> Design:
+        """The best design by one requirement; an end unless another is clearly better."""
+        end = self.designs[0 if requirement is self.first else -1]
+        if requirement is self.second and self.last is not None:
+            return end
+        good = [d for d in self.designs if d.result is not None and d.result.status.converged]
+        best = min(good, key=lambda d: _result_value(_result_of(d), requirement))
+        return (
+            best
+            if _result_value(_result_of(best), requirement)
+            < _result_value(_result_of(end), requirement) * (1 - MIN_IMPROVEMENT)
+            else end
+        )
+
+    def _fill_between(self, ends: list[Design], points: int) -> None:
+        """What lies between the ends."""
+        high, low = ends[0].limit, ends[1].limit
+        if high <= low * (1 + MIN_IMPROVEMENT):
+            self.designs = ends[:1]
+            return
+        self.designs = [ends[0], *(Design(limit) for limit in _limit_grid(high, low, points)[1:-1]), ends[1]]
+        if points > 2 and self._path is not None:
+            self._follow(self._path)
+        else:
+            for k, start in [(k, k - 1) for k in range(1, points - 1)] + [(k, k + 1) for k in range(points - 2, 0, -1)]:
+                self._improve(k, self._gains(start))
+        for _ in range(MAX_IMPROVEMENT_ROUNDS):
+            for k in range(1, points - 1):
+                better = self._rival(k)
+                if better is not None:
+                    self._improve(k, better)
+
+    def to_frame(self) -> "pd.DataFrame":
+        """What there is so far."""
+        import pandas as pd
+
+        return pd.DataFrame([self._row(design) for design in self.designs])
+
+    def _find_end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
+        """The best by one requirement, and of many such by the other."""
+        begun, pair = time.perf_counter(), (self.first, self.second)
+        weights = {q: self._weight(q) * (1.0 if q is requirement else SECONDARY_WEIGHT) for q in pair}
+        spec = replace(
+            self.base_search.spec,
+            weights=weights,
+            limits=limits_with_settling(self.base_search.spec, self.base_search.task.references),
+        )
+        held = requirement is self.second and self.last is not None
+        if self.last is not None and held:
+            spec = self._constrain_second(self.last)
+        method, point = self.base_search.method, None
+        if start is not None:  # a search over wide bands would lose it
+            method, point = method.shorten(method.margin), end_point(start, self.base_search.space)
+        result = _check_interruption(self.base_search.with_specification(spec, method).run(point))
+        if not result.status.converged:
+            which = "at its last limit" if held else "as good as the limits allow"
+            raise ConvergenceError(f"no front: its end, {metric_name(requirement)} {which}, is {result.status}", result)
+        limit = self.last if self.last is not None and held else _result_value(result, self.second)
+        return Design(limit, result, time.perf_counter() - begun)
+
+    def _weight(self, requirement: Requirement) -> float:
+        """That makes a requirement of the order of the horizon, as the searches' penalties are."""
+        horizon = min(r.horizon - r.at for r in self.base_search.task.references)
+        return (
+            horizon / self._requirement_scales[metric_name(requirement)]
+            if self._requirement_scales[metric_name(requirement)]
+            else 1.0
+        )
+
+    @cached_property
+    def _requirement_scales(self) -> dict[str, float]:
+        """What the requirements come to with the given gains; 0 where that is unknown."""
+        space = self.base_search.space
+        found = to_records(self.base_search.simulator.values(space.start[None], self.base_search.spec))[0]
+        return {n: v if np.isfinite(v) and v > 0 else 0.0 for n, v in found.items()}
+
+    def _constrain_second(self, limit: float) -> Specification:
+        """The first requirement to be minimised, the second held."""
+        others = tuple(q for q in self.base_search.spec.limits if metric_name(q) != metric_name(self.second))
+        weights = {self.first: self._weight(self.first)}
+        return replace(self.base_search.spec, weights=weights, limits=(*others, with_upper_limit(self.second, limit)))
+
+    def _follow(self, path: LimitPath) -> None:
+        """With a solver along the limits; where what is found does not survive printing, again with more margin."""
+        todo = list(range(1, len(self.designs) - 1))
+        for margin in self._margins:
+            asked = [self._search_for(k, self.base_search.method) for k in todo]
+            found = self._track(path, [own.tighten(margin) for own in asked]) if todo else []
+            for k, own, solution in zip(todo, asked, found, strict=True):
+                self._certify(k, own, solution, margin)
+                self.base_search.progress(f"design {k + 1} of {len(self.designs)}: {_design_status(self.designs[k])}")
+            todo = [k for k in todo if not _design_status(self.designs[k]).converged]
+
+    @property
+    def _margins(self) -> tuple[float, ...]:
+        """Of the limits, one after the other where a design does not survive printing."""
+        return tuple(self.base_search.method.margin * factor for factor in (1, 2, 4))
+
+    @cached_property
+    def _path(self) -> LimitPath | None:
+        """The problem, prepared once, of which all designs are solutions; None where each is a search of its own."""
+        search = self._search_for(1, self.base_search.method)
+        return search.method.limit_path(search.task, search.tighten(search.method.margin))
+
+    def _track(self, path: LimitPath, specs: Sequence[Specification]) -> list[Solution]:
+        """From the first end; where the other end is on another branch, from there, too, and the better.
+
+        Two tracks that agree next to the second end are one.
+        """
+        space, ends = self.base_search.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
+        starts = [end_point(result, space) for result in ends]
+        found = path.follow(starts[0], specs)
+        other = path.follow(starts[1], specs[-1:])
+        if _solution_cost(other[0]) < _solution_cost(found[-1]) * (1 - MIN_IMPROVEMENT):
+            other = path.follow(starts[1], specs[::-1])
+        for k, back in zip(range(len(specs) - 1, -1, -1), other, strict=False):
+            spent = found[k].stats["seconds"] + back.stats["seconds"]
+            better = back if _solution_cost(back) < _solution_cost(found[k]) else found[k]
+            found[k] = replace(better, stats={**better.stats, "seconds": spent})
+        return found
+
+    def _certify(self, k: int, search: Search, solution: Solution, margin: float) -> None:
+        begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
+        result = self._round_and_certify(search, solution, margin)
+        seconds = old.seconds + spent + time.perf_counter() - begun
+        self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
+
+    def _round_and_certify(self, search: Search, solution: Solution, margin: float) -> TuningResult:
+        """A solution as printed, with its certificate."""
+        if solution.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        point = np.array([solution.parameters.value(n) for n in search.space.names])
+        found = SearchResult(point, solution.status, tuple(solution.multipliers), {"optimum": solution.stats["cost"]})
+        good = solution.status.converged
+        return (
+            search.certify_roundings(found, margin)
+            if good
+            else search.certifier.certify(search.simulator, found, point)
+        )
+
+    def _search_for(self, k: int, method: Method) -> Search:
+        return self.base_search.with_specification(self._constrain_second(self.designs[k].limit), method)
+
+    def _improve(self, k: int, start: Array | None) -> None:
+        """Search for a design from given gains; the better stays."""
+        begun, old, path = time.perf_counter(), self.designs[k], self._path
+        if path is not None and start is not None:
+            result, spent = self._resolve(path, k, start)
+        else:
+            search, spent = (
+                self._search_for(k, self.base_search.method.shorten(self.base_search.method.margin)),
+                0.0,
+            )
+            result = _check_interruption(search.run(start))
+        kept = old.result if old.result is not None and not self._is_better(result, old.result) else result
+        seconds, solver_seconds = old.seconds + time.perf_counter() - begun, old.solver_seconds + spent
+        self.designs[k] = replace(old, result=kept, seconds=seconds, solver_seconds=solver_seconds)
+        self.base_search.progress(
+            f"{metric_name(self.second)} {user_value(self.second, old.limit):.4g}: {result.status}"
+        )
+
+    def _resolve(self, path: LimitPath, k: int, start: Array) -> tuple[TuningResult, float]:
+        """The solver's answer from given gains, with more margin where it does not survive printing; its seconds."""
+        search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
+        for margin in self._margins:
+            (solution,) = path.follow(start, [search.tighten(margin)])
+            result, spent = self._round_and_certify(search, solution, margin), spent + solution.stats["seconds"]
+            if result.status.converged:
+                break
+        assert result is not None
+        return result, spent
+
+    def _is_better(self, one: TuningResult, other: TuningResult) -> bool:
+        if not one.status.converged or not other.status.converged:
+            return one.status.converged
+        return _result_value(one, self.first) < _result_value(other, self.first)
+
+    def _gains(self, k: int) -> Array | None:
+        result = self.designs[k].result
+        return None if result is None else end_point(result, self.base_search.space)
+
+    def _rival(self, k: int) -> Array | None:
+        """The gains of what beats a design within its limit, another design or a sampled point; None without."""
+        design, space = self.designs[k], self.base_search.space
+        spec, own = self._constrain_second(design.limit), np.inf
+        if design.result is not None and design.result.status.converged:
+            own = _result_value(design.result, self.first)
+        found = [
+            d.result for d in self.designs if d is not design and _design_status(d).converged and d.result is not None
+        ]
+        rivals = {
+            _result_value(r, self.first): end_point(r, space)
+            for r in found
+            if _result_value(r, self.second) <= design.limit
+        }
+        points, rows = self._samples
+        rivals |= {v[metric_name(self.first)]: x for x, v in zip(points, rows, strict=True) if not spec.violations(v)}
+        least = min((v for v in rivals if np.isfinite(v)), default=np.inf)
+        return rivals[least] if least < own * (1 - MIN_IMPROVEMENT) else None
+
+    @cached_property
+    def _samples(self) -> tuple[Array, list[dict[str, float]]]:
+        """Points spread over the gains' box, and what the requirements read there."""
+        space, rng = self.base_search.space, np.random.default_rng(0)
+        points = space.from_unit(first_population(RIVAL_SAMPLES, space.to_unit(space.start), rng))
+        return points, to_records(self.base_search.simulator.values(points, self.base_search.spec))
+
+    def _row(self, design: Design) -> dict[str, Any]:
+        result, pair, space = design.result, (self.first, self.second), self.base_search.space
+        good = result is not None and result.status.converged
+        columns = {"": "certified", "claimed ": "claimed"}
+        known = result.requirements if result is not None and good else None
+        figures = {
+            f"{lead}{metric_name(q)}": nan if known is None else float(known[column][metric_name(q)])
+            for lead, column in columns.items()
+            for q in pair
+        }
+        gains = {n: nan if result is None or not good else result.parameters.value(n) for n in space.names}
+        costs = {"solver_seconds": design.solver_seconds, "seconds": design.seconds}
+        error = "" if good else Code.INTERRUPTED.value if result is None else str(result.status)
+        return {**figures, "limit": user_value(self.second, design.limit), **gains, **costs, "error": error}
+
+
+def _result_of(design: Design) -> TuningResult:
+    assert design.result is not None
+    return design.result
+
+
+def _check_interruption(result: TuningResult) -> TuningResult:
+    """The same; Ctrl-C, which a search turns into its best so far, ends a front."""
+    if result.status.code is Code.INTERRUPTED:
+        raise KeyboardInterrupt
+    return result
+
+
+def _count_successes(designs: Sequence[Design]) -> int:
+    """How many of them are certified."""
+    return sum(_design_status(design).converged for design in designs)
+
+
+def _design_status(design: Design) -> Status:
+    return Status(Code.INTERRUPTED) if design.result is None else design.result.status
+
+
+def _solution_cost(solution: Solution) -> float:
+    """The objective; inf where it is no solution."""
+    return solution.stats["cost"] if solution.status.converged else np.inf
+
+
+def _result_value(result: TuningResult, requirement: Requirement) -> float:
+    """The certified figure as `read` gives it, so that smaller is better."""
+    return user_value(requirement, float(result.requirements["certified"][metric_name(requirement)]))  # its own inverse
+
+
+def _limit_grid(high: float, low: float, points: int) -> list[float]:
+    """Limits from high to low, evenly or, where the ends are far apart, evenly in the logarithm."""
+    even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
+    return [float(v) for v in even(high, low, points)]
