@@ -1,10 +1,11 @@
-"""Search by gradients: a short screening over several settling bands at once, then condensed multiple shooting.
+"""`Condensed`: a search by gradients, a short screening over several settling bands and then condensed shooting.
 
-For many gains and many scenarios. Gradients find the nearest optimum only, and at a narrow band each way to leave it
-once more or once less is an optimum of its own: the mean over bands, wide and narrow, leads a screening across them,
-where ever narrower bands led ten seeds on T32's corners to 0.184 s and this one to 0.159 s. The dither makes optima
-of its own beside each other: `restarts` screens again, and jumps from the best to other dithers (eight more seeds:
-median 0.155 s, 0.183 s where it only swept the dither about the best).
+It is for many gains and many scenarios. Gradients find the nearest optimum only, and each number of times that the
+response leaves a narrow band makes an optimum of its own. The mean settling time over wide and narrow bands leads a
+screening across these optima: on the corners of the friction drive in problems/speed/t32.py ten seeds ended at 0.159 s,
+with a sequence of narrowing bands at 0.184 s. The dither makes further optima beside each other: `restarts` screens
+again and jumps from the best point to other dithers (eight more seeds: median 0.155 s, against 0.183 s where the dither
+was only varied about the best point).
 """
 
 from collections.abc import Sequence
@@ -28,9 +29,9 @@ from pneuopt.tuning.screening import (
     BestPoint,
     MeritFunction,
     Screening,
+    compute_merits,
+    evolve,
     first_population,
-    generation,
-    merit,
     screening_result,
     short_screening,
 )
@@ -38,47 +39,63 @@ from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 from pneuopt.tuning.sqp import SQP, LinearisedPoint, descend
 
-NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")  # gradients are wrong or useless there
-QUANTISER_PARAMETERS = ("sensor.resolution",)  # what makes steps of a signal, wherever it is among the parameters
-# Gains up to which one plant is tuned as well without gradients; eight on a drive with friction take twice the time.
+# Free parameters that no gradient serves: the averaging time moves with the frequency, and a clip that no response
+# meets has derivative zero.
+NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
+QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
+# Gains up to which one plant is tuned without gradients. A lower number sends small problems, which a screening solves
+# as well, to the gradients; a higher one costs time: with eight gains on a drive with friction it takes twice as long.
 MAX_SCREENING_GAINS = 6
-MIN_POINT_DISTANCE = 0.03  # of a gain's range: two points closer than that are one
-PROGRAM_MARGIN = 0.005  # by which the programs' band and limits are tighter: a solution lies on them, and grazes them
-MAX_PENALTY_RAISES = 2  # times that the penalties are raised tenfold, where they did not keep the limits
-RANKING_POINTS = 12  # points that rank the scenarios
-RESTART_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a range, to which a renewal jumps
-JUMP_ITERATIONS = 8  # iterations that choose among the jumps
+# Distance below which two points count as one, a fraction of each gain's range. A smaller one lets one optimum take
+# several of the places in `keep`; a larger one merges optima that differ in the dither.
+MIN_POINT_DISTANCE = 0.03
+# Share by which the programs' band and limits are tighter than the search's. With less, a solution, which lies on its
+# limits, breaks them between the nodes; more gives performance away.
+PROGRAM_MARGIN = 0.005
+MAX_PENALTY_RAISES = 2  # times that the penalties are raised tenfold where limits stay broken; more slow each program
+# Points by which the scenarios are ranked. Fewer rank them by chance; each more costs a simulation of every case.
+RANKING_POINTS = 12
+# Places in the range of a parameter that is not the PID's, to which a restart jumps. Fewer miss optima of the dither;
+# each one costs `JUMP_ITERATIONS` iterations.
+RESTART_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
+# Iterations before the best of the jumps are chosen. Fewer choose before the gains have adapted to the new dither; more
+# cost time for jumps that are dropped.
+JUMP_ITERATIONS = 8
 
 
 @dataclass(frozen=True)
 class Condensed:
-    """Condensed multiple shooting: sequential quadratic programs on compiled simulations with sensitivities.
+    """Tune many gains, or for many scenarios, by quadratic programs on compiled simulations with sensitivities.
 
     Parameters
     ----------
     members, generations : int
-        Of the screening by differential evolution.
+        Population and generations of the screening by differential evolution.
     bands : tuple of float
-        Settling bands that the screening judges by beside the one asked for, as far as they are wider.
+        Settling bands over which the screening takes the mean settling time, beside the one asked for, as far as they
+        are wider.
     keep, iterations : int
-        Points that the programs improve, and how often.
+        Points that the programs improve, and iterations for each.
     restarts : int
         Times that another population is screened, and the programs begin again from the best point with the dither's
-        amplitude, then its offset, and what else is free and not the PID's, put to `RESTART_FRACTIONS` of its range.
+        amplitude, then its offset, and every other free parameter that is not the PID's, put to `RESTART_FRACTIONS` of
+        its range.
     working : int
-        Cases, the worst, that the programs see at a time.
+        Cases, the worst ones, that the programs see at a time.
     rounds : int
-        Of taking in cases that turn out to be worse.
+        Rounds of programs; after each, cases that turn out to be worse are taken in.
     nodes : tuple of int
-        At which a response is read: on the way, and in the final polish.
+        Instants at which a response is read: during the search, and in the final polish.
     polish : int
         Iterations on the finer nodes.
     margin : float
-        How much tighter the search's limits are than those asked for.
+        How much tighter the search's limits are than those asked for, a fraction.
     seed : int
+        Of the random numbers.
     digits : int, optional
         Significant digits of the gains handed out; None: all.
     steps : SQP
+        Step control of the programs.
     """
 
     members: int = 40
@@ -113,15 +130,15 @@ class Condensed:
 
     @property
     def successor(self) -> None:
-        """None: its answer is final."""
+        """None, for its answer is final."""
 
     def check(self, task: TuningTask) -> None:
-        """Refuse what gradients cannot do: `InputError` names it and the remedy."""
+        """Refuse requirements and parameters without a gradient: `InputError` names them and the remedy."""
         strange = _nonsmooth_terms(task)
         require(not strange, f"Condensed has no gradient for {', '.join(strange)}; use method=Screening()")
 
     def suits(self, task: TuningTask) -> bool:
-        """For scenarios or many gains, where there are gradients of all requirements to all that is free."""
+        """Whether there are scenarios or many gains, and gradients of all requirements to all that is free."""
         many = bool(task.scenarios) or len(task.space.names) > MAX_SCREENING_GAINS
         return many and not _nonsmooth_terms(task)
 
@@ -134,20 +151,20 @@ class Condensed:
         attempt: int,  # noqa: ARG002
         progress: ProgressCallback,
     ) -> SearchResult:
-        """The best point found; see `Method.find`."""
+        """Search for the best point; see `Method.find`."""
         best = run_gradient_search(simulator, task.references, task.space, spec, self, start, progress)
         return screening_result(task, simulator, spec, best)
 
     def shorten(self, margin: float) -> Screening:
-        """A short search, from a point that is close."""
+        """The method for a short search from a point that is close."""
         return short_screening(margin, self.digits)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
-        """None: it can only search anew."""
+        """None, for it can only search anew."""
 
 
 def _nonsmooth_terms(task: TuningTask) -> list[str]:
-    """Requirements without a gradient, and free parameters to which there is none."""
+    """The names of requirements without a gradient, and of free parameters to which there is none."""
     return [*_nonsmooth_requirements(task.spec), *_nonsmooth_parameters(task.space)]
 
 
@@ -167,9 +184,9 @@ def run_gradient_search(
     spec: Specification,
     method: Condensed,
     start: Array,
-    tell: ProgressCallback,
+    report_progress: ProgressCallback,
 ) -> BestPoint:
-    """The best point found; Ctrl-C ends the search with the best so far.
+    """Search by screening and gradients; Ctrl-C ends the search with the best point so far.
 
     Parameters
     ----------
@@ -178,11 +195,11 @@ def run_gradient_search(
         Already tightened.
     start : ndarray, shape (n,)
         A member of the first population.
-    tell : callable
-        Hears of each stage.
+    report_progress : callable
+        Receives a line of text a stage.
     """
     scale = min(r.horizon - r.at for r in references)
-    search = _CondensedSearch(simulator, spec, method, scale, space.to_unit(start), tell)
+    search = _CondensedSearch(simulator, spec, method, scale, space.to_unit(start), report_progress)
     try:
         search.run()
     except KeyboardInterrupt:
@@ -191,7 +208,7 @@ def run_gradient_search(
 
 
 class _CondensedSearch:
-    """The search's state: the best point by exact merit over all cases, and what it took."""
+    """A search in progress: the best point by its merit over all cases, and the number of candidates simulated."""
 
     def __init__(
         self,
@@ -200,14 +217,16 @@ class _CondensedSearch:
         method: Condensed,
         scale: float,
         start: Array,
-        tell: ProgressCallback,
+        report_progress: ProgressCallback,
     ) -> None:
-        self._simulator, self._spec, self._method, self._scale, self._progress = simulator, spec, method, scale, tell
+        self._simulator, self._spec, self._method, self._scale = simulator, spec, method, scale
+        self._report_progress = report_progress
         self._rollout = sensitivity_rollout(simulator)
         self._rng = np.random.default_rng(method.seed)
         self.best, self._best_merit, self.count, self._objective_scale = np.clip(start, 0.0, 1.0), np.inf, 0, 1.0
 
     def run(self) -> None:
+        """Screen, descend, restart, raise penalties and take in worse cases, in that order, then polish."""
         method, spec = self._method, self._spec
         population = first_population(method.members, self.best, self._rng)
         cases = self._worst_cases(population[:RANKING_POINTS])
@@ -231,7 +250,7 @@ class _CondensedSearch:
         self._polish(cases)
 
     def _search(self, population: Array, cases: Sequence[int]) -> Array:
-        """The optima that a screening of this population leads to."""
+        """Screen a population and descend from its best points; the optima, the best first."""
         method = self._method
         starts = self._screen(population, cases, method.generations)
         return self._select_best(self._descend(starts, cases, self._spec, method.iterations))
@@ -242,21 +261,21 @@ class _CondensedSearch:
             self._select_best(self._descend(self.best[None], cases, self._spec, self._method.polish, is_last=True))
 
     def _screen(self, population: Array, cases: Sequence[int], generations: int) -> Array:
-        """The best points of a short differential evolution over several bands, apart from each other."""
+        """Evolve a population over several bands at once; its best points, at a distance from each other."""
         simulator, space = self._simulator.select_cases(cases), self._simulator.space
-        judge = MeritFunction(simulator.coarse(self._spec, self._bands), space, self._spec, self._scale, population[0])
-        merits, worst = judge.race(population, np.full(len(population), np.inf), None)
+        merit = MeritFunction(simulator.coarse(self._spec, self._bands), space, self._spec, self._scale, population[0])
+        merits, worst = merit.race(population, np.full(len(population), np.inf), None)
         for _ in range(generations):
-            population, merits, worst = generation(population, merits, worst, judge, self._rng)
+            population, merits, worst = evolve(population, merits, worst, merit, self._rng)
         if self._best_merit == np.inf:
-            self.best, self._objective_scale = judge.best, self._objective(judge.best)
-        self._progress(f"screening over {1 + len(self._bands)} bands: best {merits.min():.4g}")
-        self.count += judge.count + len(population)
-        merits = MeritFunction(simulator.coarse(self._spec), space, self._spec, self._scale, judge.best)(population)
+            self.best, self._objective_scale = merit.best, self._objective(merit.best)
+        self._report_progress(f"screening over {1 + len(self._bands)} bands: best {merits.min():.4g}")
+        self.count += merit.count + len(population)
+        merits = MeritFunction(simulator.coarse(self._spec), space, self._spec, self._scale, merit.best)(population)
         return _distinct_points(population, merits)[: self._method.keep]
 
     def _jump(self, points: Array, cases: Sequence[int]) -> list[Array]:
-        """The optima to which the best point leads with one unknown, not the PID's, put elsewhere; none is known."""
+        """Descend from the best point with one parameter that is not the PID's put elsewhere; only new optima count."""
         names, method = self._simulator.space.names, self._method
         others = [k for k, n in enumerate(names) if not n.startswith("pid.")]
         jumps = [
@@ -274,11 +293,14 @@ class _CondensedSearch:
 
     @cached_property
     def _bands(self) -> list[float]:
-        """Those that are wider than the one asked for."""
+        """The method's settling bands that are wider than the one asked for."""
         return [band for band in self._method.bands if band > self._spec.band]
 
     def _objective(self, unit: Array) -> float:
-        """What the objective is of the order of; ten times the penalties hold a search in the first basin it meets."""
+        """The objective's size at a point, which sets that of the penalties.
+
+        Penalties ten times as large hold a search in the first basin that it meets.
+        """
         simulator, spec = self._simulator, self._spec
         values = to_records(simulator.values(simulator.space.from_unit(unit[None]), spec))[0]
         unknown = {"SettlingTime": self._scale}
@@ -287,7 +309,7 @@ class _CondensedSearch:
     def _descend(
         self, unit: Array, cases: Sequence[int], spec: Specification, most: int, *, is_last: bool = False
     ) -> Array:
-        """Improved points, the best first; on coarse samples up to the last time."""
+        """Improve points by quadratic programs, on coarse samples but for the last time; distinct, the best first."""
         inside, simulator = spec.tighten(PROGRAM_MARGIN, PROGRAM_MARGIN), self._simulator.select_cases(cases)
         simulator = simulator if is_last else simulator.coarse(spec)
         problem = LinearisedProblem(
@@ -296,12 +318,12 @@ class _CondensedSearch:
         found: list[LinearisedPoint] = descend(problem, problem.start(unit), most, self._method.steps)
         self.count += problem.count
         merits = np.array([point.merit for point in found])
-        self._progress(f"programs on {len(cases)} cases: best {merits.min():.4g}")
+        self._report_progress(f"programs on {len(cases)} cases: best {merits.min():.4g}")
         return _distinct_points(np.array([point.z[:-1] for point in found]), merits)
 
     def _select_best(self, unit: Array) -> Array:
-        """The best few of the points by exact merits over all cases, the best first; it is kept."""
-        merits = merit(
+        """Rank points by their merits over all cases, keep the best as `best`, and return the best few in order."""
+        merits = compute_merits(
             self._simulator.values(self._simulator.space.from_unit(unit), self._spec), self._spec, self._scale
         )
         self.count += len(unit)
@@ -310,21 +332,21 @@ class _CondensedSearch:
         return _distinct_points(unit, merits)[: self._method.keep]
 
     def _violates_limits(self) -> bool:
-        """Whether the best point breaks a limit: then the penalties were too small."""
+        """Whether the best point breaks a limit, for then the penalties were too small."""
         values = self._simulator.values(self._simulator.space.from_unit(self.best[None]), self._spec)
         return bool(self._spec.violations(to_records(values)[0]))
 
     def _merits_by_case(self, unit: Array) -> Array:
-        """Merits of each case, the sensitivity left out, shape (m, n_cases)."""
+        """The merit of each point on each case, margins left out, shape (m, n_cases)."""
         responses = self._simulator.respond(self._simulator.space.from_unit(unit), self._spec.band)
         self.count += len(unit)
         plain = self._spec.without(ROBUSTNESS_REQUIREMENTS)
         if plain.weight(ROBUSTNESS_REQUIREMENTS):
             return np.zeros((len(unit), len(self._simulator.cases)))
-        return responses.to_table(merit(responses.by_case(), plain, self._scale))
+        return responses.to_table(compute_merits(responses.by_case(), plain, self._scale))
 
     def _worst_cases(self, unit: Array) -> list[int]:
-        """The cases that rank worst for most of some points; all if they are few."""
+        """The cases with the worst mean rank over some points; all of them if they are few."""
         count = len(self._simulator.cases)
         if count <= self._method.working:
             return list(range(count))
@@ -332,7 +354,7 @@ class _CondensedSearch:
         return sorted(np.argsort(-ranks, kind="stable")[: self._method.working].tolist())
 
     def _worse_cases(self, cases: Sequence[int], unit: Array) -> list[int]:
-        """Cases outside the working set that are worse for the best point than all within."""
+        """Cases outside the working set that are worse, at their worst over these points, than every case within."""
         if len(cases) == len(self._simulator.cases):
             return []
         merits = self._merits_by_case(np.vstack([self.best[None], unit])).max(axis=0)
@@ -341,7 +363,7 @@ class _CondensedSearch:
 
 
 def _distinct_points(unit: Array, merits: Array) -> Array:
-    """The points in order of merit, without those that lie close to a better one."""
+    """The points in order of merit; one that lies close to a better one is dropped."""
     found = list[Array]()
     for k in np.argsort(merits, kind="stable"):
         if all(np.max(np.abs(unit[k] - other)) > MIN_POINT_DISTANCE for other in found):

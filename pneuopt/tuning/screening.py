@@ -1,7 +1,7 @@
-"""Search by compiled simulation: differential evolution over ever narrower bands, then a local refinement.
+"""`Screening`: a search by compiled simulation, differential evolution over narrowing bands and then Nelder-Mead.
 
-For any loop, friction, clip and sampling included. Directly at a narrow band a search stalls where nothing settles yet;
-what settles within 10 % leads to what settles within 2 %.
+It tunes any loop, with friction, clip and sampling. A search that begins with a narrow settling band stalls where no
+candidate settles within it; candidates that settle within 10 % lead it to those that settle within 2 %.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,29 +29,35 @@ from pneuopt.tuning.responses import Responses, to_records
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
-LIMIT_TOLERANCE = 1e-4  # by which a search may end on the wrong side of a limit; the certificate decides
-# Share of the margin for peaks of command and sensitivity: what a search's coarser samples may miss of a peak.
+# Relative excess over a limit with which a search still counts as successful. At zero, rounding errors make a design
+# that lies on its limit infeasible; a larger one hands over designs whose certificate is bound to fail.
+LIMIT_TOLERANCE = 1e-4
+# Share of the margin that limits on peaks of command and sensitivity are tightened by. A smaller one than a search's
+# coarse samples miss of a peak makes the certificate fail; a larger one gives performance away.
 SIMULATION_PEAK_MARGIN = 1 / 5
-VIOLATION_PENALTY = 20.0  # weight of a limit's relative violation beside that of never settling
+# Weight of a limit's relative violation beside that of never settling. With a smaller one a search stays with designs
+# that settle and break a limit; with a larger one with loops so slow that they keep every limit and never settle.
+VIOLATION_PENALTY = 20.0
 
 
 @dataclass(frozen=True)
 class Screening:
-    """Differential evolution on compiled simulations, then Nelder-Mead from the best.
+    """Tune any loop by differential evolution on compiled simulations, then by Nelder-Mead from the best point.
 
     Parameters
     ----------
     members : int
-        Of the population.
+        Candidates in the population.
     generations : int
-        In each stage; there is one for each of `bands`, and two for the band asked for.
+        Generations in each stage; there is one for each of `bands`, and two for the band asked for.
     bands : tuple of float
         Settling bands of the first stages, as far as they are wider than the one asked for.
     refinements : int
-        Simulations of the local search.
+        Simulations of the local search, at most.
     margin : float
-        How much tighter the search's limits are than those asked for.
+        How much tighter the search's limits are than those asked for, a fraction.
     seed : int
+        Of the random numbers.
     digits : int, optional
         Significant digits of the gains handed out; None: all.
     """
@@ -76,13 +82,13 @@ class Screening:
 
     @property
     def successor(self) -> None:
-        """None: its answer is final."""
+        """None, for its answer is final."""
 
     def check(self, task: TuningTask) -> None:
-        """It can tune any loop."""
+        """Accept every task: a simulation can be searched whatever the loop."""
 
     def suits(self, task: TuningTask) -> bool:  # noqa: ARG002
-        """Always."""
+        """Whether it is the one to choose: always, it is the last in `METHODS`."""
         return True
 
     def find(
@@ -94,26 +100,26 @@ class Screening:
         attempt: int,  # noqa: ARG002
         progress: ProgressCallback,
     ) -> SearchResult:
-        """The best point found; see `Method.find`."""
+        """Search for the best point; see `Method.find`."""
         best = run_screening(simulator, task.references, task.space, spec, self, start, progress)
         return screening_result(task, simulator, spec, best)
 
     def shorten(self, margin: float) -> "Screening":
-        """A short search, from a point that is close."""
+        """The method for a short search from a point that is close."""
         return short_screening(margin, self.digits)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
-        """None: it can only search anew."""
+        """None, for it can only search anew."""
 
 
 @dataclass(frozen=True, eq=False)
 class BestPoint:
-    """What `run_screening` found.
+    """The best point that a search by simulation found.
 
     Attributes
     ----------
     point : ndarray, shape (n,)
-        The best by merit.
+        The gains with the least merit.
     count : int
         Candidates simulated.
     is_complete : bool
@@ -132,9 +138,9 @@ def run_screening(
     spec: Specification,
     method: Screening,
     start: Array,
-    tell: ProgressCallback,
+    report_progress: ProgressCallback,
 ) -> BestPoint:
-    """The best point found; Ctrl-C ends the search with the best so far.
+    """Search by differential evolution and Nelder-Mead; Ctrl-C ends the search with the best point so far.
 
     Parameters
     ----------
@@ -143,32 +149,35 @@ def run_screening(
         Already tightened.
     start : ndarray, shape (n,)
         A member of the first population.
-    tell : callable
-        Hears of each generation.
+    report_progress : callable
+        Receives a line of text a generation.
     """
-    judge = MeritFunction(simulator, space, spec, min(r.horizon - r.at for r in references), space.to_unit(start))
+    merit = MeritFunction(simulator, space, spec, min(r.horizon - r.at for r in references), space.to_unit(start))
     try:
-        _search(judge, spec, method, tell)
+        _search(merit, spec, method, report_progress)
     except KeyboardInterrupt:
-        return BestPoint(space.from_unit(judge.best), judge.count, is_complete=False)
-    return BestPoint(space.from_unit(judge.best), judge.count, is_complete=True)
+        return BestPoint(space.from_unit(merit.best), merit.count, is_complete=False)
+    return BestPoint(space.from_unit(merit.best), merit.count, is_complete=True)
 
 
-def _search(judge: "MeritFunction", spec: Specification, method: Screening, tell: ProgressCallback) -> None:
+def _search(merit: "MeritFunction", spec: Specification, method: Screening, report_progress: ProgressCallback) -> None:
+    """Evolve a population over the bands, from wide to narrow, and refine the best; `merit` keeps it."""
     rng = np.random.default_rng(method.seed)
-    population = first_population(method.members, judge.best, rng)
+    population = first_population(method.members, merit.best, rng)
     for band in [*(b for b in method.bands if b > spec.band), spec.band, spec.band]:
-        judge.set_specification(spec.with_band(band))
-        merits, worst = judge.race(population, np.full(len(population), np.inf), None)
+        merit.set_specification(spec.with_band(band))
+        merits, worst = merit.race(population, np.full(len(population), np.inf), None)
         for number in range(method.generations):
-            population, merits, worst = generation(population, merits, worst, judge, rng)
-            tell(f"band {band:.3g}, generation {number + 1} of {method.generations}: best {merits.min():.4g}")
+            population, merits, worst = evolve(population, merits, worst, merit, rng)
+            report_progress(
+                f"band {band:.3g}, generation {number + 1} of {method.generations}: best {merits.min():.4g}"
+            )
     if method.refinements:
-        _refine(judge.best, judge, method.refinements)
+        _refine(merit.best, merit, method.refinements)
 
 
 def screening_result(task: TuningTask, simulator: Simulator, spec: Specification, best: BestPoint) -> SearchResult:
-    """What a search by simulation hands over.
+    """The result of a search by simulation: its point with its status and what is active there.
 
     Parameters
     ----------
@@ -186,12 +195,12 @@ def screening_result(task: TuningTask, simulator: Simulator, spec: Specification
 
 
 def short_screening(margin: float, digits: int | None) -> Screening:
-    """A short search from a point that is close: wide bands would lose it."""
+    """The settings of a short search from a point that is close, which wide bands would lead away from."""
     return Screening(24, 8, (), 200, margin, digits=digits)
 
 
 class MeritFunction:
-    """Merit of points of the unit cube, one a row; counts them, and keeps the best under what was asked last.
+    """The merit of points of the unit cube, one a row; it counts them and keeps the best by the present specification.
 
     Attributes
     ----------
@@ -205,7 +214,7 @@ class MeritFunction:
         self.best, self._best_merit, self.count = start, np.inf, 0
 
     def set_specification(self, spec: Specification) -> None:
-        """Judge by another specification from now on."""
+        """Use another specification from now on; the best point so far no longer counts."""
         self._spec, self._best_merit = spec, np.inf
 
     def __call__(self, unit: Array) -> Array:
@@ -213,14 +222,15 @@ class MeritFunction:
         return self.race(unit, np.full(len(unit), np.inf), None)[0]
 
     def race(self, unit: Array, rivals: Array, first: Indices | None) -> tuple[Array, Indices]:
-        """The merit of each point that may beat its rival, and of the others a lower bound that does not.
+        """Compute the merit of points that beat their rivals, and for the others a lower bound above their rival's.
 
         Parameters
         ----------
         unit : ndarray, shape (m, n)
         rivals : ndarray, shape (m,)
+            The merits to beat.
         first : ndarray of int, shape (m,), or None
-            The case that each point faces first, its rival's worst: most losers need no other.
+            The case on which each point is simulated first, its rival's worst: most losers need no other.
 
         Returns
         -------
@@ -235,10 +245,10 @@ class MeritFunction:
         else:
             opening = np.arange(C) == first[:, None]
             merits, worst, seen = self._evaluate(points, opening, rivals, {})
-            on = merits <= rivals
-            if on.any():
-                seen = {n: value[on] for n, value in seen.items()}
-                merits[on], worst[on], _ = self._evaluate(points[on], ~opening[on], rivals[on], seen)
+            able = merits <= rivals
+            if able.any():
+                seen = {n: value[able] for n, value in seen.items()}
+                merits[able], worst[able], _ = self._evaluate(points[able], ~opening[able], rivals[able], seen)
         k = int(np.argmin(merits))
         if merits[k] < self._best_merit:
             self.best, self._best_merit = unit[k], float(merits[k])
@@ -247,9 +257,10 @@ class MeritFunction:
     def _evaluate(
         self, points: Array, lanes: Mask | None, rivals: Array, seen: Mapping[str, Array]
     ) -> tuple[Array, Indices, dict[str, Array]]:
-        """Merits, worst cases and values over the cases of `lanes` and what was `seen` before.
+        """Compute merits, worst cases and values over the cases of `lanes` and the values `seen` on others before.
 
-        Margins, a frequency response each, cost as much as a simulation; as limits they only add.
+        Margins, a frequency response each, cost as much as a simulation. A limit on them can only raise a merit, so
+        they are computed for points that can still beat their rival.
         """
         given = () if lanes is None else (lanes,)
         responses = self._simulator.respond(points, self._spec.band, *given)
@@ -257,7 +268,7 @@ class MeritFunction:
         values = _elementwise_max(responses.values, seen)
         merits = np.full(len(points), -np.inf)
         if not self._spec.weight(ROBUSTNESS_REQUIREMENTS):
-            merits = merit(values, plain, self._scale)
+            merits = compute_merits(values, plain, self._scale)
         if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
             ahead = merits <= rivals
             margins = {n: np.full(len(points), -np.inf) for n in self._simulator.margin_metrics}
@@ -265,25 +276,36 @@ class MeritFunction:
             for n, value in margins.items():
                 value[ahead] = robust[n]
             values = _elementwise_max({**values, **margins}, seen)
-            merits[ahead] = merit({n: value[ahead] for n, value in values.items()}, self._spec, self._scale)
+            merits[ahead] = compute_merits({n: value[ahead] for n, value in values.items()}, self._spec, self._scale)
         return merits, self._worst_case(responses, plain), values
 
     def _worst_case(self, responses: Responses, plain: Specification) -> Indices:
-        """The case with the largest merit, margins left out."""
+        """Each point's case with the largest merit, margins left out, shape (m,)."""
         if len(self._simulator.cases) == 1 or self._spec.weight(ROBUSTNESS_REQUIREMENTS):
             return np.zeros(len(responses.values["Excess"]), dtype=np.intp)
-        table = responses.to_table(merit(responses.by_case(), plain, self._scale))
+        table = responses.to_table(compute_merits(responses.by_case(), plain, self._scale))
         return np.asarray(np.argmax(table, axis=1))
 
 
 def _elementwise_max(values: Mapping[str, Array], seen: Mapping[str, Array]) -> dict[str, Array]:
+    """The larger of both, by name; a name that was not `seen` keeps its values."""
     return {n: np.maximum(value, seen[n]) if n in seen else value for n, value in values.items()}
 
 
-def generation(
-    population: Array, merits: Array, worst: Indices, judge: MeritFunction, rng: np.random.Generator
+def evolve(
+    population: Array, merits: Array, worst: Indices, merit: MeritFunction, rng: np.random.Generator
 ) -> tuple[Array, Array, Indices]:
-    """One generation of differential evolution: half of the members search about themselves and the best."""
+    """Advance a population by one generation of differential evolution.
+
+    About half of the trial points lie between a member and the best, the others about a member drawn at random.
+
+    Returns
+    -------
+    population : ndarray, shape (m, n)
+    merits : ndarray, shape (m,)
+    worst : ndarray of int, shape (m,)
+        Each member's worst case.
+    """
     m, n = population.shape
     a, b, c = (rng.permutation(m) for _ in range(3))
     factor = rng.uniform(0.4, 0.9, (m, 1))
@@ -295,30 +317,31 @@ def generation(
     kept = rng.random((m, n)) < 0.1
     kept[np.arange(m), rng.integers(n, size=m)] = False
     trial = np.where(kept, population, mutant)
-    found, cases = judge.race(trial, merits, worst)
+    found, cases = merit.race(trial, merits, worst)
     better = found <= merits
     population = np.where(better[:, None], trial, population)
     return population, np.where(better, found, merits), np.where(better, cases, worst)
 
 
-def _refine(best: Array, judge: MeritFunction, most: int) -> None:
-    """Nelder-Mead from a small simplex; the judge keeps the best."""
+def _refine(best: Array, merit: MeritFunction, most: int) -> None:
+    """Search by Nelder-Mead from a small simplex about the best point; `merit` keeps the best it sees."""
     steps = np.where(best < 0.5, 0.03, -0.03) * np.eye(len(best))
     options = {"maxfev": most, "initial_simplex": np.vstack([best, best + steps]), "xatol": 1e-5, "fatol": 1e-7}
     settings: Any = {"method": "Nelder-Mead", "bounds": [(0.0, 1.0)] * len(best), "options": options}
 
     def cost(unit: Array) -> float:
-        return float(judge(unit[None])[0])
+        return float(merit(unit[None])[0])
 
     minimize(cost, best, **settings)
 
 
-def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
-    """The objective where all limits are kept; elsewhere more than that, graded by how much they are missed by.
+def compute_merits(values: Mapping[str, Array], spec: Specification, scale: float) -> Array:
+    """The objective of points that keep all limits; of others more than any objective, graded by their violations.
 
     So limits come first, whatever unit the objective has: K. Deb, An efficient constraint handling method for genetic
-    algorithms, Comput. Methods Appl. Mech. Engrg. 186 (2000) 311-338. What never settles misses a settling time that
-    is minimised, by more the further from the reference it ends, so that a search can start.
+    algorithms, Comput. Methods Appl. Mech. Engrg. 186 (2000) 311-338. Where a settling time is minimised, a response
+    that never settles counts as a violation, the larger the further from the reference it ends, so that a search can
+    start.
 
     Parameters
     ----------
@@ -340,7 +363,7 @@ def merit(values: Mapping[str, Array], spec: Specification, scale: float) -> Arr
 
 
 def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
-    """A Latin hypercube with the start in it."""
+    """Draw a Latin hypercube of the unit cube, with the start as its first point, shape (members, n)."""
     cells = np.array([rng.permutation(members) for _ in start]).T
     found: Array = (cells + rng.random(cells.shape)) / members
     found[0] = np.clip(start, 0.0, 1.0)
@@ -348,7 +371,7 @@ def first_population(members: int, start: Array, rng: np.random.Generator) -> Ar
 
 
 def _screening_status(spec: Specification, values: Mapping[str, float]) -> Status:
-    """What a screening achieved: it keeps the limits, or the closest it came."""
+    """The status of a search: converged where its point keeps the limits; otherwise it says which ones are broken."""
     broken = [
         f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
         for q in spec.violations(values, LIMIT_TOLERANCE)
@@ -364,7 +387,7 @@ def _screening_status(spec: Specification, values: Mapping[str, float]) -> Statu
 
 
 def _active_limits(space: Space, spec: Specification, point: Array, values: Mapping[str, float]) -> tuple[str, ...]:
-    """Limits within 2 % of being reached, gains within 0.1 % of their range of a bound."""
+    """The names of limits that are reached to within 2 %, and of gains within 0.1 % of their range from a bound."""
     limits = [metric_name(q) for q in spec.limits if values[metric_name(q)] >= 0.98 * upper_limit(q)]
     low, up = space.bounds.T
     near = np.minimum(point - low, up - point) <= 1e-3 * (up - low)

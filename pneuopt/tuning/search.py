@@ -20,7 +20,7 @@ from pneuopt.tuning.result import (
     relaxation_share,
     with_relaxations,
 )
-from pneuopt.tuning.screening import merit
+from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
@@ -144,7 +144,7 @@ class Search:
         points, most = nearest[None], found.stats["optimum"] * (1 + MAX_CERTIFIED_EXCESS)
         for _ in range(ROUNDING_ROUNDS):
             values = simulator.values(points, spec)
-            order, rows = np.argsort(merit(values, spec, self.task.horizon)), to_records(values)
+            order, rows = np.argsort(compute_merits(values, spec, self.task.horizon)), to_records(values)
             for k in order.tolist():
                 good = not spec.violations(rows[k]) and spec.objective(rows[k]) <= most
                 if good and len(tried) < MAX_CERTIFIED_POINTS and points[k].tolist() not in tried:

@@ -46,7 +46,7 @@ from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.tuning.condensed import run_gradient_search
 from pneuopt.tuning.responses import Responses
-from pneuopt.tuning.screening import merit
+from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, search_space
 from problems.shared.arrays import Array
@@ -121,7 +121,7 @@ class Clock:
 
     def merits(self, points: Array) -> Array:
         """Of candidates on every case; raises StopIteration."""
-        found = merit(self.simulator.respond(points, TIGHT.band).values, TIGHT, STEP.horizon)
+        found = compute_merits(self.simulator.respond(points, TIGHT.band).values, TIGHT, STEP.horizon)
         spent = time.process_time() - self.begun
         while len(self.kept) < len(TIMES) and spent > self.limits[len(self.kept)]:
             self.kept.append(self.point)
@@ -202,7 +202,7 @@ def timed(simulator: Simulator, space: Space, seed: int) -> tuple[Array, float]:
 
 def value(simulator: Simulator, point: Array) -> float:
     responses: Responses = simulator.respond(point[None], TIGHT.band)
-    return float(merit(responses.values, TIGHT, STEP.horizon)[0])
+    return float(compute_merits(responses.values, TIGHT, STEP.horizon)[0])
 
 
 def evolve(clock: Clock, space: Space, seed: int, options: dict[str, Any]) -> None:

@@ -27,7 +27,7 @@ from scipy.optimize import differential_evolution
 
 import pneuopt as po
 from pneuopt.evaluation.specification import specify
-from pneuopt.tuning.screening import merit
+from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.two_phase import solve_two_phase
@@ -86,7 +86,7 @@ def evolved(simulator: Simulator, goal: float, limit: float, seed: int) -> list[
 
     def cost(unit: Array) -> Array:
         points = space.from_unit(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
-        merits = merit(simulator.values(points, TIGHT), TIGHT, STEP.horizon)
+        merits = compute_merits(simulator.values(points, TIGHT), TIGHT, STEP.horizon)
         best = min(trace[-1][1] if trace else inf, float(merits.min()))
         trace.append((time.process_time() - begun, best))
         if best <= goal or trace[-1][0] > limit:

@@ -28,7 +28,7 @@ import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.tuning.responses import Responses
-from pneuopt.tuning.screening import merit, run_screening
+from pneuopt.tuning.screening import compute_merits, run_screening
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, search_space
 from problems.shared.arrays import Array
@@ -74,7 +74,7 @@ class Counter:
         found = self.simulator.respond(points, band)
         self.simulations += len(points)
         if band == self.spec.band:
-            merits = merit(found.values, self.spec, STEP.horizon)
+            merits = compute_merits(found.values, self.spec, STEP.horizon)
             k = int(np.argmin(merits))
             if merits[k] < self.best:
                 self.best, self.point = float(merits[k]), points[k]
@@ -149,7 +149,7 @@ def evolve(counter: Counter, budget: int, seed: int, options: dict[str, Any]) ->
 
     def cost(unit: Array) -> Array:
         points = space.from_unit(np.clip(np.atleast_2d(unit.T), 0.0, 1.0))
-        return merit(counter.respond(points, counter.spec.band).values, counter.spec, STEP.horizon)
+        return compute_merits(counter.respond(points, counter.spec.band).values, counter.spec, STEP.horizon)
 
     members = options.get("popsize", 15) * len(space.names)
     settings: dict[str, Any] = {"bounds": [(0.0, 1.0)] * len(space.names), "vectorized": True, "updating": "deferred"}

@@ -154,9 +154,9 @@ def test_racing_finds_what_facing_every_case_finds_and_runs_less() -> None:
         return respond(own, points, band, wanted)
 
     def faced_by_all(
-        judge: MeritFunction, unit: np.ndarray, _: np.ndarray, __: np.ndarray | None
+        merit: MeritFunction, unit: np.ndarray, _: np.ndarray, __: np.ndarray | None
     ) -> tuple[np.ndarray, ...]:
-        return race(judge, unit, np.full(len(unit), np.inf), None)
+        return race(merit, unit, np.full(len(unit), np.inf), None)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Simulator, "respond", counted)

@@ -296,9 +296,9 @@ def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
     assert sum(judged) < 0.7 * found.count
 
     def plainly(
-        judge: MeritFunction, unit: np.ndarray, _: np.ndarray, first: np.ndarray | None
+        merit: MeritFunction, unit: np.ndarray, _: np.ndarray, first: np.ndarray | None
     ) -> tuple[np.ndarray, ...]:
-        return race(judge, unit, np.full(len(unit), np.inf), first)
+        return race(merit, unit, np.full(len(unit), np.inf), first)
 
     with pytest.MonkeyPatch.context() as patch:
         race = MeritFunction.race
