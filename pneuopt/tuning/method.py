@@ -1,4 +1,4 @@
-"""`Method`: what a way to tune has to answer, the task that it gets, and the result that it hands over."""
+"""`Method`: what a way to tune must offer; `TuningTask`, which it is given, and `SearchResult`, which it returns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from pneuopt.tuning.space import Space
 
 @dataclass(frozen=True, eq=False)
 class TuningTask:
-    """What is to be tuned, everything checked.
+    """A loop, its references and scenarios, its free gains and what is asked of them, all checked.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class TuningTask:
     space : Space
         The free gains, and every parameter of the loop.
     spec : Specification
-        As asked for.
+        Objective and limits, as asked for.
     """
 
     loop: ClosedLoop
@@ -44,9 +44,18 @@ class TuningTask:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a method hands over: a point before rounding, what is active there, figures; whether it came to its end.
+    """The point that a method found, before rounding.
 
-    `stats` holds at least "optimum", the objective there, where the status is "converged".
+    Attributes
+    ----------
+    point : ndarray, shape (n,)
+    status : Status
+    active : tuple of str
+        Limits and bounds that are active there.
+    stats : mapping of str to float
+        At least "optimum", the objective there, where the status is "converged".
+    is_complete : bool
+        False where Ctrl-C ended the search.
     """
 
     point: Array
@@ -57,10 +66,10 @@ class SearchResult:
 
 
 class LimitPath(Protocol):
-    """A problem, prepared once, that is solved for one set of limits after the other."""
+    """A problem that is prepared once and solved for one set of limits after the other."""
 
     def follow(self, start: Array, specs: Sequence[Specification]) -> list[Solution]:
-        """Solve for one after the other, the first from gains of shape (n,)."""
+        """Solve for one specification after the other, the first from gains of shape (n,), each from the one before."""
         ...
 
 
@@ -69,35 +78,35 @@ class Method(Protocol):
 
     @property
     def margin(self) -> float:
-        """How much tighter its limits are than those asked for, a fraction."""
+        """By what fraction its limits are tighter than those asked for."""
         ...
 
     @property
     def peak_margin(self) -> float:
-        """Of `margin` the share that limits on peaks of command and sensitivity get."""
+        """The share of `margin` by which limits on peaks of command and sensitivity are tightened."""
         ...
 
     @property
     def digits(self) -> int | None:
-        """Significant digits of the gains handed out; None: all."""
+        """To how many significant digits the gains are rounded; None: not at all."""
         ...
 
     @property
     def parameters_without_effect(self) -> tuple[str, ...]:
-        """Parameters that what it solves does not depend on: they stay as given."""
+        """Parameters on which its problem does not depend: they stay as given."""
         ...
 
     @property
     def successor(self) -> "Method | None":
-        """What tunes in its place where it was chosen unasked and fails; None: its answer is final."""
+        """The method to try next where this one was chosen by default and fails; None: its answer is final."""
         ...
 
     def check(self, task: TuningTask) -> None:
-        """Refuse what it cannot tune: `InputError` names it and the remedy."""
+        """Refuse a task that it cannot tune: `InputError` names the reason and the remedy."""
         ...
 
     def suits(self, task: TuningTask) -> bool:
-        """Whether it is the one to choose, of those that come after it in `METHODS`; it can tune what it suits."""
+        """Whether it is to be chosen before those that follow it in `METHODS`; it can tune any task that it suits."""
         ...
 
     def find(
@@ -109,27 +118,27 @@ class Method(Protocol):
         attempt: int,
         progress: ProgressCallback,
     ) -> SearchResult:
-        """The best point found; Ctrl-C ends a search by simulation with the best so far.
+        """Search for the best point; Ctrl-C ends a search by simulation with the best so far.
 
         Parameters
         ----------
         task : TuningTask
         simulator : Simulator
-            Of the task's cases.
+            It simulates the task's cases.
         spec : Specification
-            The task's, tightened by the margin.
+            The task's specification, tightened by the margin.
         start : ndarray, shape (n,)
         attempt : int
-            0, or how often the certificate has failed: `start` is then what was found with less margin.
+            How often the certificate has failed so far; from 1 on `start` is the point found with less margin.
         progress : callable
-            Hears a line of text a generation, start or program.
+            Receives a line of text a generation, start or program.
         """
         ...
 
     def shorten(self, margin: float) -> "Method":
-        """A short search, from a point that is close."""
+        """The method for a short search from a point that is close."""
         ...
 
     def limit_path(self, task: TuningTask, spec: Specification) -> LimitPath | None:
-        """What follows moving limits, `spec` the first of them, tightened; None where it can only search anew."""
+        """The problem prepared for moving limits, `spec` the first, tightened; None where each needs a new search."""
         ...

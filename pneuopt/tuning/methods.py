@@ -1,4 +1,4 @@
-"""The methods of `tune`: the one place where a new one is registered, and how one is chosen."""
+"""`METHODS`: the methods of `tune`, where a new one is registered; `choose_method` takes the first that suits."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -15,5 +15,5 @@ METHODS: Mapping[str, type[TwoPhase] | type[Condensed] | type[Screening]] = Mapp
 
 
 def choose_method(task: TuningTask) -> Method:
-    """The first method that suits a task."""
+    """Choose the first method in `METHODS` that suits a task."""
     return next(method for method in (kind() for kind in METHODS.values()) if method.suits(task))

@@ -1,4 +1,4 @@
-"""`TuningResult`, and the certificate that it stands on: a claim beside the simulation that shares nothing with it."""
+"""`TuningResult`, and the `Certifier` that makes it: the search's figures beside those of an independent simulation."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -33,8 +33,12 @@ from pneuopt.tuning.simulator import Simulator
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_CERTIFIED_EXCESS = 0.01  # relative excess of the certified over the claimed settling time
-ACTIVE_ROOM = 0.02  # of a limit, the room within which it counts as reached
+# Relative excess of the certified over the claimed objective that a certificate allows. A smaller one refuses designs
+# for the search's coarser samples; a larger one certifies designs whose response grazes the band.
+MAX_CERTIFIED_EXCESS = 0.01
+# Room left of a limit, a fraction of it, within which it counts as active. A smaller one misses limits that the
+# search's margin keeps a design away from; a larger one names limits that hold nothing back.
+ACTIVE_ROOM = 0.02
 RELAXATION_COLUMNS = ("asked", "needed", "share")
 TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.metric.headline)
 
@@ -63,7 +67,7 @@ class TuningResult:
         fraction of it, and that design's gains; in a last row, "all", the share by which all limits together have to
         give way. The independent simulation has confirmed each. Empty where the limits do not contradict each other.
     active : tuple of str
-        Requirements and bounds that hold the objective back.
+        Requirements and bounds that keep the objective from being smaller.
     status : Status
     stats : mapping of str to float
         "seconds", "deviation.SettlingTime" and so on (the largest |claimed - certified|), and the search's own:
@@ -90,20 +94,20 @@ class TuningResult:
 
 @dataclass(frozen=True, eq=False)
 class Certifier:
-    """Certifies what a search found.
+    """Make the certificate of a point: its independent simulation, beside the claim of the search.
 
     Parameters
     ----------
     task : TuningTask
     method : Method
-        For the provenance.
+        Named in the provenance.
     """
 
     task: TuningTask
     method: Method
 
     def certify(self, simulator: Simulator, found: SearchResult, point: Array) -> TuningResult:
-        """Claim and certificate of a point; its values are handed out where the certificate holds."""
+        """Simulate a point by both simulations; the result has its gains where the certificate holds."""
         import pandas as pd
 
         parameters = self.task.space.parameters_at(point)
@@ -112,16 +116,16 @@ class Certifier:
         rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:
-            certified, met = self._evaluate(parameters)
+            certified, contacts = self._evaluate(parameters)
             slopes = _friction_slopes(certified)
             certified = certified.loc[shown]
-            status = _contact_status(met) if met else self._certificate_status(found, claimed, certified)
+            status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, certified)
         except ConvergenceError as error:
-            certified, met, slopes = claimed * np.nan, [], {}
+            certified, contacts, slopes = claimed * np.nan, [], {}
             status = Status(Code.NOT_CERTIFIED, (str(error),))
         deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
         values = dict(zip(self.task.space.names, point.tolist(), strict=True))
-        contacts = {"contacts": float(len(met))} if met else {}
+        contact_count = {"contacts": float(len(contacts))} if contacts else {}
         rejected = {} if status.converged else {f"rejected.{n}": v for n, v in values.items()}
         return TuningResult(
             self.task.space.parameters.with_values(values) if status.converged else self.task.space.parameters,
@@ -131,7 +135,7 @@ class Certifier:
             pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.task.space.names], dtype=float),
             found.active,
             status,
-            {**found.stats, **deviation, **contacts, **rejected, **slopes},
+            {**found.stats, **deviation, **contact_count, **rejected, **slopes},
             provenance(
                 self.method,
                 *self.task.spec.weights,
@@ -142,7 +146,7 @@ class Certifier:
         )
 
     def _evaluate(self, parameters: ParameterSet) -> tuple["pd.DataFrame", list[str]]:
-        """The certificate, and what the responses ran into."""
+        """The certified metrics, and the warnings of end stops and emptied chambers that the responses met."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
             certified = evaluate(
@@ -186,14 +190,14 @@ class Certifier:
         return Status(Code.CONVERGED, (message,))
 
     def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
-        """The worst case, where there are several."""
+        """The words " at" and the worst case of a metric, where there are several cases."""
         values = requirement_values({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
         k = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
         return f" at {certified.columns[k]}" if len(values) > 1 else ""
 
 
 def _friction_slopes(certified: "pd.DataFrame") -> dict[str, float]:
-    """The slope of friction with which margins are read, a case each."""
+    """The slope of friction with which each case's margins are read [N s/m, or N m s/rad]."""
     rows = certified.loc[[n for n in certified.index if n == "FrictionSlope"]]
     return {f"friction_slope[{case}]": float(v) for case, column in rows.items() for v in column}
 
@@ -201,7 +205,7 @@ def _friction_slopes(certified: "pd.DataFrame") -> dict[str, float]:
 def requirement_table(
     spec: Specification, claimed: "pd.DataFrame", certified: "pd.DataFrame", active: Sequence[str] = ()
 ) -> "pd.DataFrame":
-    """Each requirement beside what is allowed; see `TuningResult.requirements`."""
+    """A table of each requirement's claimed and certified figure beside its limit; see `TuningResult.requirements`."""
     import pandas as pd
 
     limits = {metric_name(q): q for q in spec.limits}
@@ -215,7 +219,7 @@ def requirement_table(
 
 
 def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]]) -> TuningResult:
-    """The result of the design that comes closest, with what would do in place of its limits."""
+    """The result of the design that comes closest to the limits, with the relaxations that would make them feasible."""
     import pandas as pd
 
     broken = result.requirements[~(result.requirements["room"] >= 0) & result.requirements["allowed"].notna()]
@@ -228,7 +232,7 @@ def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]]) ->
 
 
 def relaxation_share(result: TuningResult) -> float:
-    """The share by which every limit would have to be wider for a result; inf where something is not reached at all."""
+    """The share by which every limit has to widen for a design to keep them; inf where a requirement has no value."""
     known = result.requirements
     rooms = known["room"][known["allowed"].notna()]
     unreached = known["certified"].isna().any() or rooms.isna().any()
@@ -236,6 +240,7 @@ def relaxation_share(result: TuningResult) -> float:
 
 
 def _requirement_row(requirement: Requirement, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> dict[str, Any]:
+    """A row of `TuningResult.requirements`, but for "active"."""
     n = metric_name(requirement)
     values = [requirement_values({n: frame.loc[n].to_numpy(dtype=float)})[n] for frame in (claimed, certified)]
     k = [int(np.argmax(np.where(np.isnan(v), np.inf, v))) for v in values]
@@ -252,7 +257,7 @@ def _requirement_row(requirement: Requirement, claimed: "pd.DataFrame", certifie
     }
 
 
-def _contact_status(met: Sequence[str]) -> Status:
-    """Of a response that ran into an end stop or emptied a chamber: whatever it shows, the drive does not."""
+def _contact_status(contacts: Sequence[str]) -> Status:
+    """The status of a design whose response meets an end stop or empties a chamber, where the model no longer holds."""
     remedy = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
-    return Status(Code.NOT_CERTIFIED, (*dict.fromkeys(met), remedy))
+    return Status(Code.NOT_CERTIFIED, (*dict.fromkeys(contacts), remedy))

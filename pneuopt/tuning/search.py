@@ -1,4 +1,4 @@
-"""`Search`: one tuning from its start to a certified answer, or to how far its limits would have to give way."""
+"""`Search`: one tuning from its start to a certified answer; `relax`: by how much limits would have to give way."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -24,15 +24,23 @@ from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
-MARGINS_TO_TRY = 3  # margins tried, each twice the one before
-MAX_CERTIFIED_POINTS = 5  # printed gains certified at each margin, at most
-ROUNDING_ROUNDS = 3  # of looking around for printed gains that lose next to nothing
-RELAXATION_MARGIN = 0.002  # margin of the search for how far a limit has to give way: what it finds shall be the least
+# Margins tried, each twice the one before. Fewer give up on designs that need more room to survive the certificate;
+# each more costs another search where no design exists.
+MARGINS_TO_TRY = 3
+# Rounded designs certified at each margin, at most. Fewer miss the one that survives; each more costs an independent
+# simulation of every case.
+MAX_CERTIFIED_POINTS = 5
+# Rounds in which the neighbours of the best rounded design are simulated. Fewer miss a rounding that loses next to
+# nothing; more move the design away from the one that was found.
+ROUNDING_ROUNDS = 3
+# Margin of the search for the least relaxation of a limit, a fraction. A larger one reports more than is needed; at
+# zero the design found does not survive its certificate.
+RELAXATION_MARGIN = 0.002
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """One tuning: search, print, certify, and again with a wider margin where the certificate fails."""
+    """Search, round the gains and certify them; search again with a wider margin where the certificate fails."""
 
     task: TuningTask
     method: Method
@@ -45,16 +53,16 @@ class Search:
 
     @property
     def spec(self) -> Specification:
-        """As asked for."""
+        """The objective and limits as asked for."""
         return self.task.spec
 
     @property
     def certifier(self) -> Certifier:
-        """Of what is found."""
+        """The certifier of this task's designs."""
         return Certifier(self.task, self.method)
 
     def run(self, start: Array | None = None) -> TuningResult:
-        """The result, from a point other than the given gains where there is one."""
+        """Search from a point, by default the given gains, until a rounded design is certified."""
         simulator = self.simulator
         try:
             if start is None:
@@ -66,7 +74,7 @@ class Search:
             margin = min(self.method.margin * 2**attempt, 0.5)
             try:
                 found = self.method.find(self.task, simulator, self.tighten(margin), start, attempt, self.progress)
-            except KeyboardInterrupt:  # of a method that has no best so far
+            except KeyboardInterrupt:  # in a method that holds no best point yet
                 found = _interrupted_at(start)
             counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
             found = replace(found, stats={**found.stats, **counts, "margin": margin})
@@ -83,12 +91,12 @@ class Search:
 
     @cached_property
     def simulator(self) -> Simulator:
-        """Of all cases, that reads what is asked for."""
+        """The compiled simulation of all cases, which reads the requirements asked for."""
         task = self.task
         return Simulator(task.loop, task.references, task.space, task.scenarios, task.spec)
 
     def _report_start(self, simulator: Simulator) -> None:
-        """Say where the given gains are no good: a search copes with that, but one may be mistyped."""
+        """Report cases in which the loop never settles with the given gains: one of them may be mistyped."""
         times = [row["SettlingTime"] for row in simulator.table(self.space.start, self.spec)]
         bad = [k for k, t in enumerate(times) if not np.isfinite(t)]
         if bad:
@@ -97,7 +105,7 @@ class Search:
             self.progress(f"with the given gains the loop {word} at {where}; searching on")
 
     def certify_roundings(self, found: SearchResult, margin: float) -> TuningResult:
-        """What was found, as printed: the first of several roundings whose certificate holds, or the last."""
+        """Certify roundings of the gains found, until one holds; otherwise the last one's result."""
         result = None
         for point in self._round_gains(self.simulator, found, margin):
             result = self.certifier.certify(self.simulator, found, point)
@@ -107,19 +115,19 @@ class Search:
         return result
 
     def certify_point(self, point: Array) -> TuningResult:
-        """A point as printed, with its certificate."""
+        """Round a point and certify it."""
         printed = self.space.round_point(point, self.method.digits) if self.method.digits else point
         found = SearchResult(printed, Status(Code.CONVERGED), (), {"optimum": np.inf})
         return self.certifier.certify(self.simulator, found, printed)
 
     def with_specification(self, spec: Specification, method: Method) -> "Search":
-        """The same for another specification, of the same kinds, on the same simulator."""
+        """A search for another specification of the same kinds of requirements, on the same compiled simulator."""
         other = replace(self, task=replace(self.task, spec=spec), method=method)
         vars(other)["simulator"] = self.simulator
         return other
 
     def _result_so_far(self, simulator: Simulator, found: SearchResult) -> TuningResult:
-        """The best so far, as printed, with its certificate; not handed out, for nobody has chosen it."""
+        """Round and certify the best point of an interrupted search; the result keeps the given gains."""
         digits = self.method.digits
         best = self.certifier.certify(
             simulator, found, self.space.round_point(found.point, digits) if digits else found.point
@@ -131,11 +139,11 @@ class Search:
         return replace(best, parameters=self.space.parameters, status=status, stats={**values, **best.stats})
 
     def tighten(self, margin: float) -> Specification:
-        """What is asked for, with so much room left as the method's answer may lose."""
+        """The specification with limits tighter by a margin, as much as rounding and certificate may cost."""
         return self.spec.tighten(margin, margin * self.method.peak_margin)
 
     def _round_gains(self, simulator: Simulator, found: SearchResult, margin: float) -> Iterator[Array]:
-        """The gains as printed; where those break a limit or lose too much, what a last place more or less mends."""
+        """Roundings of the gains found: the nearest one, then neighbours that keep the limits and lose little."""
         digits, spec, tried = self.method.digits, self.tighten(margin / 2), list[list[float]]()
         if digits is None:
             yield found.point
@@ -157,7 +165,7 @@ class Search:
             yield from self._mend_rounding(nearest, digits, spec, most)
 
     def _mend_rounding(self, nearest: Array, digits: int, spec: Specification, most: float) -> Iterator[Array]:
-        """Where no single last place mends it: of all printed gains close by those that do, the best first."""
+        """Roundings further away, the best first, for gains of which no single last place keeps the limits."""
         points = np.vstack([nearest, self.space.neighbourhood(nearest, digits)])
         rows = to_records(self.simulator.values(points, spec))
         costs = [np.inf if spec.violations(row) else spec.objective(row) for row in rows]
@@ -166,19 +174,19 @@ class Search:
 
 
 def _interrupted_at(point: Array) -> SearchResult:
-    """Of a search that was cut short before it had found anything."""
+    """The result of a search that was interrupted before it had found anything."""
     return SearchResult(point, Status(Code.INTERRUPTED), (), {"simulations": 1.0}, is_complete=False)
 
 
 def relax(search: Search, result: TuningResult) -> TuningResult:
-    """Say how far the limits have to give way, each alone and all together.
+    """Find by how much the limits have to give way, each alone and all together.
 
-    Where it turns out that a design keeps them all, which a search with its margins can miss, that is the answer.
+    A search with its margins can miss a design that keeps all limits; where one turns up here, it is the answer.
     """
     spec, points, rows = search.spec, [end_point(result, search.space)], dict[str, dict[str, float]]()
     method = search.method.shorten(RELAXATION_MARGIN)
     for q in spec.limits:
-        search.progress(f"how far {metric_name(q)} would have to give way alone")
+        search.progress(f"finding how far {metric_name(q)} alone has to give way")
         found = search.with_specification(relaxation_specification(spec, q, search.task.references), method).run(
             points[0]
         )
@@ -189,25 +197,25 @@ def relax(search: Search, result: TuningResult) -> TuningResult:
         rows[metric_name(q)] = relaxation_row(q, value, points[-1], search.space.names)
         if rows[metric_name(q)]["share"] <= 0:
             return _continue_from_feasible(search, points[-1])
-    search.progress("how far all limits would have to give way together")
+    search.progress("finding how far all limits together have to give way")
     inside = spec.with_band(spec.band * (1 - search.method.margin))
     shared = relax_all(search.simulator, search.space, inside, points)
-    judged = min((search.certify_point(point) for point in (shared, *points)), key=relaxation_share)
-    if judged.status.converged:
-        return _continue_from_feasible(search, end_point(judged, search.space))
+    closest = min((search.certify_point(point) for point in (shared, *points)), key=relaxation_share)
+    if closest.status.converged:
+        return _continue_from_feasible(search, end_point(closest, search.space))
     if len(rows) > 1:
         rows["all"] = relaxation_row(
-            None, relaxation_share(judged), end_point(judged, search.space), search.space.names
+            None, relaxation_share(closest), end_point(closest, search.space), search.space.names
         )
-    return with_relaxations(replace(judged, stats={**result.stats, **judged.stats}), rows)
+    return with_relaxations(replace(closest, stats={**result.stats, **closest.stats}), rows)
 
 
 def _continue_from_feasible(search: Search, point: Array) -> TuningResult:
-    """The best from a design that keeps all limits; or that design, where the margins leave no room for a search."""
+    """Search from a design that keeps all limits; where the margins leave no room for that, certify that design."""
     found = search.run(point)
     return found if found.status.converged else search.certify_point(point)
 
 
 def end_point(result: TuningResult, space: Space) -> Array:
-    """The point that a search ended in, whether it was handed out or not."""
+    """The gains in which a search ended, certified or rejected, shape (n,)."""
     return np.array([result.stats.get(f"rejected.{n}", result.parameters.value(n)) for n in space.names])

@@ -1,4 +1,4 @@
-"""`Space`: the box in which the candidates of a tuning lie, what they are as printed, and the steps that they need."""
+"""`Space`: the box in which the candidates of a tuning lie, their rounding, and the RK4 steps that they need."""
 
 import itertools
 from collections.abc import Sequence
@@ -15,8 +15,12 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
+# RK4 steps between two samples, at most. A lower limit refuses stiff loops that could be run; with a higher one a
+# search whose bounds let a filter get too fast takes hours instead of naming them.
 MAX_LOOP_SUBSTEPS = 100
-MAX_ROUNDING_POINTS = 625  # points: all that differ by two last places or less in four gains
+# Rounded points around a design that are simulated, at most: 5^4, all that differ by two last places or less in four
+# gains. Fewer miss roundings that keep the limits; each more costs a simulation.
+MAX_ROUNDING_POINTS = 625
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +32,7 @@ class Space:
     parameters : ParameterSet
         Every parameter of the loop; the free ones span the box.
     names : tuple of str
-        The free ones that have an effect.
+        Those of the free ones that have an effect.
     """
 
     parameters: ParameterSet
@@ -49,7 +53,7 @@ class Space:
         return self.parameters.with_values(dict(zip(self.names, np.clip(point, *self.bounds.T).tolist(), strict=True)))
 
     def from_unit(self, unit: Array) -> Array:
-        """Points for numbers between 0 and 1, shape (..., n): along the range, or its logarithm where so flagged."""
+        """Map numbers between 0 and 1 to points, shape (..., n): along the range, or its logarithm where flagged."""
         low, up = self.bounds.T
         log = np.array([self.parameters[n].log for n in self.names], dtype=bool)
         tiny = np.where(log, low, 1.0)
@@ -57,7 +61,7 @@ class Space:
         return np.clip(drawn, low, up)
 
     def to_unit(self, point: Array) -> Array:
-        """The inverse of `from_unit`."""
+        """Map points to numbers between 0 and 1: the inverse of `from_unit`."""
         low, up = self.bounds.T
         log = np.array([self.parameters[n].log for n in self.names], dtype=bool)
         safe = np.where(log, [low, up, point], 1.0)
@@ -84,7 +88,7 @@ class Space:
         return rows
 
     def round_point(self, point: Array, digits: int) -> Array:
-        """The point with so many significant digits, shape (n,).
+        """Round a point to so many significant digits, within the bounds, shape (n,).
 
         Examples
         --------
@@ -100,18 +104,18 @@ class Space:
             found[k] = next((v for v in rounded if low <= v <= up), value)
         return found
 
-    def neighbours(self, printed: Array, digits: int) -> Array:
-        """The points that differ from a printed one by a last place in one coordinate, shape (m, n) with m <= 2 n."""
+    def neighbours(self, rounded: Array, digits: int) -> Array:
+        """The points that differ from a rounded one by a last place in one coordinate, shape (m, n) with m <= 2 n."""
         found = []
-        for k, (value, (low, up)) in enumerate(zip(printed.tolist(), self.bounds, strict=True)):
+        for k, (value, (low, up)) in enumerate(zip(rounded.tolist(), self.bounds, strict=True)):
             sides = (_round_digits(value + n * _last_place(value, digits), digits) for n in (-1, 1)) if value else ()
-            found += [np.where(np.arange(len(printed)) == k, v, printed) for v in sides if low <= v <= up]
-        return np.reshape(found, (-1, len(printed)))
+            found += [np.where(np.arange(len(rounded)) == k, v, rounded) for v in sides if low <= v <= up]
+        return np.reshape(found, (-1, len(rounded)))
 
-    def neighbourhood(self, printed: Array, digits: int) -> Array:
-        """The points that differ from a printed one by up to two last places in every coordinate, shape (m, n).
+    def neighbourhood(self, rounded: Array, digits: int) -> Array:
+        """The points that differ from a rounded one by up to two last places in every coordinate, shape (m, n).
 
-        Of more than `MAX_ROUNDING_POINTS` a random share.
+        Where they are more than `MAX_ROUNDING_POINTS`, that many are drawn at random.
 
         Examples
         --------
@@ -120,18 +124,18 @@ class Space:
         >>> space.neighbourhood(space.start, 4).ravel().tolist()
         [0.3998, 0.3999, 0.4, 0.4001]
         """
-        n, sides = len(printed), np.arange(-2, 3)
+        n, sides = len(rounded), np.arange(-2, 3)
         few = len(sides) ** n <= MAX_ROUNDING_POINTS
         drawn = np.random.default_rng(0).integers(-2, 3, (MAX_ROUNDING_POINTS, n))
         offsets = np.array(list(itertools.product(sides, repeat=n))) if few else np.unique(drawn, axis=0)
-        places = np.array([_last_place(value, digits) for value in printed.tolist()])
-        points = [[_round_digits(v, digits) for v in row] for row in (printed + offsets * places).tolist()]
+        places = np.array([_last_place(value, digits) for value in rounded.tolist()])
+        points = [[_round_digits(v, digits) for v in row] for row in (rounded + offsets * places).tolist()]
         low, up = self.bounds.T
         return np.array([point for point in points if np.all((point >= low) & (point <= up))]).reshape(-1, n)
 
 
 def _last_place(value: float, digits: int) -> float:
-    """What one in the last of so many digits is worth."""
+    """The value of a one in the last of so many significant digits; 0 for a value of 0."""
     return float(10.0 ** (np.floor(np.log10(abs(value))) - digits + 1)) if value else 0.0
 
 
@@ -140,7 +144,7 @@ def _round_digits(value: float, digits: int) -> float:
 
 
 def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
-    """The box that the free parameters span, checked.
+    """Check the free parameters and span a `Space` by their bounds, over every parameter of the loop.
 
     Raises
     ------
@@ -173,12 +177,12 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
 
 
 def clip_level(loop: ClosedLoop, p: ParameterSet) -> float:
-    """The largest command that the controller's own limits let through; inf without limits."""
+    """The largest size of a command that the controller's own limits let through [its unit]; inf without limits."""
     return max(abs(p.value("pid.lower")), abs(p.value("pid.upper"))) if loop.pid.limits else float("inf")
 
 
 def _check_amplitude(p: ParameterSet) -> None:
-    """Refuse a search where dither alone, around no matter what offset, runs into the command's limits."""
+    """Refuse an amplitude's bound with which dither alone, around any offset, exceeds the command's range."""
     (low, high, whose), most = command_range(p), p["dither.amplitude"].upper
     unit = p["dither.amplitude"].unit
     require(
@@ -189,13 +193,13 @@ def _check_amplitude(p: ParameterSet) -> None:
 
 
 def dither_resolution_rate(loop: ClosedLoop, parameters: ParameterSet) -> float:
-    """The rate [1/s] with which steps must keep up between two samples, so that an analogue dither has its points."""
+    """The rate [1/s] at which RK4 steps resolve an analogue dither between two samples; 0 for any other dither."""
     between = loop.dither is not None and loop.dither.analogue and loop.pid.sample_time is not None
     return RK4_MAX_H_LAMBDA * SAMPLES_A_DITHER_PERIOD * highest_dither_frequency(loop, parameters) if between else 0.0
 
 
 def fastest_eigenvalue(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> Array:
-    """The largest eigenvalue's size [1/s] of the loop over the given states, for each row of parameters, shape (m,)."""
+    """The size of the loop's largest eigenvalue over some states [1/s], for each row of parameters, shape (m,)."""
     system = loop.system() if loop.pid.sample_time is None else loop.hold_system()
     x, q = ca.SX.sym("x", len(system.states)), ca.SX.sym("p", len(system.parameters))
     rates = system.ode(0, x, np.zeros(len(system.inputs)), q)[0]
@@ -208,7 +212,7 @@ def fastest_eigenvalue(loop: ClosedLoop, p: Array, states: Sequence[Array]) -> A
 
 
 def rk4_substeps(rate: float, h: float) -> int:
-    """RK4 steps in a sample of length h so that the rate stays stable.
+    """The number of RK4 steps in a sample of length h [s] with which a mode of this rate [1/s] is integrated stably.
 
     Raises
     ------

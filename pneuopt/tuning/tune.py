@@ -1,7 +1,7 @@
-"""`tune`: PID gains and dither found together, and proven by a simulation that shares nothing with the search.
+"""`tune`: find PID gains and dither together, and certify them by a simulation that shares nothing with the search.
 
-A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or sampling, by compiled screening
-(`Screening`). Gains are handed out as printed: rounded first, then certified.
+A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or sampling, by compiled simulation
+(`Condensed`, `Screening`). The gains are rounded first and certified then, so that the printed numbers are proven.
 """
 
 import time
@@ -27,7 +27,8 @@ from pneuopt.tuning.search import Search, relax
 from pneuopt.tuning.space import Space, clip_level, search_space
 
 __all__ = ["TuningResult", "prepare_search", "prepare_task", "tune"]
-INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)  # limits may be why
+# Endings of a search that contradictory limits may have caused: `tune` then seeks how far they have to give way.
+INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)
 
 
 def tune(
@@ -42,7 +43,7 @@ def tune(
     throw: bool = True,
     progress: ProgressCallback | None = None,
 ) -> TuningResult:
-    """Find the free gains, and dither, that do best on the references within the limits.
+    """Find the free gains, and dither, with the least objective on the references within the limits.
 
     Parameters
     ----------
@@ -65,9 +66,9 @@ def tune(
         clip can hold back, if it has equations for all that is asked for; `Condensed` for scenarios or many gains where
         all is differentiable; else, or where `TwoPhase` fails, `Screening`.
     throw : bool
-        Raise if nothing could be certified; otherwise the result says so in its status.
+        Raise an error if no design is certified; otherwise the result's status says so.
     progress : callable, optional
-        Receives a line of text a generation or start.
+        Receives a line of text a generation, start or program.
 
     Returns
     -------
