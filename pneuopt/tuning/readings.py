@@ -1,4 +1,4 @@
-"""What a search watches of a response, on which grid, and the metrics that it reads off it."""
+"""The outputs that a search runs, the grid on which it samples a reference, and the metrics that it reads there."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -18,14 +18,17 @@ from pneuopt.evaluation.metrics import BandCentre, Envelope, batch_metrics
 from pneuopt.evaluation.response import MAX_READINGS_A_SAMPLE
 from pneuopt.quantities.arrays import Array
 
-SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT = range(3)  # outputs that are run; the meter's channels follow one another
-INTEGRAL_OUTPUT = -1  # under dither the last output, and the last state, is the signal's integral
+# Indices of the outputs that are run: the measured signal, the command, then the meter's channels one after another.
+SIGNAL_OUTPUT, CONTROL_OUTPUT, METER_OUTPUT = range(3)
+INTEGRAL_OUTPUT = -1  # index of the signal's integral, under dither the last output and the last state
+# The largest objective that a search tells apart, in place of infinity. Below what objectives reach (seconds, percent,
+# volts) good designs would tie; far above it the grading of broken limits, which is multiplied by it, loses digits.
 WORST_MERIT = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceGrid:
-    """The samples of one reference.
+    """The samples at which the response to one reference is run and read.
 
     Attributes
     ----------
@@ -35,7 +38,7 @@ class ReferenceGrid:
     spacing : float
         [s]
     sample_time : float or None
-        Of the controller that holds its command [s].
+        The controller's, if it is sampled [s].
     """
 
     reference: Step
@@ -46,19 +49,19 @@ class ReferenceGrid:
 
     @property
     def step_index(self) -> int:
-        """The first sample from the step on."""
+        """The index of the first sample at or after the step."""
         return int(np.searchsorted(self.t, self.reference.at - 1e-12))
 
     def pad(self, n: int) -> tuple[Array, Array, Array]:
-        """Inputs, instants and steps, the last sample repeated to n samples; no step leaves it: runs end there."""
+        """Inputs, instants and steps, the last sample repeated up to n samples with steps of 0: there a run ends."""
         k = np.minimum(np.arange(n), len(self.t) - 1)
         return self.u[k], self.t[k], np.where(np.arange(n) < len(self.t) - 1, self.spacing, 0.0)
 
 
 def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
-    """The loop's sampled step with no outputs but the measured signal, the command and channels of the meter.
+    """Build the loop's sampled step with the measured signal, the command and channels of the meter as its outputs.
 
-    Under dither the signal's integral, from zero on, is one more state and the last output.
+    Under dither the signal's integral, zero at the start, is one more state and the last output.
     """
     discrete, outputs = loop.discrete(), names(loop.outputs)
     ode = (loop.system() if loop.pid.sample_time is None else loop.hold_system()).ode
@@ -86,7 +89,7 @@ def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
 
 
 def _update_at_sample(loop: ClosedLoop, t: ca.SX, x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
-    """The state after an instant that may be a sample of the controller, or lie between two."""
+    """The state after the controller's update, if the instant t is one of its samples; otherwise the state itself."""
     h = loop.pid.sample_time
     assert h is not None
     near = 0.25 / MAX_READINGS_A_SAMPLE
@@ -94,7 +97,7 @@ def _update_at_sample(loop: ClosedLoop, t: ca.SX, x: ca.SX, u: ca.SX, p: ca.SX) 
 
 
 def has_integral(loop: ClosedLoop) -> bool:
-    """Whether the runs of `loop_pieces` carry the signal's integral."""
+    """Whether `loop_pieces` has the signal's integral as a state: under dither."""
     return loop.dither is not None
 
 
@@ -107,9 +110,26 @@ def read_metrics(
     envelope: Envelope,
     channels: Sequence[str] = (),
 ) -> dict[str, Array]:
-    """The metrics `only` of sound responses y, shape (m, n, n_watched).
+    """Read the metrics `only` off responses that do not run away.
 
-    Over several bands SettlingTime is the mean, in which an unsettled one counts for `penalty_settling_time`.
+    Parameters
+    ----------
+    grid : ReferenceGrid
+    y : ndarray, shape (m, n, n_outputs)
+        The outputs of `loop_pieces`.
+    bands : sequence of float
+        Settling bands, fractions of the step. Over several SettlingTime is the mean; a response that does not settle
+        counts as `penalty_settling_time`.
+    period : float or None
+        The time over which the signal is averaged [s].
+    only : collection of str
+    envelope : sequence of (float, float, float)
+    channels : sequence of str
+        The meter's, in the order of the outputs.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (m,)
     """
     reference, signal, since = grid.reference, y[:, :, SIGNAL_OUTPUT], slice(grid.step_index, None)
     late = slice(int(np.searchsorted(grid.t, 0.8 * reference.horizon + 0.2 * reference.at)), None)
@@ -140,10 +160,10 @@ def read_metrics(
 
 
 def metered(y: Array, channels: Sequence[str]) -> dict[str, Array]:
-    """What the meter shows among outputs that are the last axis of y."""
+    """The meter's channels by name, from outputs that are the last axis of y."""
     return {channel: y[..., METER_OUTPUT + k] for k, channel in enumerate(channels)}
 
 
 def penalty_settling_time(scale: float, excess: Array) -> Array:
-    """What a search takes for the settling time of a response that never settles [s]: graded, so that it can start."""
+    """The settling time that a search assigns to a response that never settles [s], larger for a larger error."""
     return np.asarray(scale * (2 + np.minimum(excess, WORST_MERIT)))

@@ -8,16 +8,26 @@ import numpy as np
 from pneuopt.evaluation.requirements import larger_is_better, requirement_values
 from pneuopt.quantities.arrays import Array, Indices, Mask
 
+# Size of an output [its unit] from which a response counts as running away. A lower level may be reached by sound
+# signals in small units (pressures in Pa); beyond a higher one the metrics of a diverging response lose their digits.
 RUNAWAY_LEVEL = 1e12
 
 
 class Responses:
-    """Simulated candidates; their margins, a frequency response each, are computed only where asked for.
+    """The metrics of simulated candidates; margins, a frequency response each, are computed only on request.
+
+    Parameters
+    ----------
+    lanes : ndarray of bool, shape (m, n_cases)
+        Which cases of which candidate were run.
+    p : ndarray, shape (n_lanes, n_parameters)
+    measured : LaneMetrics
+    margins : MarginReader
 
     Attributes
     ----------
     values : dict of str to ndarray, shape (m,)
-        What the requirements read but for margins, the worst over the cases that were run.
+        The requirements' values without margins, the worst over the cases that were run.
     """
 
     def __init__(self, lanes: Mask, p: Array, measured: "LaneMetrics", margins: "MarginReader") -> None:
@@ -30,19 +40,19 @@ class Responses:
         return self.to_table(self._measured.metrics[metric])
 
     def by_case(self) -> dict[str, Array]:
-        """The values of each case that was run, shape (n_lanes,), as `lanes` lists them row by row."""
+        """The requirements' values in each lane, shape (n_lanes,), candidate by candidate, margins left out."""
         metrics = self._measured.metrics
         return {**requirement_values(metrics), "Excess": metrics["Excess"]}
 
     def with_margins(self, rows: Mask) -> dict[str, Array]:
-        """The values of some candidates, with their margins."""
+        """The requirements' values of some candidates with their margins, the worst over the cases that were run."""
         chosen = {n: value[rows] for n, value in self.values.items()}
         margins = requirement_values(self.margin_metrics(rows))
         ran = self._lanes[rows]
         return chosen | {n: np.max(np.where(ran, table, -np.inf), axis=1) for n, table in margins.items()}
 
     def margin_metrics(self, rows: Mask) -> dict[str, Array]:
-        """Margins and peaks of some candidates, a column a case; NaN and infinite where the response runs away."""
+        """Margins and peaks of some candidates, shape (m, n_cases); NaN and infinite where the response runs away."""
         measured, names = self._measured, self._margins.names
         found = {n: np.full(len(measured.sound), np.nan if larger_is_better(n) else np.inf) for n in names}
         row, case = np.nonzero(self._lanes)
@@ -54,7 +64,7 @@ class Responses:
         return {n: self.to_table(value)[rows] for n, value in found.items()}
 
     def to_table(self, lanes: Array) -> Array:
-        """Numbers of the lanes as a table, shape (m, n_cases); minus infinity where a case was not run."""
+        """Arrange numbers of the lanes as a table, shape (m, n_cases); minus infinity where a case was not run."""
         table = np.full(self._lanes.shape, -np.inf)
         table[self._lanes] = lanes
         return table
@@ -62,18 +72,19 @@ class Responses:
 
 @dataclass(frozen=True, eq=False)
 class LaneMetrics:
-    """What m lanes showed.
+    """The metrics of m lanes and the points in which they end.
 
     Attributes
     ----------
     metrics : dict of str to ndarray, shape (m,)
-        Of `step_metrics`, and "Excess", the mean error near the end, for what never settles; infinite where the
-        response runs away.
+        Those of `step_metrics`, and "Excess", the mean error near the end, by which responses that never settle are
+        graded; infinite where the response runs away.
     sound : ndarray of bool, shape (m,)
         False where the response runs away.
     x_end : ndarray, shape (m, n_states)
+        The states in which the responses end.
     command : ndarray, shape (m,)
-        Where the responses end.
+        The commands in which they end.
     """
 
     metrics: dict[str, Array]
@@ -83,25 +94,25 @@ class LaneMetrics:
 
     @staticmethod
     def empty(m: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
-        """For m lanes, to be filled."""
+        """Metrics of m lanes to be filled in; until then they read as running away."""
         return LaneMetrics(
             {n: np.full(m, np.inf) for n in read}, np.zeros(m, dtype=bool), np.empty((m, n_states)), np.empty(m)
         )
 
 
 def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
-    """The values of one candidate after another."""
+    """Turn a dict of arrays into a dict of numbers for each candidate."""
     rows = zip(*(value.tolist() for value in values.values()), strict=True)
     return [dict(zip(values, row, strict=True)) for row in rows]
 
 
 def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
-    """The largest of each value over the cases; NaN wins."""
+    """The largest of each value over the cases; NaN where one of them is NaN."""
     return {n: float(np.max([values[n] for values in found])) for n in found[0]}
 
 
 def is_sound(y: Array, x_end: Array) -> Mask:
-    """Which lanes did not run away."""
+    """Which lanes did not run away, shape (m,)."""
     with np.errstate(all="ignore"):
         tame = np.all(np.abs(y) < RUNAWAY_LEVEL, axis=(1, 2))
     return np.asarray(tame & np.isfinite(x_end).all(axis=1))
@@ -109,14 +120,14 @@ def is_sound(y: Array, x_end: Array) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class MarginReader:
-    """Margins and peaks of loops linearised about the end of their responses.
+    """How to compute margins and peaks of loops linearised about the end of their responses.
 
     Attributes
     ----------
     names : tuple of str
         The metrics that `read` gives.
     read : callable
-        From parameters, shape (m, n_parameters), cases, shape (m,), and the states and commands in which the lanes end.
+        Of parameters, shape (m, n_parameters), cases, shape (m,), and the states and commands in which the lanes end.
     """
 
     names: tuple[str, ...]

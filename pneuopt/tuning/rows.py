@@ -1,7 +1,7 @@
-"""Simulated lanes with their derivatives to the gains, as the records that metrics are read off.
+"""`Lanes`: simulated responses with their derivatives to the gains, as step records from which metrics are read.
 
-The signal is averaged and read at nodes. Where a metric is the largest of several, or an integral of sizes, its
-derivative is that of the instant, or sign, that holds now.
+The signal is averaged and read at nodes. Where a metric is the largest value over time, or the integral of an absolute
+value, its derivative is taken at the present instant of the maximum, or with the present sign.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,23 +20,24 @@ from pneuopt.tuning.readings import CONTROL_OUTPUT, INTEGRAL_OUTPUT, SIGNAL_OUTP
 
 @dataclass(frozen=True, eq=False)
 class Lanes:
-    """Simulated lanes of one reference.
+    """Simulated lanes of one reference, with sensitivities.
 
     Parameters
     ----------
-    grid : Grid
-    y : ndarray, shape (m, n, n_watched)
-    dy : ndarray, shape (m, n, n_watched, n_columns)
-        Numbers, all of them.
+    grid : ReferenceGrid
+    y : ndarray, shape (m, n, n_outputs)
+    dy : ndarray, shape (m, n, n_outputs, n_columns)
+        Derivatives of y to start states and parameters, finite everywhere.
     chain : ndarray, shape (m, n_columns, n_gains)
-        How the columns move with the unknowns.
+        Derivatives of those start states and parameters to the unknowns of the search.
     periods : sequence of float
-        Over which each lane is averaged [s]; 0: not at all.
+        The time over which each lane is averaged [s]; 0: it is not averaged.
     stride : int
         Samples from node to node.
     envelope : sequence of (float, float, float)
+        The bounds of a `StepEnvelope`.
     channels : sequence of str
-        Of the meter, that were run.
+        The meter's channels that were run.
     """
 
     grid: ReferenceGrid
@@ -50,21 +51,21 @@ class Lanes:
 
     @cached_property
     def t(self) -> Array:
-        """From the step on, shape (n,) [s]."""
+        """The samples' time after the step, shape (n,) [s]."""
         return self.grid.t[self.grid.step_index :] - self.grid.reference.at
 
     @cached_property
     def nodes(self) -> Array:
-        """Shape (K,) [s]."""
+        """The nodes' time after the step, shape (K,) [s]."""
         return reading_times(self.grid, self.stride, max(self.periods))
 
     @cached_property
     def record(self) -> StepRecord:
-        """The responses as readers of rows see them, the averaged signal at the nodes."""
+        """The step record of the lanes, the averaged signal at the nodes, with derivatives to the unknowns."""
         reference, columns, K = self.grid.reference, self.dy.shape[-1], len(self.nodes)
         error, by_column = np.empty((len(self.y), K)), np.empty((len(self.y), columns, K))
         last, last_by_column = np.empty((len(self.y), 1)), np.empty((len(self.y), 1, columns))
-        for period, own in self._lanes_by_period():
+        for period, own in self._lanes_by_averaging_time():
             signal, slopes = self._output(own, SIGNAL_OUTPUT), self._slopes(own, SIGNAL_OUTPUT)
             if period:
                 window = DitherPeriodMean(period, self.grid.spacing)
@@ -93,23 +94,25 @@ class Lanes:
         )
 
     def _to_gains(self, by_column: Array) -> Array:
+        """Derivatives to the unknowns from those to the columns, by the chain rule."""
         return np.asarray(by_column @ self.chain)
 
     def _output(self, own: NDArray[np.bool_], which: int) -> Array:
+        """One output of some lanes from the step on, shape (m, n)."""
         return np.ascontiguousarray(self.y[own, self.grid.step_index :, which])
 
     def _slopes(self, own: NDArray[np.bool_], which: int) -> Array:
-        """A row a lane and column."""
+        """The derivatives of one output, a row for each lane and column."""
         found = np.ascontiguousarray(np.moveaxis(self.dy[own, self.grid.step_index :, which], 2, 1))
         return found.reshape(-1, found.shape[-1])
 
-    def _lanes_by_period(self) -> Iterator[tuple[float, NDArray[np.bool_]]]:
-        """Lanes with one period."""
+    def _lanes_by_averaging_time(self) -> Iterator[tuple[float, NDArray[np.bool_]]]:
+        """Each averaging time and a mask of the lanes that have it."""
         for period in sorted(set(self.periods)):
             yield period, np.array([other == period for other in self.periods])
 
 
 def reading_times(grid: ReferenceGrid, stride: int, period: float) -> Array:
-    """Instants after the step at which a response averaged over a period is read [s]."""
+    """The times after the step at which a response that is averaged over a period is read [s]."""
     t = grid.t[grid.step_index :] - grid.reference.at
     return t[: DitherPeriodMean(period, grid.spacing).mean_count(len(t)) if period else len(t)][::stride]

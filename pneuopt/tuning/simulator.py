@@ -1,4 +1,4 @@
-"""`Simulator`: how many candidates respond to the references, at once and compiled, and what is read off them."""
+"""`Simulator`: compiled simulation of many candidates at once, on every reference and scenario."""
 
 import copy
 from collections.abc import Iterator, Sequence
@@ -26,18 +26,23 @@ from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rat
 HEADLINES = {name: metric.source is Source.LINEAR_LOOP for name, metric in METRICS.items() if metric.headline}
 BASE_METRICS = (*(name for name, linear in HEADLINES.items() if not linear), "Ripple", "Excess")
 BASE_MARGINS = tuple(name for name, linear in HEADLINES.items() if linear)
-MAX_MIXED_LANES = 32  # lanes: different references then share the lanes of a processor, the shorter ones padded
-MAX_CHUNK_LANES = 128  # lanes that are run, and read, at a time: what a processor's cache holds
-COARSE_SAMPLES_A_PERIOD = (
-    10  # samples a dither period; settling times then are off by a tenth of a millisecond on T32, 3 at worst
-)
-STIFFEST_CORNERS = 8  # corners of the gains' box whose rates are looked at on the scenarios' plants too
+# Lanes up to which different references run together, the shorter ones padded. Fewer leave a processor's lanes empty;
+# more waste time on the padding.
+MAX_MIXED_LANES = 32
+# Lanes that are run and read at a time. Fewer leave cores idle; the responses of more do not fit a processor's cache.
+MAX_CHUNK_LANES = 128
+# Samples of a dither period during a search. Fewer shift settling times by more: at ten by 0.1 ms on the drive of
+# problems/speed/t32.py, 3 ms at worst; more cost time in proportion.
+COARSE_SAMPLES_A_PERIOD = 10
+# Corners of the gains' box, the fastest on the nominal plant, at which the fastest mode is sought on the scenarios'
+# plants. Fewer may miss a stiff one, on which RK4 is then unstable; each more costs an eigenvalue problem a plant.
+STIFFEST_CORNERS = 8
 
 
 class Simulator:
-    """Compiled responses of many candidates to the references, on every scenario's plant, and what is read off them.
+    """Simulate many candidates, compiled, on every reference and every scenario's plant, and read their metrics.
 
-    What is measured is the plant's true signal, whatever the controller sees of it.
+    The plant's true signal counts, whatever a sensor shows the controller of it.
 
     Parameters
     ----------
@@ -47,7 +52,7 @@ class Simulator:
     scenarios : mapping of str to mapping, optional
         The plants beside the nominal one.
     spec : Specification, optional
-        Whose kinds are read beside the common ones.
+        Its kinds of requirements are read beside the common ones.
 
     Attributes
     ----------
@@ -55,7 +60,7 @@ class Simulator:
     response_metrics, margin_metrics : tuple of str
         The metrics read off the responses, and off the loop linearised about their ends.
     meter_channels : tuple of str
-        Of the plant's meter, that are run for them.
+        Channels of the plant's meter that are run for them.
     """
 
     def __init__(
@@ -88,10 +93,10 @@ class Simulator:
         self.robustness = batch_margin_function(loop, omega)  # about what `operating_points` gives
 
     def coarse(self, spec: Specification, bands: Sequence[float] = ()) -> "Simulator":
-        """The same for a search on its way, by copy: half as many samples, and nothing read but what `spec` asks.
+        """A copy for use during a search, with half as many samples, which reads only what `spec` asks for.
 
-        With `bands` SettlingTime is the mean over those and the one asked for, an unsettled one for the horizon and
-        more.
+        With `bands` SettlingTime is the mean over those and the band asked for; a response that does not settle counts
+        as `penalty_settling_time`.
         """
         part = copy.copy(self)
         part._wider = tuple(bands)
@@ -105,7 +110,7 @@ class Simulator:
         return part
 
     def select_cases(self, chosen: Sequence[int]) -> "Simulator":
-        """The same with some of the cases, by copy."""
+        """A copy with some of the cases."""
         part = copy.copy(self)
         part.cases, part._rest = tuple(self.cases[k] for k in chosen), [self._rest[k] for k in chosen]
         used, part._grid_of = np.unique(self._grid_of[list(chosen)], return_inverse=True)
@@ -113,11 +118,11 @@ class Simulator:
         return part
 
     def cases_by_grid(self) -> list[Mask]:
-        """The cases of each grid, a reference's."""
+        """Which cases run on each grid, that is on each reference: a mask of shape (n_cases,) a grid."""
         return [self._grid_of == g for g in range(len(self.grids))]
 
     def dither_periods(self) -> list[float]:
-        """The time over which the dither is averaged, a case each [s]; 0: no dither, at any amplitude."""
+        """The time over which each case is averaged [s]; 0 without dither, or where its amplitude is fixed at 0."""
         order, dither = list(self.space.parameters), self.loop.dither
         amplitude = self.space.parameters["dither.amplitude"] if dither else None
         if dither is None or amplitude is None or not (amplitude.free or amplitude.value):
@@ -146,20 +151,20 @@ class Simulator:
         return Responses(wanted, p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
     def values(self, points: Array, spec: Specification) -> dict[str, Array]:
-        """What the requirements read, the worst over the cases, shape (m,) each.
+        """The values of the requirements for each candidate, the worst over the cases, shape (m,) each.
 
         Parameters
         ----------
         points : ndarray, shape (m, n)
         spec : Specification
-            Its band counts, and whether margins do.
+            It gives the band, and says whether margins are needed.
         """
         responses = self.respond(points, spec.band)
         every = np.ones(len(points), dtype=bool)
         return responses.with_margins(every) if spec.concerns(ROBUSTNESS_REQUIREMENTS) else responses.values
 
     def table(self, point: Array, spec: Specification) -> list[dict[str, float]]:
-        """The metrics of one candidate, a row a case."""
+        """The metrics of one candidate, by name, a dict a case."""
         responses = self.respond(point[None], spec.band)
         margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
         return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
@@ -171,7 +176,8 @@ class Simulator:
     def operating_points(self, p: Array, case: Indices, x_end: Array, commands: Array) -> tuple[Array, Array]:
         """The plant's states and commands in which lanes end; under dither their means over its last period.
 
-        A search keeps no states on the way: the period after the end is run, and what it drifts by is taken off.
+        A search keeps no states along a response, so one more period is run after its end. The change from that
+        period's start to its end is subtracted from the mean, which puts it back by one period.
         """
         x, u = x_end[:, : len(self.loop.plant.states)].copy(), commands.copy()
         for period, rows in self.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
@@ -183,7 +189,7 @@ class Simulator:
         return x, u
 
     def _means_after_end(self, grid: ReferenceGrid, x_end: Array, p: Array, period: float) -> Array:
-        """Means of the plant's states and the command over the period after the end, less the drift in one."""
+        """Means of the plant's states and the command over one period after the end, minus their change in it."""
         held = self.loop.pid.sample_time is not None
         n = max(1, round(period / grid.spacing)) if held else SAMPLES_A_DITHER_PERIOD
         h = grid.spacing if held else period / n
@@ -197,7 +203,14 @@ class Simulator:
             return np.asarray(np.trapezoid(along, axis=1) / n - (along[:, -1] - along[:, 0]))
 
     def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
-        """Parameters and start states of lanes, each a candidate's row and a case."""
+        """Parameters, shape (m, n_parameters), and start states, shape (m, n_states), of lanes.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n_points, n)
+        rows, case : ndarray of int, shape (m,)
+            Each lane's candidate, a row of `points`, and its case.
+        """
         base, order = self.space.vectors(points)[rows], list(self.space.parameters)
         p, starts = np.empty_like(base), np.empty((len(rows), self._rollout.n_states))
         for k in np.unique(case).tolist():
@@ -207,7 +220,7 @@ class Simulator:
         return p, starts
 
     def starts(self, case: int, points: Array) -> Array:
-        """Where the loop waits for the step, shape (m, n_states), and under dither a zero, the signal's integral."""
+        """The states before the step, shape (m, n_states); under dither the last one is the signal's integral, zero."""
         rest = self._rest[case]
         if rest is not None:
             found = np.tile(rest, (len(points), 1))
@@ -216,18 +229,21 @@ class Simulator:
         return np.column_stack([found, np.zeros((len(found), int(has_integral(self.loop))))])
 
     def starts_vary(self, case: int) -> bool:
-        """Whether the rest of a case depends on the gains."""
+        """Whether the state before the step depends on the gains in a case."""
         return self._rest[case] is None
 
     def lanes_by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
-        """Which of the sound lanes are averaged over which time."""
+        """Each averaging time [s], None without dither, and a mask of the sound lanes that it is for."""
         rates = self._dither_rates(p)
         for rate in np.unique(rates[sound]).tolist():
             period = self.loop.dither.period(rate, self.loop.pid.sample_time) if rate and self.loop.dither else None
             yield period, sound & (rates == rate)
 
     def pad(self, case: Indices) -> tuple[Array, Array, Array, int]:
-        """Inputs, instants and steps of lanes, shapes (m, n, n_inputs), (m, n), (m, n); substeps."""
+        """Inputs, instants and steps of lanes, padded to one length, and their RK4 steps a sample.
+
+        Their shapes are (m, n, n_inputs), (m, n) and (m, n).
+        """
         own = self._grid_of[case]
         n = max(len(self.grids[g].t) for g in np.unique(own))
         full = {g: self.grids[g].pad(n) for g in np.unique(own).tolist()}
@@ -235,7 +251,7 @@ class Simulator:
         return u, t, h, max(self.substeps[g] for g in np.unique(own))
 
     def _chunks(self, case: Indices) -> Iterator[Indices]:
-        """Lanes that run together: few of them all at once, many with those on the same grid."""
+        """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid."""
         if len(case) <= MAX_MIXED_LANES:
             yield np.arange(len(case))
             return
@@ -244,6 +260,7 @@ class Simulator:
             yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
 
     def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: float) -> None:
+        """Simulate the lanes `chunk` and fill their rows of `out`."""
         if not len(chunk):
             return
         u, t, h, steps = self.pad(case)
@@ -277,7 +294,10 @@ class Simulator:
         return np.where(amplitude == 0, 0.0, frequency)
 
     def _fastest_eigenvalue(self, references: Sequence[Step]) -> float:
-        """The fastest mode over the gains' box; on the scenarios' plants at the corners that are fastest nominally."""
+        """The rate of the fastest mode over the gains' box and all plants [1/s].
+
+        On the scenarios' plants only the corners that are fastest on the nominal one are examined.
+        """
         states = [x for k in range(len(references)) for x in self._sample_states(k)]
         corners, order = self.space.vectors(self.space.corners()), list(self.space.parameters)
         rates = fastest_eigenvalue(self.loop, corners, states)
@@ -286,7 +306,7 @@ class Simulator:
         return float(max([rates.max(), *(fastest_eigenvalue(self.loop, p, states).max() for p in others)]))
 
     def _sample_states(self, k: int) -> list[Array]:
-        """Some states along the response of the given gains, and the rest."""
+        """States along the response of the given gains, from the start on."""
         grid, given = self.grids[k], self.space.start[None]
         start, p = self.starts(k, given), self.space.vectors(given)
         u, t, h = (a[None] for a in grid.pad(len(grid.t)))
@@ -297,12 +317,12 @@ class Simulator:
 
 
 def _select_rows(y: Array, rows: Mask) -> Array:
-    """Some rows, the time axis as contiguous as it was."""
+    """Select rows of responses without changing the memory order, in which time is contiguous."""
     return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)
 
 
 def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> Array | None:
-    """The state before the step where it does not depend on the gains."""
+    """The state before the step, shape (n_states,); None where it depends on the gains."""
     other = space.from_unit(np.full(len(space.names), 0.7))
     first, second = (case.initial(loop, space.parameters_at(point)) for point in (space.start, other))
     scale = np.array([q.nominal for q in loop.states])
@@ -310,11 +330,15 @@ def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> 
 
 
 def _grids(
-    loop: ClosedLoop, references: Sequence[Step], parameters: ParameterSet, a_period: int = SAMPLES_A_DITHER_PERIOD
+    loop: ClosedLoop,
+    references: Sequence[Step],
+    parameters: ParameterSet,
+    samples_a_period: int = SAMPLES_A_DITHER_PERIOD,
 ) -> list[ReferenceGrid]:
+    """The samples of each reference, with so many samples in the period of a continuous dither."""
     found = []
     for reference in references:
-        h = sample_spacing(loop, reference, parameters, a_period)
+        h = sample_spacing(loop, reference, parameters, samples_a_period)
         run, k = loop_inputs(loop, reference, h), readings_a_sample(loop, reference)
         number = np.arange(k * (len(run) - 1) + 1)
         t: Array = np.asarray(number * (h / k), dtype=np.float64)
