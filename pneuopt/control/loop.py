@@ -21,6 +21,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.control.wiring import Signals, check_algebraic_loop, check_initial_command, evaluate_plant, select_signal
+from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (
     DiscreteSystem,
     Motion,
@@ -32,6 +33,7 @@ from pneuopt.dynamics.system import (
     stack,
     symbols,
 )
+from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity, with_prefix, without_prefix
@@ -43,7 +45,8 @@ class ClosedLoop:
 
     Parameters
     ----------
-    plant : System
+    plant : drive or System
+        Held as its system.
     pid : PID
     dither : Dither, optional
     actuated : str, optional
@@ -64,8 +67,8 @@ class ClosedLoop:
         If the dither cannot be sampled.
     """
 
-    plant: System
-    pid: PID
+    plant: PlantField = PlantField()  # noqa: RUF009 - the field, no default
+    pid: PID  # type: ignore[misc]  # mypy takes the field before it for a default
     dither: Dither | None = None
     actuated: str | None = None
     measured: str | None = None
@@ -89,6 +92,11 @@ class ClosedLoop:
     def __repr__(self) -> str:
         model = self.system() if self.pid.sample_time is None else self.discrete()
         return repr(model).replace(type(model).__name__, "ClosedLoop", 1)
+
+    @property
+    def loop(self) -> "ClosedLoop":
+        """The loop itself, as `Rig.loop` is the loop behind a rig's sensors."""
+        return self
 
     @cached_property
     def command(self) -> Quantity:
@@ -371,3 +379,8 @@ class ClosedLoop:
         t, x, u = ca.SX.sym("t"), symbols(self.plant.states), {q.name: ca.SX(0) for q in self.plant.inputs}
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
         return ca.Function("shown", [t, stack(x), stack(p)], [stack(self._plant_rates(t, x, u, p, ca.SX(0))[1])])
+
+
+def check_closed_loop(loop: object) -> None:
+    """Raise `InputError` where `loop` is no `ClosedLoop`, but a drive, say."""
+    check_argument("loop", loop, ClosedLoop, "a ClosedLoop, such as ClosedLoop(drive, PID())")

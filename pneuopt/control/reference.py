@@ -1,11 +1,12 @@
 """References that a loop shall follow, and disturbances against which it shall hold them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite
 
 import numpy as np
 
+from pneuopt.quantities.arguments import as_tuple
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -127,6 +128,11 @@ class Step:
         columns = {"reference": np.where(k >= first, self.final, self.initial)}
         columns |= {disturbance_input(n): np.where(k >= first, v, 0.0) for n, v in self.disturbance.items()}
         return Trajectory(k * step, columns)
+
+
+def as_steps(references: Step | Iterable[Step]) -> tuple[Step, ...]:
+    """One Step as well as several, as a tuple; an `InputError` where something else came."""
+    return as_tuple("references", references, Step, "a Step or several, such as Step(0.1)")
 
 
 def disturbance_input(name: str) -> str:

@@ -1,14 +1,16 @@
 """`Runnable` and `Fittable`: what a model offers so that it can be simulated, and fitted to logs.
 
 `System`, `ClosedLoop` and `LoggedLoop` are runnable; a new kind of model becomes so by these members, and is then taken
-by `simulate` and, where it is fittable, by `identify`. Nobody asks a model for its type.
+by `simulate` and, where it is fittable, by `identify`. Nobody asks a model for its type. A drive is none: `as_system`
+and `as_runnable` take its system, and every verb that is given a model begins with one of them.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import FRICTION_DIRECTION, DiscreteSystem, Motion, System
+from pneuopt.quantities.arguments import wrong_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
@@ -82,6 +84,63 @@ class Fittable(Runnable, Protocol):
     def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """What speaks against the logs, a sentence each."""
         ...
+
+
+class HasSystem(Protocol):
+    """Anything that can be written as a `System`: a drive, a continuous loop, the system itself."""
+
+    def system(self) -> System:
+        """Its equations, with every parameter's default."""
+        ...
+
+
+M = TypeVar("M", bound=Runnable)
+DRIVE_OR_SYSTEM = "a drive (read_drive gives one beside its parameters) or its system"
+
+
+def as_system(model: HasSystem, argument: str = "system", meant: str = DRIVE_OR_SYSTEM) -> System:
+    """The system of a drive; a system stays what it is.
+
+    Parameters
+    ----------
+    model : drive or System
+    argument, meant : str
+        For the message: the name of the argument, and what it takes.
+
+    Raises
+    ------
+    InputError
+        If it has no system.
+    """
+    if isinstance(model, type) or not callable(getattr(model, "system", None)):
+        raise wrong_argument(argument, model, meant)
+    return model.system()
+
+
+def as_runnable(model: M | HasSystem, argument: str = "system") -> M | System:
+    """The system of a drive; what can be simulated, a loop or a system, stays what it is. Errors as for `as_system`."""
+    if hasattr(model, "motion") and not isinstance(model, type):
+        return model  # type: ignore[return-value]
+    return as_system(model, argument, f"{DRIVE_OR_SYSTEM}, or a ClosedLoop")
+
+
+class PlantField:
+    """A field of a dataclass that takes a drive as well as its system, and holds the system."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Remember the field's name."""
+        self._name = name
+
+    def __get__(self, instance: object, owner: type) -> System:
+        """The system; the class itself has none, by which a dataclass sees a field without a default."""
+        if instance is None:
+            raise AttributeError(self._name)
+        system: System = instance.__dict__[self._name]
+        return system
+
+    def __set__(self, instance: object, model: HasSystem) -> None:
+        """Hold the system of `model`; errors as for `as_system`."""
+        instance.__dict__[self._name] = as_system(model, self._name)
 
 
 def check_smooth(model: Runnable) -> None:

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.hooks import Contact
-from pneuopt.dynamics.runnable import Runnable
+from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable
 from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
+from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity
@@ -43,7 +44,7 @@ class StickSlipResult:
 
 
 def simulate(
-    model: Runnable,
+    model: Runnable | HasSystem,
     inputs: Trajectory,
     parameters: ParameterSet,
     *,
@@ -56,8 +57,8 @@ def simulate(
 
     Parameters
     ----------
-    model : Runnable
-        A System, ClosedLoop or LoggedLoop. A loop with a sampled PID takes its samples at ``inputs.t[0]`` plus whole
+    model : drive, System, ClosedLoop or another Runnable
+        A loop with a sampled PID takes its samples at ``inputs.t[0]`` plus whole
         sample times.
     inputs : Trajectory
         A column an input of the model, held from each of its instants to the next; others are not read.
@@ -105,7 +106,7 @@ def simulate(
 
 
 def simulate_stick_slip(
-    model: Runnable,
+    model: Runnable | HasSystem,
     inputs: Trajectory,
     parameters: ParameterSet,
     *,
@@ -138,14 +139,14 @@ def simulate_stick_slip(
     return StickSlipResult(run.trajectory(), run.events)
 
 
-def contacts(trajectory: Trajectory, model: Runnable, parameters: ParameterSet) -> tuple[Contact, ...]:
+def contacts(trajectory: Trajectory, model: Runnable | HasSystem, parameters: ParameterSet) -> tuple[Contact, ...]:
     """Where a response runs into an end stop or empties a chamber: what `simulate` warns of, seen at the instants.
 
     Parameters
     ----------
     trajectory : Trajectory
         With the plant's states.
-    model : Runnable
+    model : drive, System, ClosedLoop or another Runnable
     parameters : ParameterSet
 
     Returns
@@ -162,7 +163,7 @@ def contacts(trajectory: Trajectory, model: Runnable, parameters: ParameterSet) 
     >>> print(str(contacts(run, drive, drive.parameters)[0]).partition(";")[0])
     the piston reached the front end stop (position 199.9 mm) at t = 0.04975 s with 0.4 m/s
     """
-    plant = model.plant
+    plant = as_runnable(model, "model").plant
     rows = trajectory.matrix(names(plant.states))
     watch = LimitMonitor(plant, parameters, trajectory.t[0], rows[0])
     for t, row in zip(trajectory.t, rows, strict=True):
@@ -184,13 +185,16 @@ def new_integration(system: System, p: Array, grid: Array, rtol: float, atol: fl
 
 
 def _integrate(
-    model: Runnable,
+    model: Runnable | HasSystem,
     inputs: Trajectory,
     parameters: ParameterSet,
     initial: Mapping[str, float] | ArrayLike | None,
     t_out: ArrayLike | None,
     tolerances: tuple[float, float],
 ) -> tuple[Integration, tuple[Contact, ...]]:
+    model = as_runnable(model, "model")
+    check_argument("inputs", inputs, Trajectory, "a Trajectory; a log's is its .trajectory")
+    check_parameters(parameters)
     motion = model.motion()
     system, update = motion.system, compile_function(motion.update) if motion.update is not None else None
     u, grid = input_rows(system.inputs, inputs), _report_times(t_out, inputs.t)

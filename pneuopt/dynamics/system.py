@@ -148,6 +148,10 @@ class System:
         """The model itself, as it has no controller."""
         return self
 
+    def system(self) -> "System":
+        """The system itself, so that a verb takes a drive as well as its system."""
+        return self
+
     def motion(self) -> "Motion":
         """See `Runnable`."""
         return Motion(self)

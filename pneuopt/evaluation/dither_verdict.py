@@ -11,13 +11,14 @@ import numpy as np
 
 from pneuopt.control.averaging import ripple
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.hooks import Rest
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.response import command_range
+from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -162,7 +163,9 @@ def judge_dither(
     ConvergenceError
         If a simulation stops.
     """
-    steps = [references] if isinstance(references, Step) else list(references)
+    check_closed_loop(loop)
+    check_parameters(parameters)
+    steps = as_steps(references)
     full = loop.complete(parameters)
     require(loop.dither is not None, "there is no dither to judge: ClosedLoop(plant, pid, Dither())")
     require(full.value(DITHER_AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")

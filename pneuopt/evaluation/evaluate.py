@@ -10,7 +10,7 @@ import numpy as np
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.dither_mean import period_mean
@@ -22,6 +22,7 @@ from pneuopt.evaluation.record import record
 from pneuopt.evaluation.response import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
@@ -104,7 +105,8 @@ def evaluate(
     """
     import pandas as pd
 
-    steps = [references] if isinstance(references, Step) else list(references)
+    steps = as_steps(references)
+    check_parameters(parameters)
     inner, rig = _loop_and_rig(loop, steps)
     full = inner.complete(parameters)
     every = cases(steps, scenarios, full)
@@ -218,9 +220,10 @@ def _margin_metrics(
 
 def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Step]) -> tuple[ClosedLoop, Rig | None]:
     """Loop with inputs for the references' disturbances, and the rig around it, if any."""
+    meant = "a ClosedLoop, such as ClosedLoop(drive, PID()), or a Rig with one"
+    check_argument("loop", model, (ClosedLoop, Rig), meant)
     rig = model if isinstance(model, Rig) else None
-    loop = rig.loop if rig is not None else model
-    if not isinstance(loop, ClosedLoop):
+    if model.loop is None:
         raise ModelError("this rig has no controller, so it follows no reference; make it of a ClosedLoop")
-    loop = add_disturbances(loop, references)
+    loop = add_disturbances(model.loop, references)
     return loop, replace(rig, model=loop) if rig is not None else None

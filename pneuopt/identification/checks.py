@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from pneuopt.dynamics.system import names
 from pneuopt.logs.doctor import Finding, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import noise_level
+from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -23,8 +24,17 @@ SETPOINT_CHANNELS = (
 MAX_PAUSE_STEPS = 50  # usual steps without a sample; the inputs in between are unknown
 
 
-def check_logs(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> list[Experiment]:
+def as_experiments(experiments: Experiment | Iterable[Experiment]) -> tuple[Experiment, ...]:
+    """One log as well as several, as a tuple; an `InputError` where something else came."""
+    return as_tuple("experiments", experiments, Experiment, "an Experiment or several, as read_log(path) gives them")
+
+
+def check_logs(
+    system: Fittable, experiments: Experiment | Iterable[Experiment], parameters: ParameterSet
+) -> list[Experiment]:
     """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
+    experiments = as_experiments(experiments)
+    check_parameters(parameters)
     require(len(experiments) > 0, "no experiments: give at least one log", LogError)
     check_names("parameter", parameters, system.parameters)
     system.check(parameters)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.system import System
-from pneuopt.identification.checks import check_logs
+from pneuopt.dynamics.runnable import HasSystem
+from pneuopt.identification.checks import as_experiments, check_logs
 from pneuopt.identification.identify import identify
 from pneuopt.identification.problem import as_estimation_model
 from pneuopt.identification.result import IdentificationResult
@@ -53,7 +53,7 @@ class LogComparison:
 
 
 def compare_logs(
-    system: System | ClosedLoop,
+    system: HasSystem | ClosedLoop,
     experiments: Sequence[Experiment],
     parameters: ParameterSet,
     *,
@@ -66,7 +66,7 @@ def compare_logs(
 
     Parameters
     ----------
-    system : System or ClosedLoop
+    system : drive, System or ClosedLoop
     experiments : sequence of Experiment
         At least two.
     parameters : ParameterSet
@@ -82,6 +82,7 @@ def compare_logs(
     InputError
         If there is one log only, or logs, system and parameters do not fit together.
     """
+    experiments = as_experiments(experiments)
     require(len(experiments) > 1, f"{len(experiments)} log is not to be compared; give at least two", LogError)
     logs = check_logs(as_estimation_model(system), experiments, parameters)
     fits = {}

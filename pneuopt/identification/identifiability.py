@@ -15,8 +15,7 @@ from scipy.stats import chi2
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.excitation import Lack
 from pneuopt.dynamics.hooks import Start
-from pneuopt.dynamics.runnable import check_smooth
-from pneuopt.dynamics.system import System
+from pneuopt.dynamics.runnable import HasSystem, check_smooth
 from pneuopt.identification.checks import check_content, check_free, check_logs
 from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
@@ -60,8 +59,8 @@ VAGUER_THAN_PRIOR = "they say less of it than a factor of ten about its value wo
 
 
 def identifiability(
-    system: System | ClosedLoop,
-    experiments: Sequence[Experiment],
+    system: HasSystem | ClosedLoop,
+    experiments: Experiment | Sequence[Experiment],
     parameters: ParameterSet,
     *,
     method: LeastSquares | None = None,
@@ -70,8 +69,8 @@ def identifiability(
 
     Parameters
     ----------
-    system : System or ClosedLoop
-    experiments : sequence of Experiment
+    system : drive, System or ClosedLoop
+    experiments : Experiment or sequence of Experiment
     parameters : ParameterSet
         As for `identify`.
     method : LeastSquares, optional

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.runnable import Fittable, check_smooth
+from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import System, names
+from pneuopt.dynamics.system import names
 from pneuopt.identification.checks import (
+    as_experiments,
     check_content,
     check_free,
     check_logs,
@@ -40,6 +41,7 @@ from pneuopt.identification.statistics import (
     ljung_box,
 )
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
@@ -59,8 +61,8 @@ NOTHING_IDENTIFIABLE = Status(
 
 
 def identify(
-    system: System | ClosedLoop,
-    experiments: Sequence[Experiment],
+    system: HasSystem | ClosedLoop,
+    experiments: Experiment | Sequence[Experiment],
     parameters: ParameterSet,
     *,
     method: LeastSquares | None = None,
@@ -72,10 +74,10 @@ def identify(
 
     Parameters
     ----------
-    system : System or ClosedLoop
+    system : drive, System or ClosedLoop
         A loop with its sampled PID, where the logs hold the reference ("speed_reference") but not the command. Where
         they hold the command, identify the plant alone: the controller then says nothing more.
-    experiments : sequence of Experiment
+    experiments : Experiment or sequence of Experiment
         Each with all inputs and at least one output of the system. Missing outputs and samples do not count.
     parameters : ParameterSet
         The free ones are estimated; the others are known, unless a log's conditions override them.
@@ -100,6 +102,7 @@ def identify(
     """
     method, model = method or LeastSquares(), as_estimation_model(system)
     check_smooth(model)
+    experiments = as_experiments(experiments)
     if estimate_noise:
         experiments = [replace(e, noise={}) for e in experiments]
     experiments = check_logs(model, experiments, parameters)
@@ -117,14 +120,14 @@ def identify(
 
 
 def validate(
-    system: System | ClosedLoop, experiments: Sequence[Experiment], parameters: ParameterSet
+    system: HasSystem | ClosedLoop, experiments: Experiment | Sequence[Experiment], parameters: ParameterSet
 ) -> "pd.DataFrame":
     """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
 
     Parameters
     ----------
-    system : System or ClosedLoop
-    experiments : sequence of Experiment
+    system : drive, System or ClosedLoop
+    experiments : Experiment or sequence of Experiment
         Best such as no fit has seen.
     parameters : ParameterSet
 
@@ -138,9 +141,9 @@ def validate(
     import pandas as pd
 
     model = as_estimation_model(system)
-    fixed = model.parameters | parameters.fixed(*parameters.free_names)
+    logs, fixed = check_logs(model, experiments, parameters), _fixed_parameters(model, parameters)
     rows = []
-    for experiment in check_logs(model, experiments, fixed):
+    for experiment in logs:
         run = _predict_log(model, experiment, fixed)
         rows += [
             row | _residual_diagnosis(model, experiment, run, str(row["channel"]))
@@ -149,12 +152,12 @@ def validate(
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
 
-def predict(system: System | ClosedLoop, experiment: Experiment, parameters: ParameterSet) -> Trajectory:
+def predict(system: HasSystem | ClosedLoop, experiment: Experiment, parameters: ParameterSet) -> Trajectory:
     """The free run that `validate` compares with a log.
 
     Parameters
     ----------
-    system : System or ClosedLoop
+    system : drive, System or ClosedLoop
     experiment : Experiment
     parameters : ParameterSet
 
@@ -164,8 +167,14 @@ def predict(system: System | ClosedLoop, experiment: Experiment, parameters: Par
         States and outputs on the log's grid.
     """
     model = as_estimation_model(system)
-    fixed = model.parameters | parameters.fixed(*parameters.free_names)
-    return _predict_log(model, check_logs(model, [experiment], fixed)[0], fixed)
+    check_argument("experiment", experiment, Experiment, "an Experiment, as read_log(path) gives it")
+    log = check_logs(model, experiment, parameters)[0]
+    return _predict_log(model, log, _fixed_parameters(model, parameters))
+
+
+def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSet:
+    """Every parameter of the system, none free."""
+    return system.parameters | parameters.fixed(*parameters.free_names)
 
 
 def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) -> Trajectory:

@@ -8,8 +8,8 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.dynamics.runnable import Fittable
-from pneuopt.dynamics.system import System, names
+from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable
+from pneuopt.dynamics.system import names
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.result import IdentificationResult
@@ -112,9 +112,10 @@ class EstimationProblem:
         return Residuals(index, outputs, experiment.trajectory.matrix(outputs), noise)
 
 
-def as_estimation_model(model: System | ClosedLoop) -> Fittable:
-    """The model as an identification reads it from a log."""
-    return LoggedLoop(model) if isinstance(model, ClosedLoop) else model
+def as_estimation_model(model: HasSystem | ClosedLoop | Fittable) -> Fittable:
+    """The model as an identification reads it from a log: of a drive its system, of a loop a `LoggedLoop`."""
+    runnable = as_runnable(model)
+    return LoggedLoop(runnable) if isinstance(runnable, ClosedLoop) else runnable
 
 
 def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from scipy.stats import chi2
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.system import System
+from pneuopt.dynamics.runnable import HasSystem
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.result import IdentificationResult
@@ -81,8 +81,8 @@ class Profile:
 
 
 def profile(
-    system: System | ClosedLoop,
-    experiments: Sequence[Experiment],
+    system: HasSystem | ClosedLoop,
+    experiments: Experiment | Sequence[Experiment],
     result: IdentificationResult,
     name: str,
     *,
@@ -93,8 +93,8 @@ def profile(
 
     Parameters
     ----------
-    system : System or ClosedLoop
-    experiments : sequence of Experiment
+    system : drive, System or ClosedLoop
+    experiments : Experiment or sequence of Experiment
         Those that `result` was made from.
     result : IdentificationResult
         A converged one: every refit starts from it, no start is searched for.

@@ -6,11 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+from pneuopt.dynamics.runnable import HasSystem, as_system
 from pneuopt.dynamics.system import System, names
+from pneuopt.identification.checks import as_experiments
 from pneuopt.identification.identify import identify, validate
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import LeastSquares
@@ -50,26 +53,26 @@ class ModelSelection:
 
 
 def select_model(
-    candidates: Mapping[str, System],
-    experiments: Sequence[Experiment],
+    candidates: Mapping[str, HasSystem],
+    experiments: Experiment | Sequence[Experiment],
     parameters: ParameterSet,
     *,
     free: Sequence[str],
-    held_out: Sequence[Experiment] = (),
+    held_out: Experiment | Sequence[Experiment] = (),
     method: LeastSquares | None = None,
 ) -> ModelSelection:
     """Fit every candidate and recommend one.
 
     Parameters
     ----------
-    candidates : mapping of str to System
-        By name, say ``{n: ForceDrive(f).system() for n, f in friction_ladder().items()}``.
-    experiments : sequence of Experiment
+    candidates : mapping of str to drive or System
+        By name, say ``{n: ForceDrive(f) for n, f in friction_ladder().items()}``.
+    experiments : Experiment or sequence of Experiment
     parameters : ParameterSet
         Known values; a candidate takes those that it has. What is free among them stays so.
     free : sequence of str
         Names, or patterns, freed in each candidate that has them.
-    held_out : sequence of Experiment
+    held_out : Experiment or sequence of Experiment, optional
         Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
     method : LeastSquares, optional
 
@@ -91,16 +94,20 @@ def select_model(
     (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable parameters count among the k, so
     that a candidate with such parameters gives way to a simpler one that fits as well.
     """
+    check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
     require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
-    given = {name: _candidate_parameters(system, parameters, free) for name, system in candidates.items()}
+    systems = {name: as_system(model, f"candidates[{name!r}]") for name, model in candidates.items()}
+    experiments, held_out = as_experiments(experiments), as_experiments(held_out)
+    check_parameters(parameters)
+    given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
     _check_names(given, parameters, free)
-    fits = {n: identify(s, experiments, given[n], method=method, throw=False) for n, s in candidates.items()}
+    fits = {n: identify(s, experiments, given[n], method=method, throw=False) for n, s in systems.items()}
     converged = [n for n, fit in fits.items() if fit.status.converged]
     if not converged:
         message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
         raise ConvergenceError(f"none of the candidates converged: {message}", fits)
-    predicted = {n: _mean_nrmse(candidates[n], held_out, fits[n]) for n in converged}
-    rows = _candidate_rows(candidates, fits, predicted)
+    predicted = {n: _mean_nrmse(systems[n], held_out, fits[n]) for n in converged}
+    rows = _candidate_rows(systems, fits, predicted)
     chosen, passed_over = _choose(rows)
     return ModelSelection(_selection_table(rows), chosen, _selection_reason(rows, chosen, passed_over), fits)
 

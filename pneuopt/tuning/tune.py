@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.requirements import PeakControl, Requirement
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
+from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
@@ -127,14 +128,16 @@ def prepare_task(
     scenarios: Scenarios = NO_SCENARIOS,
 ) -> TuningTask:
     """Check what is to be tuned, and that its limits can be kept at all; parameters and errors as for `tune`."""
+    check_closed_loop(loop)
+    check_parameters(parameters)
     check_smooth(loop.plant)
-    steps = [references] if isinstance(references, Step) else list(references)
+    steps = as_steps(references)
     loop = add_disturbances(loop, steps)
     require(len(steps) > 0, "no reference to tune for; give a Step")
     space = search_space(loop, parameters)
     spec = spec.without(PeakControl) if clip_level(loop, space.parameters) <= spec.limit(PeakControl) else spec
     check_feasibility(loop, cases(steps, scenarios, space.parameters, space.names), space, spec)
-    return TuningTask(loop, tuple(steps), scenarios, space, spec)
+    return TuningTask(loop, steps, scenarios, space, spec)
 
 
 def prepare_search(task: TuningTask, method: Method | None = None, progress: ProgressCallback | None = None) -> Search:

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.reference import Step, as_steps
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, user_limit
 from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
+from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -101,7 +102,9 @@ def validate_design(
     """
     require(len(scenarios) > 0, "no fresh plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)")
     spec = specify(minimise, subject_to)
-    steps = [references] if isinstance(references, Step) else list(references)
+    check_closed_loop(loop)
+    check_parameters(parameters)
+    steps = as_steps(references)
     loop = add_disturbances(loop, steps)
     full = loop.complete(parameters).select(loop.parameters)
     values = _simulate_plants(loop, steps, full, spec, scenarios)
