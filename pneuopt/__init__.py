@@ -4,12 +4,12 @@ The concept map, in the order in which data flow:
 
     read_log(path)                    -> Experiment: a measured Trajectory, its noise and conditions
     read_drive(path)                  -> a drive and its ParameterSet; or build one: ForceDrive(Stribeck())
-    identify(system, logs, freed)     -> IdentificationResult: estimates with confidence intervals
-    select_model(systems, logs, ...)  -> which of several models the logs support, and why
-    identifiability(system, logs, freed) -> Verdict: what the logs can tell, in words, before a fit
+    identify(drive, logs, freed)      -> IdentificationResult: estimates with confidence intervals
+    select_model(drives, logs, ...)   -> which of several models the logs support, and why
+    identifiability(drive, logs, freed) -> Verdict: what the logs can tell, in words, before a fit
     profile, propagate_error(...)     -> an interval where a linear one lies; one of a figure made of estimates
-    validate(system, logs, fitted)    -> how well a held-out log is predicted, and what is left in the residuals
-    ClosedLoop(system, PID, Dither)   -> the loop to be tuned, continuous or sampled
+    validate(drive, logs, fitted)     -> how well a held-out log is predicted, and what is left in the residuals
+    ClosedLoop(drive, PID, Dither)    -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
     validate_design(loop, ...)        -> a design on fresh plants: worst, 95th percentile, violations
     judge_dither(loop, steps, tuned)  -> whether the dither is useful, useless or harmful, and why, in numbers
@@ -20,8 +20,9 @@ The concept map, in the order in which data flow:
     pareto_front(loop, steps, ...)    -> what one requirement costs in terms of another: a row a certified design
     grid, sweep(fn, parameters, cases)-> a study: any function over named cases, in processes, as a table
 
-Names are loaded when first used, as `__init__.pyi` says where they are; importing the package costs nothing. Modules
-are private but for `pneuopt.catalog` (numbers of real hardware, cited) and `pneuopt.plotting` (figures).
+Wherever a drive stands, its system may; where logs or steps stand, one may. Names are loaded when first used, as
+`__init__.pyi` says where they are; importing the package costs nothing. Modules are private but for `pneuopt.catalog`
+(numbers of real hardware, cited) and `pneuopt.plotting` (figures).
 """
 
 import lazy_loader
