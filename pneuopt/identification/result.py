@@ -73,8 +73,8 @@ class Verdict:
         return {
             "sentences": list(self.sentences),
             "unidentifiable": list(self.unidentifiable),
-            "kept": list(self.unchanged),
-            "together": [list(group) for group in self.indistinguishable],
+            "unchanged": list(self.unchanged),
+            "indistinguishable": [list(group) for group in self.indistinguishable],
             "reasons": {str(n): reason for n, reason in self.reasons.items()},
         }
 

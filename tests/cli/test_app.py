@@ -55,8 +55,10 @@ def test_identify_recovers_what_made_the_logs_and_says_so(folder: Path, axis_tru
     assert Path("fit.png").stat().st_size > 10_000
     for name in ("friction", "residuals", "correlation"):
         assert Path(f"fit_{name}.png").stat().st_size > 10_000
-    words = {n: said["verdict"][n] for n in ("sentences", "unidentifiable", "kept", "together", "reasons")}
-    assert words == {"sentences": [], "unidentifiable": [], "kept": [], "together": [], "reasons": {}}
+    words = {
+        n: said["verdict"][n] for n in ("sentences", "unidentifiable", "unchanged", "indistinguishable", "reasons")
+    }
+    assert words == {"sentences": [], "unidentifiable": [], "unchanged": [], "indistinguishable": [], "reasons": {}}
     assert said["verdict"]["table"][0]["name"] == "load.mass"
 
 

@@ -98,7 +98,7 @@ def test_the_file_of_the_fit_says_why_and_keeps_what_is_unidentifiable(tmp_path:
     write_fit(fit, source, fitted())
     said, text = read_toml(fit).unwrap(), fit.read_text(encoding="utf-8")
     assert said["status"]["code"] == "converged"
-    assert said["verdict"]["unidentifiable"] == said["verdict"]["kept"] == list(BRISTLES)
+    assert said["verdict"]["unidentifiable"] == said["verdict"]["unchanged"] == list(BRISTLES)
     assert "the motion never reverses" in said["verdict"]["reasons"][BRISTLES[0]]
     assert any("keep their given values" in sentence for sentence in said["verdict"]["sentences"])
     assert np.isnan(said["estimates"][BRISTLES[0]]["value"])
