@@ -82,13 +82,27 @@ class SeparatingRun:
 
 @dataclass(frozen=True)
 class Excitation:
-    """A model's needs by parameter, and the runs that separate its parameters; of these the first that suits counts."""
+    """Which motion a model's parameters need in a log, and the runs that separate its parameters.
+
+    Parameters
+    ----------
+    needs : mapping of str to Need
+        By parameter.
+    runs : tuple of SeparatingRun
+        The first that suits a group counts.
+    smoothing : str
+        The parameter over which dry friction changes its sign: a model creeps at speeds of that order where the drive
+        stands still. Empty without one.
+    """
 
     needs: Mapping[str, Need] = field(default_factory=dict)
     runs: tuple[SeparatingRun, ...] = ()
+    smoothing: str = ""
 
     def __or__(self, other: "Excitation") -> "Excitation":
-        return Excitation({**self.needs, **other.needs}, self.runs + other.runs)
+        return Excitation(
+            {**self.needs, **other.needs}, self.runs + other.runs, smoothing=self.smoothing or other.smoothing
+        )
 
     def with_prefix(self, prefix: str) -> "Excitation":
         """The same with every part's own name ("viscous") made whole ("friction.viscous")."""
@@ -96,5 +110,7 @@ class Excitation:
         def whole(names: frozenset[str]) -> frozenset[str]:
             return frozenset(n if "." in n else f"{prefix}.{n}" for n in names)
 
+        smoothing = f"{prefix}.{self.smoothing}" if self.smoothing else ""
         needs = {f"{prefix}.{n}": replace(e, confused_with=whole(e.confused_with)) for n, e in self.needs.items()}
-        return Excitation(needs, tuple(replace(r, some=whole(r.some), others=whole(r.others)) for r in self.runs))
+        runs = tuple(replace(r, some=whole(r.some), others=whole(r.others)) for r in self.runs)
+        return Excitation(needs, runs, smoothing)

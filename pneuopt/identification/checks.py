@@ -9,8 +9,8 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable
-from pneuopt.dynamics.system import names
-from pneuopt.logs.doctor import Finding, examine
+from pneuopt.dynamics.system import System, names
+from pneuopt.logs.doctor import PISTON_CHANNELS, AxisChannels, Finding, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.arguments import as_tuple, check_parameters
@@ -63,11 +63,11 @@ def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> N
         require(not known, message, ModelError)
 
 
-def check_content(experiments: Sequence[Experiment]) -> None:
-    """Refuse logs that most of them show to be wrong or without motion; a window of a good log may well stand still."""
+def check_content(system: Fittable, experiments: Sequence[Experiment]) -> None:
+    """Refuse logs of which more than half show the same fault; a window of a good log may well stand still."""
     found: dict[str, dict[str, Finding]] = {}
     for experiment in experiments:
-        for finding in examine(experiment):
+        for finding in examine(experiment, _axis_channels(system.plant)):
             if finding.fault:
                 found.setdefault(finding.channel, {})[experiment.name] = finding
     for faults in found.values():
@@ -86,6 +86,14 @@ def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], param
     for sentence in found:
         warnings.warn(sentence, PhysicsWarning, stacklevel=3)
     return tuple(found)
+
+
+def _axis_channels(plant: System) -> AxisChannels:
+    """What a log calls the motion of the plant's axis and what drives it; a piston's names where it declares none."""
+    if plant.axis is None:
+        return PISTON_CHANNELS
+    pushes = [q.name for q in plant.inputs if q.unit == plant.axis.force]
+    return AxisChannels(plant.axis.position, plant.axis.speed, *pushes[:1])
 
 
 def _check_conditions(system: Fittable, experiment: Experiment, parameters: ParameterSet, name: str) -> None:

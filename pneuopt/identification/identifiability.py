@@ -91,7 +91,7 @@ def identifiability(
     check_smooth(model)
     logs = check_logs(model, experiments, parameters)
     check_free(logs, parameters)
-    check_content(logs)
+    check_content(model, logs)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, method or LeastSquares())
     return verdict_from_sensitivities(problem, problem.candidates()[0])
 

@@ -107,7 +107,7 @@ def identify(
         experiments = [replace(e, noise={}) for e in experiments]
     experiments = check_logs(model, experiments, parameters)
     check_free(experiments, parameters)
-    check_content(experiments)
+    check_content(model, experiments)
     doubted = emit_log_warnings(model, experiments, parameters)
     problem = EstimationProblem(model, tuple(experiments), model.parameters | parameters, method)
     held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.system import System
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.identifiability import (
     MAX_LINEAR_DEVIATION,
@@ -25,6 +26,7 @@ from pneuopt.identification.result import (
     Verdict,
     join_names,
 )
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.equations import segment_gaps
@@ -39,11 +41,8 @@ PROFILE_DRAG_DEVIATIONS = (
 RESIDUAL_BLOCK_SAMPLES = 50  # samples over which residuals are compared
 GAP_SUBSTEPS = 20  # of a sample, at which gaps are shown
 MIN_REPORTED_GAP = 1e-4  # of a nominal size
-SMOOTHING_PARAMETER, NARROW_SMOOTHING, SMOOTHING_REDUCTION = (
-    "friction.smoothing",
-    1e-4,
-    0.1,
-)  # [m/s], narrower takes ever finer steps
+SMOOTHING_REDUCTION = 0.1  # of the width [1] in one advice; smaller takes finer steps, larger leaves the model creeping
+MIN_SMOOTHING_SHARE = 0.1  # of the model's default width [1]; a narrower width takes ever finer integration steps
 
 
 def review_fit(
@@ -182,7 +181,7 @@ def _locate_failure(problem: EstimationProblem, start: Start, status: Status, ve
         status = status.with_remedies(
             _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
         )
-    return status.with_remedies(_smoothing_advice(problem))
+    return status.with_remedies(smoothing_advice(problem.system.plant, problem.parameters))
 
 
 def _name_unidentifiable(verdict: Verdict) -> str:
@@ -191,14 +190,18 @@ def _name_unidentifiable(verdict: Verdict) -> str:
     return f"the logs do not identify {join_names(names)}" if names else ""
 
 
-def _smoothing_advice(problem: EstimationProblem) -> str:
-    """A remedy for logs that stick: smoothed friction creeps meanwhile, at a speed of its width's order."""
-    width = (
-        problem.parameters[SMOOTHING_PARAMETER].value if SMOOTHING_PARAMETER in problem.parameters else NARROW_SMOOTHING
-    )
-    narrower = max(NARROW_SMOOTHING, SMOOTHING_REDUCTION * width)
-    message = f"if the logs stick, try {SMOOTHING_PARAMETER} = {narrower:g} m/s in place of {width:g} m/s"
-    return f"{message}: above it the model creeps where the drive stands still" if width > NARROW_SMOOTHING else ""
+def smoothing_advice(plant: System, parameters: ParameterSet) -> str:
+    """A remedy for logs that stick, where a smoothed friction creeps; empty if the plant's smoothing is narrow."""
+    name = plant.excitation.smoothing
+    if name not in parameters:
+        return ""
+    width, unit = parameters[name].value, parameters[name].unit
+    narrowest = MIN_SMOOTHING_SHARE * plant.parameters[name].value
+    if width <= narrowest:
+        return ""
+    narrower = max(narrowest, SMOOTHING_REDUCTION * width)
+    message = f"if the logs stick, try {name} = {narrower:g} {unit} in place of {width:g} {unit}"
+    return f"{message}: above it the model creeps where the drive stands still"
 
 
 def _worst_residual(problem: EstimationProblem, start: Start) -> str:

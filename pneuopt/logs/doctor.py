@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,24 @@ CLIPPED_SHARE = 0.02
 """Share of samples at the largest value [1] that looks clipped: lower blames rest, higher misses short clipping."""
 
 
+class AxisChannels(NamedTuple):
+    """The channels of the axis that a log is of: a piston's unless a plant names its own (angle, torque).
+
+    Attributes
+    ----------
+    position, speed : str
+    push : str
+        The force or torque that drives the axis, positive in the direction of positive speed.
+    """
+
+    position: str = "position"
+    speed: str = "speed"
+    push: str = "force"
+
+
+PISTON_CHANNELS = AxisChannels()
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing about a log.
@@ -52,13 +71,15 @@ class Finding:
     fault: bool
 
 
-def examine(experiment: Experiment) -> tuple[Finding, ...]:
-    """Look a log over, before any model is fitted to it.
+def examine(experiment: Experiment, axis: AxisChannels = PISTON_CHANNELS) -> tuple[Finding, ...]:
+    """Find faults of a log before any model is fitted to it.
 
     Parameters
     ----------
     experiment : Experiment
         Its noise, where given, separates motion from noise.
+    axis : AxisChannels
+        What the log calls its motion and what drives it.
 
     Returns
     -------
@@ -79,23 +100,23 @@ def examine(experiment: Experiment) -> tuple[Finding, ...]:
     """
     log = experiment.trajectory
     checks = (
-        *(_check_has_motion(experiment), _check_position_speed(log), _check_work_sign(log), _check_command(log)),
-        *(_check_pressures(experiment), _check_sampling(log)),
+        *(_check_has_motion(experiment, axis), _check_position_speed(log, axis), _check_work_sign(log, axis)),
+        *(_check_command(log, axis), _check_pressures(experiment), _check_sampling(log, axis)),
     )
     found = [finding for check in checks for finding in check]
     return tuple(sorted(found, key=lambda f: not f.fault))
 
 
-def _check_has_motion(experiment: Experiment) -> Iterator[Finding]:
+def _check_has_motion(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
     """Find channels without motion."""
-    for name in ("position", "speed"):
+    for name in (axis.position, axis.speed):
         if name not in experiment.trajectory:
             continue
         y = experiment.trajectory[name]
         y, noise = y[np.isfinite(y)], experiment.noise.get(name, 0.0)
-        if y.size and not np.any(np.diff(y)) and (name == "position" or y[0] == 0):
+        if y.size and not np.any(np.diff(y)) and (name == axis.position or y[0] == 0):
             yield Finding(name, f"{name!r} is constant: without motion friction is unidentifiable", True)
-        elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == "position" and _is_white(y))):
+        elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == axis.position and _is_white(y))):
             message = f"{name!r} shows noise and no motion: log a run in which the drive moves"
             yield Finding(name, message, True)
 
@@ -113,11 +134,11 @@ def _is_white(y: Array) -> bool:
     return abs(float(e[1:] @ e[:-1])) < 3 / math.sqrt(e.size) * float(e @ e)
 
 
-def _check_position_speed(log: Trajectory) -> Iterator[Finding]:
+def _check_position_speed(log: Trajectory, axis: AxisChannels) -> Iterator[Finding]:
     """Find a speed that is not the slope of the position, in sign or in unit."""
-    if "position" not in log or "speed" not in log:
+    if axis.position not in log or axis.speed not in log:
         return
-    slope, speed = _position_slope(log), log["speed"]
+    slope, speed = _position_slope(log, axis), log[axis.speed]
     known = np.isfinite(slope) & np.isfinite(speed)
     slope, speed = slope[known], speed[known]
     power = math.sqrt(float(slope @ slope) * float(speed @ speed))
@@ -125,24 +146,26 @@ def _check_position_speed(log: Trajectory) -> Iterator[Finding]:
         return
     ratio = float(speed @ slope) / float(slope @ slope)
     if ratio < 0:
-        yield Finding("speed", "position and speed run against each other: change the sign of one", True)
+        message = f"{axis.position} and {axis.speed} run against each other: change the sign of one"
+        yield Finding(axis.speed, message, True)
     elif not SPEED_SLOPE_RATIOS[0] < ratio < SPEED_SLOPE_RATIOS[1]:
-        yield Finding("speed", f"speed is {ratio:.3g} times the slope of the position: check both units", True)
+        message = f"{axis.speed} is {ratio:.3g} times the slope of the {axis.position}: check both units"
+        yield Finding(axis.speed, message, True)
 
 
-def _check_work_sign(log: Trajectory) -> Iterator[Finding]:
-    """Find a force or pressures of the wrong sign: a drive does net work against friction once the load is back."""
-    motion = _motion_speed(log)
+def _check_work_sign(log: Trajectory, axis: AxisChannels) -> Iterator[Finding]:
+    """Find a force, torque or pressures of the wrong sign: a drive does net work on a load that comes back."""
+    motion = _motion_speed(log, axis)
     if motion is None:
         return
-    drives = {"force": ("the force brakes", "'force'")}
+    drives = {axis.push: (f"the {axis.push} brakes", f"'{axis.push}'")}
     if "pressure_a" in log and "pressure_b" in log:
         drives["pressures"] = ("the pressures brake", "the position, or exchange pressure_a and pressure_b")
     for name, (message, remedy) in drives.items():
-        if name == "force" and name not in log:
+        if name == axis.push and name not in log:
             continue
-        if name == "force":
-            share = _work_share(log.t, log["force"], motion, centred=False)
+        if name == axis.push:
+            share = _work_share(log.t, log[name], motion, centred=False)
         else:
             pushes = (log["pressure_a"] - ratio * log["pressure_b"] for ratio in ROD_AREA_RATIOS)
             share = max(_work_share(log.t, push, motion, centred=True) for push in pushes)
@@ -151,9 +174,9 @@ def _check_work_sign(log: Trajectory) -> Iterator[Finding]:
             yield Finding(name, f"{why}: change the sign of {remedy}", True)
 
 
-def _check_command(log: Trajectory) -> Iterator[Finding]:
+def _check_command(log: Trajectory, axis: AxisChannels) -> Iterator[Finding]:
     """Find a piston that runs against its valve's command, or without one."""
-    motion = _motion_speed(log)
+    motion = _motion_speed(log, axis)
     if motion is None or "valve_voltage" not in log:
         return
     known = np.isfinite(motion) & np.isfinite(log["valve_voltage"])
@@ -218,7 +241,7 @@ def _check_pressures(experiment: Experiment) -> Iterator[Finding]:
             yield Finding(name, f"{message}; is an absolute sensor read as bar(g)?", True)
 
 
-def _check_sampling(log: Trajectory) -> Iterator[Finding]:
+def _check_sampling(log: Trajectory, axis: AxisChannels) -> Iterator[Finding]:
     """Find jitter, clipping and coarse resolution."""
     steps = np.diff(log.t)
     usual = float(np.median(steps))
@@ -235,20 +258,20 @@ def _check_sampling(log: Trajectory) -> Iterator[Finding]:
                     f"{share:.0%} of the samples of {name!r} have exactly its {which} value: is the sensor clipped?"
                 )
                 yield Finding(name, message, False)
-        if name in ("position", "speed") and 2 < levels < min(50, y.size // 4):
+        if name in (axis.position, axis.speed) and 2 < levels < min(50, y.size // 4):
             message = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
             yield Finding(name, message, False)
 
 
-def _motion_speed(log: Trajectory) -> Array | None:
+def _motion_speed(log: Trajectory, axis: AxisChannels) -> Array | None:
     """The speed as logged, else the slope of the position; None without either."""
-    return log["speed"] if "speed" in log else _position_slope(log) if "position" in log else None
+    return log[axis.speed] if axis.speed in log else _position_slope(log, axis) if axis.position in log else None
 
 
-def _position_slope(log: Trajectory) -> Array:
+def _position_slope(log: Trajectory, axis: AxisChannels) -> Array:
     """Speed from the position over a window of a hundredth of the log, at least five samples."""
     half = max(2, len(log) // 200)
-    t, y = log.t, log["position"]
+    t, y = log.t, log[axis.position]
     slope = np.full(len(t), np.nan)
     slope[half:-half] = (y[2 * half :] - y[: -2 * half]) / (t[2 * half :] - t[: -2 * half])
     return slope

@@ -20,7 +20,8 @@ class LoadDependent:
     """A base model whose Coulomb and static levels rise with the transmitted force F: + coulomb_load |F|, |F| smooth.
 
     ``|F| = sqrt(F^2 + load_rounding^2) - load_rounding``: zero without load, and never more than the true size. F is
-    what drives the load, the input of a `ForceDrive`. Gears of servos: coulomb_load 0.01 to 0.2.
+    what drives the load: the input of a `ForceDrive`, the torque of a `RotaryDrive`. Gears of servos: coulomb_load
+    0.01 to 0.2.
 
     Source: Hamon, Gautier, Garrec, Dynamic identification of robots with a dry friction model depending on load and
     velocity, IROS 2010.
@@ -55,7 +56,7 @@ class LoadDependent:
     def excitation(self) -> Excitation:
         """Loads that differ, and what the base needs."""
         words = "log sliding under a load that is known and large: a weight lifted and lowered, or a spring"
-        others = FRICTION_LEVELS | {"viscous", "load.mass"}
+        others = FRICTION_LEVELS | {"viscous", "load.mass", "load.inertia"}
         return Excitation(runs=(SeparatingRun(frozenset({"coulomb_load"}), others, words),)) | self.base.excitation
 
     @property

@@ -89,7 +89,8 @@ VISCOUS_EXCITATION = Excitation(
     ),
 )
 COULOMB_EXCITATION = (
-    Excitation({}, (SeparatingRun(CONSTANT_FORCES, FRICTION_LEVELS, "log both directions"),)) | VISCOUS_EXCITATION
+    Excitation({}, (SeparatingRun(CONSTANT_FORCES, FRICTION_LEVELS, "log both directions"),), smoothing="smoothing")
+    | VISCOUS_EXCITATION
 )
 STRIBECK_EXCITATION = COULOMB_EXCITATION | Excitation(
     {

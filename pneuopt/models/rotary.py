@@ -36,7 +36,8 @@ class RotaryDrive:
     """An inertia and friction turned by a known torque: J dw/dt = T - T_f(w) - T_L.
 
     Input: torque [N*m]. States and outputs: angle [rad] and speed [rad/s]; a friction law's states follow. Friction
-    laws are those of sliding with newtons read as newton metres and metres as radians.
+    laws are those of sliding with newtons read as newton metres and metres as radians; the force that a law depends on
+    (`LoadDependent`) is the torque.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ class RotaryDrive:
     friction: FrictionModel = field(default_factory=Coulomb)
 
     def __post_init__(self) -> None:
-        needed = ", ".join(q.name for q in self.friction.inputs)
+        needed = ", ".join(q.name for q in self.friction.inputs if q.name != "force")
         require(not needed, f"{type(self.friction).__name__} needs {needed}, which a rotary axis has not", ModelError)
 
     @property
@@ -69,16 +70,17 @@ class RotaryDrive:
 
     def system(self) -> System:
         """Wire the parts."""
-        inner = tuple(_turning_state(q) for q in self.friction.states)
+        states = (ANGLE, SPEED, *(_turning_state(q) for q in self.friction.states))
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
-            force = self.friction.force(x["speed"], without_prefix(x, "friction"), {}, without_prefix(p, "friction"))
+            inner, own, load = without_prefix(x, "friction"), without_prefix(p, "friction"), {"force": u["torque"]}
+            force = self.friction.force(x["speed"], inner, load, own)
             acceleration = (u["torque"] - force.value - p["load.torque"]) / p["load.inertia"]
             rates = {f"friction.{n}": rate for n, rate in force.rates.items()}
             return {"angle": x["speed"], "speed": acceleration, **rates}, {n: x[n] for n in ("angle", "speed")}
 
         starts = _RotaryStarts(self.friction)
-        system = define((ANGLE, SPEED, *inner), (TORQUE,), (ANGLE, SPEED), self.parameters, rhs, starts)
+        system = define(states, (TORQUE,), (ANGLE, SPEED), self.parameters, rhs, starts)
         excitation = self.friction.excitation.with_prefix("friction") | _LOAD_EXCITATION
         return replace(system, axis=Axis("angle", "speed", "load.inertia", "N*m"), excitation=excitation)
 

@@ -160,7 +160,7 @@ class _LevenbergMarquardt:
     def _run_stages(self) -> Status:
         if self.required_substeps > self.min_substeps:
             verdict = f"the model is so stiff that a sample takes {self.required_substeps} integration steps"
-            remedy = "smooth its sharpest term (friction.smoothing to 1e-4 m/s), or give LeastSquares(substeps=)"
+            remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
             return Status(Code.NOT_CONVERGED, (verdict, remedy))
         last, allowed = self.method.stages[-1], None
         for stage in self.method.stages:

@@ -143,9 +143,9 @@ def test_a_log_that_contradicts_itself_is_refused() -> None:
 
 def test_a_still_window_among_moving_ones_is_no_fault() -> None:
     still = log_with(position=np.full(100, 0.5))
-    check_content([log_with(), replace(still, name="b")])
+    check_content(RIG.system(), [log_with(), replace(still, name="b")])
     with pytest.raises(LogError, match="b: 'position' is constant"):
-        check_content([replace(still, name="b")])
+        check_content(RIG.system(), [replace(still, name="b")])
 
 
 def test_what_a_model_doubts_is_warned_of_and_stands_in_the_status() -> None:

@@ -12,10 +12,12 @@ from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime
 from pneuopt.files.drive import read_drive
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import read_log
+from pneuopt.identification.review import smoothing_advice
+from pneuopt.logs.experiments import Experiment, read_log
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent
+from pneuopt.models.load_dependent import LoadDependent
 from pneuopt.models.rotary import RotaryDrive
-from pneuopt.quantities.errors import ModelError
+from pneuopt.quantities.errors import LogError, ModelError
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import tune
 
@@ -96,6 +98,42 @@ def test_advice_speaks_in_the_axis_units() -> None:
 def test_a_friction_that_needs_pressures_is_refused() -> None:
     with pytest.raises(ModelError, match="needs pressure_a, pressure_b, which a rotary axis has not"):
         RotaryDrive(PressureDependent(Coulomb()))
+
+
+def test_the_torque_is_the_load_of_load_dependent_friction() -> None:
+    drive = RotaryDrive(LoadDependent(Coulomb()))
+    truth = {**TRUTH, "friction.coulomb_load": 0.1, "friction.load_rounding": 0.02}
+    parameters = drive.parameters.with_values(truth)
+    assert parameters["friction.load_rounding"].unit == "N*m"
+    t = np.arange(2000) * 1e-3
+    torque = 0.9 * np.sin(2 * np.pi * 1.5 * t) + 0.6 * np.sin(2 * np.pi * 4.3 * t)
+    run = simulate(drive.system(), Trajectory(t, {"torque": torque}), parameters)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(t.size)
+    log = Experiment(Trajectory(t, {"torque": torque, "angle": run["angle"] + noise}))
+    known = drive.parameters.with_values({"load.inertia": 2e-3, "friction.load_rounding": 0.02})
+    fit = identify(drive.system(), [log], known.freed("friction.coulomb", "friction.viscous", "friction.coulomb_load"))
+    for name in ("friction.coulomb", "friction.coulomb_load"):
+        assert fit.parameters.value(name) == pytest.approx(truth[name], rel=0.05)
+
+
+def test_the_log_of_a_shaft_is_checked_in_its_own_channels(servo: tuple[RotaryDrive, IdentificationResult]) -> None:
+    drive, fit = servo
+    run = next(iter(fit.trajectories.values()))
+    torque = 0.5 * np.sin(2 * np.pi * 1.5 * run.t) + 0.25 * np.sin(2 * np.pi * 4.3 * run.t)
+    turned = Experiment(Trajectory(run.t, {"torque": -torque, "angle": run["angle"], "speed": run["speed"]}))
+    with pytest.raises(LogError, match=r"the torque brakes the motion on balance .* change the sign of 'torque'"):
+        identify(drive.system(), [turned], fit.parameters)
+    against = Experiment(Trajectory(run.t, {"torque": torque, "angle": -run["angle"], "speed": run["speed"]}))
+    with pytest.raises(LogError, match="angle and speed run against each other: change the sign of one"):
+        identify(drive.system(), [against], fit.parameters)
+
+
+def test_advice_on_smoothing_is_in_the_axis_units() -> None:
+    system = RotaryDrive().system()
+    assert system.excitation.smoothing == "friction.smoothing"
+    advice = smoothing_advice(system, system.parameters)
+    assert advice.startswith("if the logs stick, try friction.smoothing = 0.01 rad/s in place of 0.1 rad/s")
+    assert smoothing_advice(system, system.parameters.with_values({"friction.smoothing": 0.01})) == ""
 
 
 def test_friction_laws_are_those_of_sliding_in_units_of_turning() -> None:
