@@ -1,9 +1,9 @@
 """`Front`: the designs between two requirements, found by epsilon constraint.
 
-The first requirement is minimised for a row of limits on the second, from the design that is best by the first to the
-one that is best by the second, which two full tunings find. Each design is the start of its neighbours', in both
-directions, so that a branch of local minima that one end leads into is left for the other's; a design that another
-beats, or one of many points spread over the gains' box, is searched for again from there.
+The first requirement is minimised under a row of limits on the second, between the design that is best by the first and
+the one that is best by the second; two full tunings find these ends. Each design is a start for both of its neighbours,
+so that the better of the two branches of local minima, one from either end, is kept. Where another design, or one of
+many points spread over the gains' box, is better within a design's limit, that design is searched for again from there.
 """
 
 import time
@@ -36,13 +36,21 @@ from pneuopt.tuning.search import Search, end_point
 if TYPE_CHECKING:
     import pandas as pd
 
-LOG_SPACING_RATIO = 8.0  # ratio of the ends from which on the limits lie evenly in the logarithm
-MAX_IMPROVEMENT_ROUNDS = 2  # of searching again for designs that others beat
-RIVAL_SAMPLES = 2000  # points at which all requirements are read: branches that neither end leads to
-MIN_IMPROVEMENT = 1e-3  # relative, by which another design has to be better
-SECONDARY_WEIGHT = (
-    1e-3  # weight of the other requirement at an end: of designs that are equally good, the best by the other
-)
+# Ratio of the ends from which on the limits lie evenly in the logarithm. With a larger one a wide front has one design
+# in its lowest decade; with a smaller one the limits of a narrow front are needlessly uneven.
+LOG_SPACING_RATIO = 8.0
+# Rounds of searching again for designs that others beat. Fewer leave such designs in the table; each more costs a
+# search for each of them.
+MAX_IMPROVEMENT_ROUNDS = 2
+# Points at which all requirements are read in search of branches that neither end leads to. Fewer miss branches; each
+# more costs a simulation of every case.
+RIVAL_SAMPLES = 2000
+# Relative improvement from which another design counts as better. A smaller one repeats searches for rounding; a larger
+# one leaves designs in the table that another beats.
+MIN_IMPROVEMENT = 1e-3
+# Weight of the other requirement at an end, relative to the one that is best there. At zero, an arbitrary one is taken
+# of designs that are equally good by the first; a larger one moves the end inwards.
+SECONDARY_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +60,11 @@ class Design:
     Attributes
     ----------
     limit : float
-        On the second requirement, as `read` gives it.
+        On the second requirement, as `Specification.limit` counts.
     result : TuningResult or None
-        None: not reached.
+        None: not yet searched for.
     seconds, solver_seconds : float
+        Time spent on it, and in the solver [s].
     """
 
     limit: float
@@ -87,7 +96,7 @@ class Front:
     designs: list[Design] = field(default_factory=list)
 
     def find_designs(self, points: int) -> None:
-        """All designs; again where one between the ends shows that an end was none."""
+        """Find all designs; repeat with new ends where a design between them is better than an end."""
         self.designs = [Design(nan)] * points
         for k, q in ((0, self.first), (-1, self.second)):
             self.designs[k] = self._find_end(q)
@@ -120,7 +129,7 @@ class Front:
         )
 
     def _fill_between(self, ends: list[Design], points: int) -> None:
-        """What lies between the ends."""
+        """Find the designs between two ends."""
         high, low = ends[0].limit, ends[1].limit
         if high <= low * (1 + MIN_IMPROVEMENT):
             self.designs = ends[:1]
@@ -138,13 +147,13 @@ class Front:
                     self._improve(k, better)
 
     def to_frame(self) -> "pd.DataFrame":
-        """What there is so far."""
+        """The table of the designs found so far; see `pareto_front`."""
         import pandas as pd
 
         return pd.DataFrame([self._row(design) for design in self.designs])
 
     def _find_end(self, requirement: Requirement, start: TuningResult | None = None) -> Design:
-        """The best by one requirement, and of many such by the other."""
+        """Find the design that is best by one requirement; among equals the one that is best by the other."""
         begun, pair = time.perf_counter(), (self.first, self.second)
         weights = {q: self._weight(q) * (1.0 if q is requirement else SECONDARY_WEIGHT) for q in pair}
         spec = replace(
@@ -166,7 +175,7 @@ class Front:
         return Design(limit, result, time.perf_counter() - begun)
 
     def _weight(self, requirement: Requirement) -> float:
-        """That makes a requirement of the order of the horizon, as the searches' penalties are."""
+        """The weight that scales a requirement to the size of the horizon, as the searches' penalties are."""
         horizon = min(r.horizon - r.at for r in self.base_search.task.references)
         return (
             horizon / self._requirement_scales[metric_name(requirement)]
@@ -176,19 +185,19 @@ class Front:
 
     @cached_property
     def _requirement_scales(self) -> dict[str, float]:
-        """What the requirements come to with the given gains; 0 where that is unknown."""
+        """The requirements' values with the given gains; 0 where they are infinite or not positive."""
         space = self.base_search.space
         found = to_records(self.base_search.simulator.values(space.start[None], self.base_search.spec))[0]
         return {n: v if np.isfinite(v) and v > 0 else 0.0 for n, v in found.items()}
 
     def _constrain_second(self, limit: float) -> Specification:
-        """The first requirement to be minimised, the second held."""
+        """The specification that minimises the first requirement under a limit on the second."""
         others = tuple(q for q in self.base_search.spec.limits if metric_name(q) != metric_name(self.second))
         weights = {self.first: self._weight(self.first)}
         return replace(self.base_search.spec, weights=weights, limits=(*others, with_upper_limit(self.second, limit)))
 
     def _follow(self, path: LimitPath) -> None:
-        """With a solver along the limits; where what is found does not survive printing, again with more margin."""
+        """Solve for all designs along the limits; those that rounding makes infeasible again with more margin."""
         todo = list(range(1, len(self.designs) - 1))
         for margin in self._margins:
             asked = [self._search_for(k, self.base_search.method) for k in todo]
@@ -200,19 +209,19 @@ class Front:
 
     @property
     def _margins(self) -> tuple[float, ...]:
-        """Of the limits, one after the other where a design does not survive printing."""
+        """Margins of the limits, the next one for designs that rounding makes infeasible."""
         return tuple(self.base_search.method.margin * factor for factor in (1, 2, 4))
 
     @cached_property
     def _path(self) -> LimitPath | None:
-        """The problem, prepared once, of which all designs are solutions; None where each is a search of its own."""
+        """The problem, prepared once, whose solutions are the designs; None where each design needs a search."""
         search = self._search_for(1, self.base_search.method)
         return search.method.limit_path(search.task, search.tighten(search.method.margin))
 
     def _track(self, path: LimitPath, specs: Sequence[Specification]) -> list[Solution]:
-        """From the first end; where the other end is on another branch, from there, too, and the better.
+        """Follow the solutions from the first end, and from the second where that one lies on a better branch.
 
-        Two tracks that agree next to the second end are one.
+        Next to the second end the two are compared; if they agree, there is one branch, and the first track stands.
         """
         space, ends = self.base_search.space, [d.result for d in (self.designs[0], self.designs[-1]) if d.result]
         starts = [end_point(result, space) for result in ends]
@@ -227,13 +236,14 @@ class Front:
         return found
 
     def _certify(self, k: int, search: Search, solution: Solution, margin: float) -> None:
+        """Certify a solution as design k."""
         begun, old, spent = time.perf_counter(), self.designs[k], solution.stats["seconds"]
         result = self._round_and_certify(search, solution, margin)
         seconds = old.seconds + spent + time.perf_counter() - begun
         self.designs[k] = replace(old, result=result, seconds=seconds, solver_seconds=old.solver_seconds + spent)
 
     def _round_and_certify(self, search: Search, solution: Solution, margin: float) -> TuningResult:
-        """A solution as printed, with its certificate."""
+        """Round a solution's gains and certify them."""
         if solution.status.code is Code.INTERRUPTED:
             raise KeyboardInterrupt
         point = np.array([solution.parameters.value(n) for n in search.space.names])
@@ -246,10 +256,11 @@ class Front:
         )
 
     def _search_for(self, k: int, method: Method) -> Search:
+        """The search for design k."""
         return self.base_search.with_specification(self._constrain_second(self.designs[k].limit), method)
 
     def _improve(self, k: int, start: Array | None) -> None:
-        """Search for a design from given gains; the better stays."""
+        """Search for design k from given gains; it replaces the present one if it is better."""
         begun, old, path = time.perf_counter(), self.designs[k], self._path
         if path is not None and start is not None:
             result, spent = self._resolve(path, k, start)
@@ -267,7 +278,14 @@ class Front:
         )
 
     def _resolve(self, path: LimitPath, k: int, start: Array) -> tuple[TuningResult, float]:
-        """The solver's answer from given gains, with more margin where it does not survive printing; its seconds."""
+        """Solve for design k from given gains, with more margin where rounding makes it infeasible.
+
+        Returns
+        -------
+        result : TuningResult
+        seconds : float
+            Time in the solver [s].
+        """
         search, spent, result = self._search_for(k, self.base_search.method), 0.0, None
         for margin in self._margins:
             (solution,) = path.follow(start, [search.tighten(margin)])
@@ -278,16 +296,18 @@ class Front:
         return result, spent
 
     def _is_better(self, one: TuningResult, other: TuningResult) -> bool:
+        """Whether a result is certified and the other is not, or is smaller by the first requirement."""
         if not one.status.converged or not other.status.converged:
             return one.status.converged
         return _result_value(one, self.first) < _result_value(other, self.first)
 
     def _gains(self, k: int) -> Array | None:
+        """The gains of design k, shape (n,); None where there is none yet."""
         result = self.designs[k].result
         return None if result is None else end_point(result, self.base_search.space)
 
     def _rival(self, k: int) -> Array | None:
-        """The gains of what beats a design within its limit, another design or a sampled point; None without."""
+        """The gains of another design or sampled point that beats design k within its limit; None if there is none."""
         design, space = self.designs[k], self.base_search.space
         spec, own = self._constrain_second(design.limit), np.inf
         if design.result is not None and design.result.status.converged:
@@ -307,12 +327,13 @@ class Front:
 
     @cached_property
     def _samples(self) -> tuple[Array, list[dict[str, float]]]:
-        """Points spread over the gains' box, and what the requirements read there."""
+        """Points spread over the gains' box, and the requirements' values there."""
         space, rng = self.base_search.space, np.random.default_rng(0)
         points = space.from_unit(first_population(RIVAL_SAMPLES, space.to_unit(space.start), rng))
         return points, to_records(self.base_search.simulator.values(points, self.base_search.spec))
 
     def _row(self, design: Design) -> dict[str, Any]:
+        """A row of `pareto_front`'s table."""
         result, pair, space = design.result, (self.first, self.second), self.base_search.space
         good = result is not None and result.status.converged
         columns = {"": "certified", "claimed ": "claimed"}
@@ -329,37 +350,40 @@ class Front:
 
 
 def _result_of(design: Design) -> TuningResult:
+    """The result of a design that has one."""
     assert design.result is not None
     return design.result
 
 
 def _check_interruption(result: TuningResult) -> TuningResult:
-    """The same; Ctrl-C, which a search turns into its best so far, ends a front."""
+    """Raise KeyboardInterrupt for a search that Ctrl-C ended with its best so far, so that the front ends, too."""
     if result.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     return result
 
 
 def _count_successes(designs: Sequence[Design]) -> int:
-    """How many of them are certified."""
+    """How many designs are certified."""
     return sum(_design_status(design).converged for design in designs)
 
 
 def _design_status(design: Design) -> Status:
+    """The status of a design's result; interrupted where there is none yet."""
     return Status(Code.INTERRUPTED) if design.result is None else design.result.status
 
 
 def _solution_cost(solution: Solution) -> float:
-    """The objective; inf where it is no solution."""
+    """The objective of a solution; infinite where the solver did not converge."""
     return solution.stats["cost"] if solution.status.converged else np.inf
 
 
 def _result_value(result: TuningResult, requirement: Requirement) -> float:
-    """The certified figure as `read` gives it, so that smaller is better."""
-    return user_value(requirement, float(result.requirements["certified"][metric_name(requirement)]))  # its own inverse
+    """The certified figure as a search counts it: smaller is better, a margin as its reciprocal."""
+    figure = float(result.requirements["certified"][metric_name(requirement)])
+    return user_value(requirement, figure)  # the conversion is the same in both directions
 
 
 def _limit_grid(high: float, low: float, points: int) -> list[float]:
-    """Limits from high to low, evenly or, where the ends are far apart, evenly in the logarithm."""
+    """Limits from high to low at even distances, or at even ratios where the ends are far apart."""
     even = np.geomspace if low > 0 and high / low > LOG_SPACING_RATIO else np.linspace
     return [float(v) for v in even(high, low, points)]

@@ -39,18 +39,18 @@ def pareto_front(
     method: Method | None = None,
     progress: ProgressCallback | None = None,
 ) -> "pd.DataFrame":
-    """Designs that are best by one requirement for what they are by another.
+    """Tune for every compromise between two requirements: designs none of which is better than another by both.
 
     Parameters
     ----------
     loop, references, parameters, subject_to, scenarios, method, progress
         As for `tune`.
     minimise : (Requirement, Requirement)
-        Two kinds; a bound of theirs is a limit as well, that of the second where the front begins.
+        Two kinds; a bound of theirs is a limit as well, and with that of the second the front begins.
     points : int
-        Designs, the two ends included; at least 2.
+        Number of designs, the two ends included; at least 2.
     until : float, optional
-        The bound of the second with which the front ends; by default the best that it can be.
+        The bound of the second with which the front ends; by default the best value that it can have.
 
     Returns
     -------

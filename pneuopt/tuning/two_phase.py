@@ -1,4 +1,4 @@
-"""`TwoPhase`: exact tuning of a linear loop; the settling time is the free duration of a multiple-shooting problem."""
+"""`TwoPhase`: exact tuning of a linear loop; its settling time is a free duration of a multiple-shooting problem."""
 
 import math
 from collections.abc import Sequence
@@ -29,29 +29,39 @@ from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue
 from pneuopt.tuning.two_phase_transcription import BAND_PARAMETER, transcribe_two_phase, without_clip
 
-MAX_STEPS_A_SEGMENT = 12  # between two nodes; the paper's loop takes 3, a lag with dead time and wide bounds 50
-EXACT_PEAK_MARGIN = 1 / 300  # share of the margin for peaks of command and sensitivity: an exact problem misses none
-# On these the average of a linear loop does not depend.
+# RK4 steps between two nodes up to which the method is chosen. A lower number leaves loops to the screening that are
+# solved in seconds (the published one takes 3 steps); with a higher one the problem takes minutes (50 steps: a lag with
+# dead time and wide bounds).
+MAX_STEPS_A_SEGMENT = 12
+# Share of the margin that limits on peaks of command and sensitivity are tightened by. With less, rounding the gains
+# breaks them; more gives performance away, for the exact problem misses no peak.
+EXACT_PEAK_MARGIN = 1 / 300
+# Parameters on which the average of a linear loop does not depend.
 PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
-OPTIMA_TOLERANCE = 1e-3  # relative difference of two optima that count as one
+# Relative difference of two objectives below which starts agree. A smaller one counts the solver's tolerance as another
+# optimum; a larger one hides local optima.
+OPTIMA_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class TwoPhase:
-    """Solve the two-phase problem by full-space multiple shooting from several starts. For linear, continuous loops.
+    """Tune a linear, continuous loop exactly: solve the two-phase problem by multiple shooting from several starts.
 
     Parameters
     ----------
     nodes : tuple of int
         Shooting nodes of the transient and of the settled phase.
     margin : float
-        How much tighter the problem's limits are than those asked for; an optimum without it grazes the band.
+        How much tighter the problem's limits are than those asked for, a fraction; without it an optimum's response
+        touches the band.
     starts : int
-        The given gains, then random ones within the bounds.
+        Number of starts: the given gains, then random ones within the bounds.
     seed : int
+        Of the random numbers.
     digits : int, optional
         Significant digits of the gains handed out; None: all.
     solver : FullSpace
+        Settings of the interior-point solver.
     """
 
     nodes: tuple[int, int] = (40, 50)
@@ -72,11 +82,11 @@ class TwoPhase:
 
     @property
     def successor(self) -> Screening:
-        """A search by simulation: the exact problem keeps its band at its nodes only."""
+        """A search by simulation, for the exact problem keeps the response in the band at its nodes only."""
         return Screening()
 
     def check(self, task: TuningTask) -> None:
-        """Refuse what the problem has no equation for: `InputError` names it and the remedy."""
+        """Refuse loops that are not linear, scenarios and requirements without an equation, by an `InputError`."""
         message = (
             "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()"
         )
@@ -86,7 +96,7 @@ class TwoPhase:
         require(not inexact, f"TwoPhase has no equation for {', '.join(inexact)}; use method=Screening()")
 
     def suits(self, task: TuningTask) -> bool:
-        """For a linear loop on one plant that no clip can hold back, if there are equations for all that is asked."""
+        """Whether the loop is linear, not clipped and without scenarios, and all that is asked for has an equation."""
         clip = clip_level(task.loop, task.space.parameters)
         clipped = clip < math.inf and not task.spec.limit(PeakControl) < clip  # designs that saturate are as welcome
         can = is_linear(task.loop) and not clipped and not task.scenarios and not _inexact_requirements(task.spec)
@@ -101,7 +111,7 @@ class TwoPhase:
         attempt: int,
         progress: ProgressCallback,
     ) -> SearchResult:
-        """The best optimum of the starts; see `Method.find`."""
+        """Solve from every start and return the best optimum; see `Method.find`."""
         method = self if attempt == 0 else replace(self, starts=1)
         space = Space(task.space.parameters_at(start), task.space.names)
         optima = solve_two_phase(task.loop, task.references, space, spec, method, progress)
@@ -117,17 +127,17 @@ class TwoPhase:
         return SearchResult(point, best.status, tuple(best.multipliers), stats)
 
     def shorten(self, margin: float) -> "TwoPhase":
-        """A short search, from a point that is close."""
+        """The method for a short search from a point that is close."""
         return replace(self, starts=2, margin=margin, solver=replace(self.solver, max_iterations=150))
 
     def limit_path(self, task: TuningTask, spec: Specification) -> "TwoPhasePath":
-        """The problem, differentiated once, whose limits and settling band then move."""
+        """The problem, prepared once, to be solved for moving limits and settling bands."""
         return two_phase_path(task.loop, task.references, task.space, spec, self)
 
 
 @dataclass(frozen=True, eq=False)
 class Optima:
-    """What the starts ended in: the best, and how many of them agree with it."""
+    """The best solution of several starts, the number of starts that converged, and of those that agree with it."""
 
     best: Solution
     starts: int
@@ -136,7 +146,7 @@ class Optima:
 
 
 def is_linear(loop: ClosedLoop) -> bool:
-    """Whether the loop, its clip aside, is a linear ODE: no state and no input is in its Jacobian."""
+    """Whether the loop without its clip is a linear ODE: its Jacobian depends on neither states nor inputs."""
     if loop.pid.sample_time is not None:
         return False
     ode = without_clip(loop).system().ode
@@ -146,7 +156,7 @@ def is_linear(loop: ClosedLoop) -> bool:
 
 
 def has_few_steps(loop: ClosedLoop, references: Sequence[Step], space: Space, method: TwoPhase) -> bool:
-    """Whether the steps between two nodes are few; with many the problem takes minutes, where a screening takes one."""
+    """Whether few enough RK4 steps lie between two nodes for the problem to take less time than a screening."""
     own = Space(space.parameters, tuple(n for n in space.names if n not in ("pid.Tt", "pid.lower", "pid.upper")))
     rate = fastest_eigenvalue(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))]).max()
     longest = max(r.horizon for r in references) / min(method.nodes)
@@ -154,6 +164,7 @@ def has_few_steps(loop: ClosedLoop, references: Sequence[Step], space: Space, me
 
 
 def _inexact_requirements(spec: Specification) -> list[str]:
+    """The names of requirements for which the two-phase problem has no equation."""
     return [n for n in spec.kinds if not METRICS[n].exact]
 
 
@@ -163,9 +174,9 @@ def solve_two_phase(
     space: Space,
     spec: Specification,
     method: TwoPhase,
-    tell: ProgressCallback,
+    report_progress: ProgressCallback,
 ) -> Optima:
-    """Solve from every start; `tell` hears of each.
+    """Solve the two-phase problem from every start; `report_progress` receives a line of text a start.
 
     Raises
     ------
@@ -181,7 +192,7 @@ def solve_two_phase(
         gains = dict(zip(space.names, point.tolist(), strict=True))
         found.append(solve_from(problem, parameters.with_values(gains)))
         value, ended = _objective_value(found[-1]), found[-1].status.code.value
-        tell(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
+        report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
     good = [s for s in found if s.status.converged]
     if not good:
         return Optima(min(found, key=lambda s: s.stats.get("largest_violation", math.inf)), len(found), 0, 0)
@@ -194,13 +205,13 @@ def solve_two_phase(
 
 @dataclass(frozen=True, eq=False)
 class TwoPhasePath:
-    """A two-phase problem to be solved for one set of limits after the other, all of the same kinds.
+    """A two-phase problem that is solved for one set of limits after the other, all of the same kinds.
 
     Parameters
     ----------
-    problem : Problem
+    problem : FullSpaceProblem
     names : tuple of str
-        The gains.
+        The names of the gains.
     band : float
         The settling band as transcribed.
     """
@@ -210,7 +221,7 @@ class TwoPhasePath:
     band: float
 
     def follow(self, start: Array, specs: Sequence[Specification]) -> list[Solution]:
-        """Solve for one after the other, the first from gains of shape (n,)."""
+        """Solve for one specification after the other, the first from gains of shape (n,), each from the one before."""
         parameters = self.problem.graph.transcription.parameters
         gains = dict(zip(self.names, start.tolist(), strict=True))
         path = [
@@ -223,10 +234,11 @@ class TwoPhasePath:
 def two_phase_path(
     loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
 ) -> TwoPhasePath:
-    """Prepare a problem whose limits and settling band will move; `spec` already tightened."""
+    """Prepare a problem whose limits and settling band are going to move; `spec` is already tightened."""
     transcription = transcribe_two_phase(loop, references, space, spec, method.nodes)
     return TwoPhasePath(prepare_full_space(transcription, method.solver, warm_start=True), space.names, spec.band)
 
 
 def _objective_value(solution: Solution) -> float:
+    """The objective that a solution reached."""
     return float(solution.stats["cost"])

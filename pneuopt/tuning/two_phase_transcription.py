@@ -34,16 +34,36 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Transcription, Where, regular_nodes
 from pneuopt.tuning.space import Space, fastest_eigenvalue, rk4_substeps
 
+# Requirements that the problem has an equation for, beside the settling time, which is its free duration.
 EXACT_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.exact and kind is not SettlingTime)
+# Upper bounds of the unknowns that stand for terms of the objective, as `Specification.limit` counts (fractions of the
+# step, the command's unit, 1). A smaller one may cut off the optimum; a far larger one scales the unknown badly.
 UNKNOWN_UPPER_BOUNDS = {"Overshoot": 10.0, "SteadyStateError": 10.0, "PeakControl": 1e6, "MaxSensitivity": 100.0}
-SETTLING_PARAMETER = "SettlingTime"
-BAND_PARAMETER = "band.share"  # of the settling band as transcribed: a number that a continuation may move
+SETTLING_PARAMETER = "SettlingTime"  # name of the unknown duration [s]
+BAND_PARAMETER = "band.share"  # name of the settling band's factor, 1 as transcribed; a continuation moves it
 
 
 def transcribe_two_phase(
     loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, nodes: tuple[int, int]
 ) -> Transcription:
-    """Write the two-phase problem; the references share one settling time, the worst of them."""
+    """Write the two-phase problem, in which the references share one settling time, the largest.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        A linear one.
+    references : sequence of Step
+    space : Space
+    spec : Specification
+        Already tightened.
+    nodes : tuple of int
+        Shooting nodes of the transient and of the settled phase.
+
+    Raises
+    ------
+    InputError
+        If the state before the step depends on the gains, or a mode is too fast for the nodes.
+    """
     free_loop = without_clip(loop)
     averaged = space.parameters.select(free_loop.parameters)
     if loop.dither:
@@ -66,9 +86,9 @@ def without_clip(loop: ClosedLoop) -> ClosedLoop:
 
 
 def _extra_unknowns(references: Sequence[Step], spec: Specification) -> ParameterSet:
-    """The settling time, an unknown for each further term of the objective, and a number for each other limit."""
+    """Parameters beside the loop's: the settling time, an unknown for each other term, a number for each other limit."""
     horizon = min(r.horizon - r.at for r in references)
-    most = min(spec.limit(SettlingTime), (1 - TAIL_SHARE) * horizon)  # in the rest a metric would not call it settled
+    most = min(spec.limit(SettlingTime), (1 - TAIL_SHARE) * horizon)  # metrics need the rest as the record's end
     free = spec.weight(SettlingTime) > 0
     given = {
         SETTLING_PARAMETER: Parameter(
@@ -88,6 +108,7 @@ def _extra_unknowns(references: Sequence[Step], spec: Specification) -> Paramete
 
 
 def _durations(references: Sequence[Step]) -> ParameterSet:
+    """The fixed durations [s]: of each reference before its step, and after it."""
     rest = {f"rest.{i}": Parameter(r.horizon - r.at, "s") for i, r in enumerate(references)}
     return ParameterSet(rest | {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0})
 
@@ -95,7 +116,7 @@ def _durations(references: Sequence[Step]) -> ParameterSet:
 def _extend_system(
     loop: ClosedLoop, extra: ParameterSet, space: Space, references: Sequence[Step], nodes: tuple[int, int]
 ) -> DiscreteSystem:
-    """The loop with the extra unknowns among its parameters, so that path limits may depend on them."""
+    """Discretise the loop with the extra unknowns among its parameters, so that path limits may depend on them."""
     system = loop.system()
     t, x, u, p = (ca.SX.sym(k, system.ode.size1_in(i)) for i, k in enumerate("txup"))
     more = ca.SX.sym("more", len(extra))
@@ -112,6 +133,7 @@ def _extend_system(
 
 
 def _reference_phases(loop: ClosedLoop, space: Space, i: int, reference: Step, nodes: tuple[int, int]) -> list[Phase]:
+    """The phases of reference i: before the step, where there is such a time, transient and settled."""
     start = _state_before_step(loop, space, reference)
     disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
     after = [disturbed.get(n, 0.0) for n in names(loop.inputs)[1:]]
@@ -128,6 +150,7 @@ def _reference_phases(loop: ClosedLoop, space: Space, i: int, reference: Step, n
 
 
 def _state_before_step(loop: ClosedLoop, space: Space, reference: Step) -> Array:
+    """The loop's state before the step, shape (n_states,); `InputError` where it depends on the gains."""
     first = loop.initial(space.parameters, reference=reference.initial, start=reference.start)
     for share in (0.3, 0.8):
         gains = space.parameters_at(space.from_unit(np.full(len(space.names), share)))
@@ -144,6 +167,7 @@ def _state_before_step(loop: ClosedLoop, space: Space, reference: Step) -> Array
 def _path_limits(
     loop: ClosedLoop, space: Space, spec: Specification, system: DiscreteSystem, i: int, reference: Step
 ) -> list[Limit]:
+    """The path limits of reference i: settling band, overshoot, steady-state error, peak command and clip."""
     t, x, u, p = (ca.SX.sym(k, system.step.size1_in(j)) for k, j in zip("txup", (0, 2, 3, 4), strict=True))
     y = system.step(t, 0, x, u, p)[1]
     outputs, at = names(system.outputs), list(system.parameters).index
@@ -157,7 +181,7 @@ def _path_limits(
         return Limit(name, ca.Function("limit", [t, x, u, p], [value]), lower, upper, where, phases)
 
     def upper_limits(kind: type, value: ca.SX, where: Where, phases: tuple[int, ...]) -> list[Limit]:
-        """Value and, where it has a sign, its negative, at most the limit or the unknown."""
+        """Hold values below the limit of their kind, or below the unknown that stands for it in the objective."""
         if not spec.concerns(kind):
             return []
         return [path_limit(kind.__name__, value - p[at(kind.__name__)], -math.inf, 0.0, where, phases)]
@@ -180,6 +204,7 @@ def _path_limits(
 def _sensitivity_limit(
     loop: ClosedLoop, averaged: ParameterSet, space: Space, spec: Specification, parameters: ParameterSet
 ) -> list[Limit]:
+    """The limit on the sensitivity's peak: Ms^2 |1 + L|^2 >= 1 at every frequency of a grid."""
     if not spec.concerns(MaxSensitivity):
         return []
     grid = np.unique(
@@ -198,13 +223,14 @@ def _sensitivity_limit(
 
 
 def _sensitivity_frequencies(loop: ClosedLoop, averaged: ParameterSet, point: Array, space: Space) -> Array:
-    """Frequencies around those of the loop's modes, where the sensitivity peaks."""
+    """Frequencies around the loop's modes, where the sensitivity peaks [rad/s]."""
     own = Space(averaged, space.names).parameters_at(point)
     full = frequency_grid(open_loop(loop, own), 40)
     return np.asarray(full[(full > 30 * full[0]) & (full < full[-1] / 30)], dtype=float)
 
 
 def _costs(spec: Specification, parameters: ParameterSet) -> tuple[Cost, ...]:
+    """The objective: a weighted sum of the unknowns that stand for its terms."""
     q = ca.SX.sym("q", len(parameters))
     terms = {kind.metric.name: spec.weight(kind) for kind in REQUIREMENT_KINDS if kind.metric.exact}
     return tuple(
