@@ -1,4 +1,4 @@
-"""Whether a tuning can have an answer at all: said before anything is searched for, with the number and the remedy."""
+"""`check_feasibility`: refuse a tuning that cannot have an answer before any search, with figure and remedy."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,18 +23,22 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 from pneuopt.tuning.space import Space
 
-STATIC_SIGN_FREQUENCY = 1e-3  # of 1/horizon, the frequency at which the plant's static sign is read
-BISECTION_STEPS = 10  # of the interval in which the fastest reachable reference is sought
+# Frequency at which the sign of the plant's static gain is read [rad per horizon]. A higher one may meet phase lag that
+# turns the sign; a lower one leaves the response of an integrating plant to rounding errors.
+STATIC_SIGN_FREQUENCY = 1e-3
+# Bisections for the largest part of a reference that can be held. Fewer make the message's figure coarse; each more
+# costs an equilibrium.
+BISECTION_STEPS = 10
 
 
 def check_feasibility(loop: ClosedLoop, every: Sequence[TuningCase], space: Space, spec: Specification) -> None:
-    """Refuse what no gains can mend.
+    """Refuse a tuning that no gains within the bounds can make feasible.
 
     Parameters
     ----------
     loop : ClosedLoop
-    every : sequence of Case
-        The nominal plant's first.
+    every : sequence of TuningCase
+        The nominal plant's cases first.
     space : Space
     spec : Specification
 
@@ -55,11 +59,13 @@ def check_feasibility(loop: ClosedLoop, every: Sequence[TuningCase], space: Spac
 
 
 def _check_dither(loop: ClosedLoop, space: Space) -> None:
+    """Check that the controller's samples resolve the dither's highest frequency."""
     if loop.dither is not None:
         loop.dither.check(highest_dither_frequency(loop, space.parameters), loop.pid.sample_time)
 
 
 def _check_horizon(reference: Step, spec: Specification) -> None:
+    """Check that a reference's record is long enough for the limits on times to be read."""
     record = reference.horizon - reference.at
     for q in spec.limits:
         if isinstance(q, SettlingTime | RiseTime) and upper_limit(q) > (1 - TAIL_SHARE) * record:
@@ -72,6 +78,7 @@ def _check_horizon(reference: Step, spec: Specification) -> None:
 
 
 def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
+    """Check that the least noise gain within the bounds keeps its limit."""
     Tf = _parameter_range(space, "pid.Tf")[1] + 0.5 * (loop.pid.sample_time or 0.0)  # as `linear_gains` has it
     least = _least_size(space, "pid.Kp") + (_least_size(space, "pid.Kd") / Tf if Tf else 0.0)
     message = (
@@ -81,7 +88,7 @@ def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
 
 
 def _check_travel(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
-    """That a piston led along the reference stays off the end stops."""
+    """Check that a piston that follows the reference stays clear of the end stops."""
     stops = [g for g in loop.plant.validity_limits if g.state == "position"]
     states = [q.name for q in loop.plant.states]
     if not stops or "position" not in states:
@@ -90,47 +97,47 @@ def _check_travel(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
     begin = float(case.initial(loop, space.parameters)[states.index("position")])
     for stop in stops:
         limit = stop.limit(own)
-        left = stop.side * (limit - begin)
+        room = stop.side * (limit - begin)
         if loop.feedback.name == "position":
             far, remedy = stop.side * (reference.final - begin), "take a smaller step"
         elif loop.feedback.name == "speed":
             lead, rest = stop.side * reference.initial * reference.at, reference.horizon - reference.at
             far = max(lead, lead + stop.side * reference.final * rest)
-            fits = (left - lead) / (stop.side * reference.final) if reference.final else inf
+            fits = (room - lead) / (stop.side * reference.final) if reference.final else inf
             early = f"end it by horizon = {reference.at + fits:.3g} s"
             remedy = f"{early}, or start elsewhere, start={{'position': ...}}" if fits > 0 else "start elsewhere"
         else:
             return
         where = "front" if stop.side > 0 else "rear"
         require(
-            far <= left,
+            far <= room,
             f"{_case_prefix(case)}it leads the piston over {write_value(far, 'm', 4)}, but from position "
-            f"{write_value(begin, 'm', 4)} to the {where} end stop there are {write_value(max(left, 0.0), 'm', 4)}; "
+            f"{write_value(begin, 'm', 4)} to the {where} end stop there are {write_value(max(room, 0.0), 'm', 4)}; "
             f"{remedy}",
         )
 
 
 def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
-    """That some command, one that the limits allow, holds the reference to within the settling band."""
+    """Check that a command within the limits holds the reference to within the settling band."""
     reference = case.reference
-    target = reference.final - spec.band * reference.size  # of a disturbance alone 0: what is to be held is known
+    target = reference.final - spec.band * reference.size  # the size is 0 for a disturbance alone
 
     def find_obstacle(share: float) -> str:
-        """What keeps a part of the reference from being held; empty: nothing."""
+        """The reason why a part of the reference cannot be held; empty where it can."""
         try:
             command = _holding_command(loop, case, space, share * target)
         except InputError as error:
             return str(error)
         return _describe_command_excess(loop, case, space, spec, command, share * target)
 
-    fault = find_obstacle(1.0)
-    if fault:
+    obstacle = find_obstacle(1.0)
+    if obstacle:
         low, high = 0.0, 1.0
         for _ in range(BISECTION_STEPS if not find_obstacle(0.0) else 0):
             middle = 0.5 * (low + high)
             low, high = (low, middle) if find_obstacle(middle) else (middle, high)
         most_held = f"; the most that can be held is {low * target:.3g} {loop.feedback.unit}" if low else ""
-        require(False, f"{_case_prefix(case)}{fault}{most_held}")
+        require(False, f"{_case_prefix(case)}{obstacle}{most_held}")
 
 
 def _holding_command(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> float:
@@ -142,7 +149,7 @@ def _holding_command(loop: ClosedLoop, case: TuningCase, space: Space, value: fl
 
 
 def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, value: float) -> tuple[Array, float]:
-    """The plant's state and the command with the measured signal at a value, as an integral action finds them."""
+    """The plant's state and the command at which an integral action holds the measured signal at a value."""
     own, acting = case.case_parameters(space.parameters), replace(loop, pid=PID(loop.pid.sample_time))
     own = own | ParameterSet({"pid.Ki": replace(acting.parameters["pid.Ki"], value=1.0)})
     start = {n: v for n, v in case.reference.start.items() if n == "position"}
@@ -152,6 +159,7 @@ def _find_operating_point(loop: ClosedLoop, case: TuningCase, space: Space, valu
 def _describe_command_excess(
     loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification, command: float, value: float
 ) -> str:
+    """The reason why a command that holds a value is not allowed; empty where it is."""
     own, unit = case.case_parameters(space.parameters), loop.command.unit
     takes = f"holding {value:.4g} {loop.feedback.unit} takes {command:.4g} {unit}"
     if loop.pid.limits:
@@ -160,16 +168,16 @@ def _describe_command_excess(
             return (
                 f"{takes}, the controller's limits are {low:g} and {high:g} {unit}; take a smaller step, or widen them"
             )
-    shaken = _least_size(space, "dither.amplitude")
-    if abs(command) + shaken > spec.limit(PeakControl):
-        beside = f" beside a dither of at least {shaken:g} {unit}" if shaken else ""
+    amplitude = _least_size(space, "dither.amplitude")
+    if abs(command) + amplitude > spec.limit(PeakControl):
+        beside = f" beside a dither of at least {amplitude:g} {unit}" if amplitude else ""
         most_allowed = f"PeakControl allows {spec.limit(PeakControl):g} {unit}"
         return f"{takes}{beside}, {most_allowed}; take a smaller step, or raise it"
     return ""
 
 
 def _check_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
-    """That not every loop allowed is positive feedback."""
+    """Check that the bounds allow gains of the sign that makes the feedback negative."""
     sign = _static_sign(loop, case, space)
     gains = {n: [sign * v for v in _parameter_range(space, n)] for n in ("pid.Kp", "pid.Ki", "pid.Kd", "pid.K")}
     best = {n: max(ends) for n, ends in gains.items()}
@@ -183,7 +191,7 @@ def _check_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
 
 
 def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
-    """Of the plant's response to a slow command, where it follows the reference; 0 where that is unknown."""
+    """The sign of the plant's response to a slow command at the reference's final value; 0 where it is unknown."""
     reference, own = case.reference, case.case_parameters(space.parameters)
     try:
         x, command = _find_operating_point(loop, case, space, reference.final)
@@ -195,7 +203,7 @@ def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
 
 
 def _parameter_range(space: Space, n: str) -> tuple[float, float]:
-    """Between what a parameter may lie, a fixed one at its value; (0, 0) where there is none."""
+    """The bounds of a free parameter, or twice the value of a fixed one; (0, 0) where the loop does not have it."""
     if n not in space.parameters:
         return 0.0, 0.0
     p = space.parameters[n]
@@ -203,10 +211,11 @@ def _parameter_range(space: Space, n: str) -> tuple[float, float]:
 
 
 def _least_size(space: Space, n: str) -> float:
-    """The least size that a parameter may have."""
+    """The least absolute value that a parameter may have."""
     low, high = _parameter_range(space, n)
     return 0.0 if low <= 0 <= high else min(abs(low), abs(high))
 
 
 def _case_prefix(case: TuningCase) -> str:
+    """The words with which a message about a case begins."""
     return f"reference {case.label}: "

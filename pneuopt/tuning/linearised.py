@@ -1,7 +1,7 @@
-"""Responses with their derivatives to the gains, as rows of a max-type problem in gains and settling time.
+"""`LinearisedProblem`: responses and their derivatives as rows of a minimax problem in gains and settling time.
 
-The settling time Ts is an unknown: from Ts on the averaged response shall lie within the band, so that for given gains
-the objective is smooth where the settling time itself jumps. Nodes after Ts move with it.
+The settling time Ts is an unknown: from Ts on the averaged response has to lie within the band. So the objective is
+smooth in the gains where the settling time itself jumps. Nodes after Ts move with it.
 """
 
 from collections.abc import Sequence
@@ -30,25 +30,34 @@ from pneuopt.tuning.sqp import LinearisedPoint, RowGroups
 
 ROW_REQUIREMENTS = tuple(kind for kind in REQUIREMENT_KINDS if kind.metric.slope is not None)
 SMOOTH_REQUIREMENTS: tuple[type[Requirement], ...] = (SettlingTime, *ROW_REQUIREMENTS, *ROBUSTNESS_REQUIREMENTS)
-"""What gradients are there for."""
-PROGRAM_BAND_PENALTY = 50.0  # what leaving the band by the whole step costs at least, times the objective's scale
-PROGRAM_LIMIT_PENALTY = 2.0  # what a limit missed by its whole size costs, times the same
-SETTLING_RADIUS_RATIO = 5.0  # trust region of Ts over that of the gains: with 1 it, not they, was what held steps back
-MAX_SENSITIVITY_LANES = 64  # that are run and read at a time
-DIFFERENCE_STEP = 1e-4  # of a gain's range: the sensitivity is differentiated over it
+"""Requirements of which there are derivatives to the gains."""
+# Least penalty of leaving the settling band by the whole step, over the objective's scale. With a smaller one leaving
+# the band pays; with a larger one a search stays in the first basin that it meets.
+PROGRAM_BAND_PENALTY = 50.0
+# Penalty of exceeding a limit by its own size, over the objective's scale; below and above as for the band.
+PROGRAM_LIMIT_PENALTY = 2.0
+# Trust region of Ts over that of the gains, both fractions of their ranges. At 1 the settling time, not the gains, held
+# steps back; far above it the linearisation in time fails first.
+SETTLING_RADIUS_RATIO = 5.0
+# Lanes with sensitivities that are run and read at a time. Fewer leave cores idle; more do not fit the cache.
+MAX_SENSITIVITY_LANES = 64
+# Step of the difference quotients of margins and rest, a fraction of a gain's range. A smaller one divides rounding
+# errors; a larger one linearises a curved function.
+DIFFERENCE_STEP = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class LinearisedResponse:
-    """What was read off one point's responses to one reference, C cases on K nodes, by n gains.
+    """One point's responses to one reference, C cases on K nodes, with derivatives to n gains.
 
     Attributes
     ----------
     error : ndarray, shape (C, K)
         The averaged signal's distance from the reference, a fraction of the step; inf where it runs away.
     by_gain : ndarray, shape (C, K, n)
+        Its derivatives.
     values, derivatives : dict of type to ndarray, shapes (C, R) and (C, R, n)
-        Rows of the other requirements.
+        Rows of the other requirements, by kind, and their derivatives.
     """
 
     error: Array
@@ -58,26 +67,27 @@ class LinearisedResponse:
 
 
 class LinearisedProblem:
-    """The problem that `nlp.sqp` minimises: unknowns are the gains as numbers from 0 to 1, and Ts over the horizon.
+    """The minimax problem that `descend` minimises, in the gains as numbers from 0 to 1 and Ts over the horizon.
 
     Parameters
     ----------
     simulator : Simulator
-        Of the cases that count.
+        Its cases count.
     rollout : Rollout
-        Of `sensitivity_rollout`.
+        The compiled loop of `sensitivity_rollout`.
     spec : Specification
     nodes : int
-        At which a response is read.
+        Number of instants at which a response is read.
     scale : float
-        What the objective is of the order of, which the penalties have to beat.
+        The size of the objective, by which the penalties are scaled.
 
     Attributes
     ----------
     bounds : ndarray, shape (n + 1, 2)
     scales : ndarray, shape (n + 1,)
+        Sizes of the unknowns' trust regions relative to each other.
     horizon : float
-        [s]
+        The shortest record after a step [s].
     count : int
         Candidates simulated.
     """
@@ -96,25 +106,24 @@ class LinearisedProblem:
         self._nodes = [
             reading_times(g, stride, longest) for g, stride in zip(simulator.grids, self._strides, strict=True)
         ]
-        self._latest = (1 - TAIL_SHARE) * self.horizon
-        self._latest = min(self._latest, self.horizon - MIN_SETTLED_PERIODS * max(self._periods, default=0.0))
-        most = min(self._latest, spec.limit(SettlingTime))
+        latest = min((1 - TAIL_SHARE) * self.horizon, self.horizon - MIN_SETTLED_PERIODS * longest)
+        most = min(latest, spec.limit(SettlingTime))
         low = most if spec.concerns(SettlingTime) and not spec.weight(SettlingTime) else 0.0
         self.bounds = np.array([*[[0.0, 1.0]] * len(self._space.names), [low / self.horizon, most / self.horizon]])
         self.scales = np.append(np.ones(len(self._space.names)), SETTLING_RADIUS_RATIO)
 
     def start(self, unit: Array) -> Array:
-        """Unknowns for gains, shape (m, n + 1): Ts as late as may be, which `improve` mends."""
+        """Unknowns for gains, shape (m, n + 1), with the latest Ts allowed; `improve` then finds the best one."""
         return np.column_stack([np.clip(unit, 0.0, 1.0), np.full(len(unit), self.bounds[-1, 1])])
 
     def evaluate(self, z: Array) -> Sequence[LinearisedPoint]:
-        """Simulate and linearise each row of z."""
+        """Simulate and linearise the responses for each row of z."""
         self.count += len(z)
         readings = self._read(z[:, :-1])
         return [self._point(row, reading) for row, reading in zip(z, readings, strict=True)]
 
     def improve(self, point: LinearisedPoint) -> LinearisedPoint:
-        """The same gains with their best Ts: the earliest, or one a little early if that is worth its penalty."""
+        """Keep the gains and choose their best Ts: the settling time, or an earlier one where that pays."""
         weight = self._spec.weight(SettlingTime)
         readings: Sequence[LinearisedResponse] = point.data
         if not weight or not np.isfinite(point.values).any() or np.isinf(point.merit):
@@ -138,11 +147,12 @@ class LinearisedProblem:
 
     @cached_property
     def _band_weight(self) -> float:
+        """The penalty of leaving the settling band by the whole step."""
         return self._scale * max(PROGRAM_BAND_PENALTY, 1 / self._spec.band)
 
     @cached_property
     def _groups(self) -> tuple[list[tuple[type, float, bool]], RowGroups]:
-        """Rows' kinds, what their values are divided by, whether they are limits; the band's is the first group."""
+        """The groups of rows: kind, divisor of the values and whether they are limits; the band comes first."""
         kinds, weights, floors = list[tuple[type, float, bool]](), [], []
         if self._spec.concerns(SettlingTime):
             kinds, weights, floors = [(SettlingTime, 1.0, True)], [self._band_weight], [0.0]
@@ -159,6 +169,7 @@ class LinearisedProblem:
         return kinds, RowGroups(np.array(weights), np.array(floors))
 
     def _point(self, z: Array, readings: Sequence[LinearisedResponse]) -> LinearisedPoint:
+        """The rows of all requirements at the unknowns z."""
         kinds, groups = self._groups
         values, slopes, group = list[Array](), list[Array](), list[Indices]()
         for g, (kind, size, is_limit) in enumerate(kinds):
@@ -177,7 +188,7 @@ class LinearisedProblem:
         return LinearisedPoint(z, float(weight * z[-1]), gradient, *rows, whose, groups, readings)
 
     def _band_rows(self, t: Array, reading: LinearisedResponse, Ts: float) -> tuple[Array, Array]:
-        """Both sides of the band at as many instants from Ts to the end, which move with it."""
+        """Rows of both sides of the band at instants from Ts to the end, which move with Ts."""
         late = np.linspace(0.0, 1.0, len(t))
         at = Ts + late * (t[-1] - Ts)
         k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
@@ -191,7 +202,7 @@ class LinearisedProblem:
         return np.array([error, -error]) - self._spec.band, np.array([slopes, -slopes])
 
     def _read(self, unit: Array) -> list[list[LinearisedResponse]]:
-        """Readings of each point, one a reference."""
+        """Simulate points; the linearised response of each point to each reference."""
         points = self._space.from_unit(unit)
         found: list[list[LinearisedResponse]] = [[] for _ in points]
         for g, own in enumerate(self._cases):
@@ -208,7 +219,7 @@ class LinearisedProblem:
         return found
 
     def _simulate_lanes(self, g: int, points: Array, rows: Indices, case: Indices) -> LinearisedResponse:
-        """Simulate lanes on one grid and read them."""
+        """Simulate lanes on one grid and linearise their responses."""
         grid = self._simulator.grids[g]
         p, starts = self._simulator.lanes(points, rows, case)
         u, instants, h, steps = self._simulator.pad(case)
@@ -247,7 +258,10 @@ class LinearisedProblem:
         )
 
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:
-        """How parameters, and before them the rest, move with the unknowns, shape (m, n_columns, n)."""
+        """Derivatives of the start states, where they depend on the gains, and the parameters to the unknowns.
+
+        Their shape is (m, n_columns, n).
+        """
         names, cases = self._space.names, self._simulator.cases
         factors = np.array([case.slopes(names) for case in cases])[case]
         chain = factors[:, :, None] * np.eye(len(names))
@@ -256,7 +270,7 @@ class LinearisedProblem:
         return np.asarray(chain * self._space.from_unit_slope(points)[rows][:, None, :])
 
     def _rest_slopes(self, points: Array, rows: Indices, case: Indices) -> Array:
-        """How the rest moves with the gains, by central differences, shape (m, n_states, n)."""
+        """Derivatives of the start states to the gains by central differences, shape (m, n_states, n)."""
         (low, up), columns = self._space.bounds.T, []
         for k, step in enumerate(DIFFERENCE_STEP * (up - low)):
             nudge = step * (np.arange(len(low)) == k)
@@ -268,7 +282,7 @@ class LinearisedProblem:
     def _robustness_rows(
         self, p: Array, sound: Mask, ends: tuple[Array, Array], points: Array, case: Indices
     ) -> dict[type, tuple[Array, Array]]:
-        """Margins and peaks of the linearised loop, and derivatives by differences, the operating point held."""
+        """Margins and peaks of the linearised loop, and their derivatives by differences at a fixed operating point."""
         names, n, kinds = (
             self._space.names,
             len(self._wrt),
@@ -298,7 +312,7 @@ class LinearisedProblem:
 
 
 def sensitivity_rollout(simulator: Simulator) -> Rollout:
-    """The compiled loop with its sensitivities to the gains; to the start where the rest depends on them."""
+    """Compile the loop with sensitivities to the gains, and to the start states where those depend on the gains."""
     order, names = list(simulator.loop.parameters), simulator.space.names
     through_start = any(simulator.starts_vary(k) for k in range(len(simulator.cases)))
     return Rollout(
@@ -309,7 +323,10 @@ def sensitivity_rollout(simulator: Simulator) -> Rollout:
 
 
 def _band_entry_times(t: Array, size: Array, band: float) -> Array:
-    """For each node when the band was last entered just before it, linear between nodes; the node's time otherwise."""
+    """For each node the time at which the segment before it enters the band, by linear interpolation.
+
+    Where that segment does not enter the band it is the time at which the segment begins.
+    """
     before, after = size[:, :-1], size[:, 1:]
     with np.errstate(all="ignore"):
         share = np.where((before > band) & (after <= band), (before - band) / (before - after), 0.0)
@@ -318,6 +335,7 @@ def _band_entry_times(t: Array, size: Array, band: float) -> Array:
 
 
 def _concatenate_responses(parts: Sequence[LinearisedResponse]) -> LinearisedResponse:
+    """Join the lanes of several responses."""
     if len(parts) == 1:
         return parts[0]
     kinds = parts[0].values
@@ -330,6 +348,7 @@ def _concatenate_responses(parts: Sequence[LinearisedResponse]) -> LinearisedRes
 
 
 def _slice_response(whole: LinearisedResponse, lanes: slice) -> LinearisedResponse:
+    """The response of some lanes."""
     return LinearisedResponse(
         whole.error[lanes],
         whole.by_gain[lanes],

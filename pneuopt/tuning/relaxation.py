@@ -1,8 +1,8 @@
-"""How far requirements that contradict each other have to give way: each alone, or all of them together.
+"""Relaxation of limits that contradict each other: by how much each alone, or all together, must give way.
 
-For one limit alone the question is a tuning of its own, whose objective is that requirement and whose limits are the
-others. For all together it is the least share by which every limit has to be wider: a minimax over the simulator's
-values, from the points that the tunings found.
+For one limit alone the answer is a tuning of its own, which minimises that requirement under the other limits. For all
+together it is the least share by which every limit has to widen: a minimax over the simulator's values, from the points
+that those tunings found.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,18 +22,24 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
-RELAXED_LIMIT_DIGITS = 3  # of a relaxed limit, rounded so that the design that was found keeps it
-UNSETTLED_EXCESS = 10.0  # relative excess of what never settles, before what it is off at the end
-MAX_LOCAL_SIMULATIONS = 200  # of the local search for all limits together
+# Significant digits of a relaxed limit, rounded so that the design that was found keeps it. Fewer relax it needlessly;
+# more claim a precision that a search does not have.
+RELAXED_LIMIT_DIGITS = 3
+# Relative excess over its limits that a response counts as which never settles, before its error at the end is added.
+# A smaller one prefers such a response to one that settles and breaks a limit; a larger one only changes the scale.
+UNSETTLED_EXCESS = 10.0
+# Simulations of the local search for all limits together. Fewer report a relaxation larger than is needed; more cost
+# time in proportion.
+MAX_LOCAL_SIMULATIONS = 200
 
 
 def relaxation_specification(
     spec: Specification, requirement: Requirement, references: Sequence[Step]
 ) -> Specification:
-    """The tuning that finds how small a limited requirement can be where the others are kept.
+    """The specification of the tuning that makes a limited requirement as small as the other limits allow.
 
-    Where a settling time is minimised, the response still has to settle. The objective is of the order of the horizon,
-    as the searches' penalties are.
+    Where a settling time was minimised, the response still has to settle. The objective is scaled to the size of the
+    horizon, as the searches' penalties are.
     """
     limits, horizon = limits_with_settling(spec, references), min(r.horizon - r.at for r in references)
     weights = {with_user_limit(requirement, None): horizon / upper_limit(requirement)}
@@ -41,7 +47,7 @@ def relaxation_specification(
 
 
 def limits_with_settling(spec: Specification, references: Sequence[Step]) -> tuple[Requirement, ...]:
-    """The limits, and where a settling time is only minimised, that there is one."""
+    """The limits, and one that the response settles at all where a settling time is minimised without a limit."""
     horizon = min(r.horizon - r.at for r in references)
     if not spec.weight(SettlingTime) or any(isinstance(q, SettlingTime) for q in spec.limits):
         return spec.limits
@@ -49,7 +55,7 @@ def limits_with_settling(spec: Specification, references: Sequence[Step]) -> tup
 
 
 def relax_all(simulator: Simulator, space: Space, spec: Specification, points: Sequence[Array]) -> Array:
-    """The point whose limits have to be widened by the least common share, by Nelder-Mead from the best of `points`.
+    """Find the point for which the limits have to widen by the least common share, by Nelder-Mead.
 
     Parameters
     ----------
@@ -57,7 +63,7 @@ def relax_all(simulator: Simulator, space: Space, spec: Specification, points: S
     space : Space
     spec : Specification
     points : sequence of ndarray, shape (n,)
-        Starts.
+        Starts, of which the best is taken.
 
     Returns
     -------
@@ -86,7 +92,7 @@ def relax_all(simulator: Simulator, space: Space, spec: Specification, points: S
 
 
 def limit_excess(values: Mapping[str, Array], spec: Specification) -> Array:
-    """The share by which every limit would have to be wider, shape (m,); graded where nothing settles."""
+    """The share by which every limit has to widen for a point to keep them, shape (m,); graded where none settles."""
     unsettled = UNSETTLED_EXCESS + np.minimum(values["Excess"], UNSETTLED_EXCESS)
     worst = np.full_like(unsettled, -np.inf)
     if spec.concerns(SettlingTime):
@@ -105,9 +111,9 @@ def relaxation_row(
     Parameters
     ----------
     requirement : Requirement or None
-        None: all together.
+        None: all limits together.
     value : float
-        As the user writes it, NaN where no design was found; of all together the share.
+        The least value on the user's scale, NaN where no design was found; for all together the least share.
     point : ndarray, shape (n,)
     names : sequence of str
     """
@@ -121,7 +127,7 @@ def relaxation_row(
 
 
 def describe_relaxations(rows: Mapping[str, Mapping[str, float]]) -> str:
-    """What the table says, in words."""
+    """Say in words which limits would have to be relaxed, and by how much."""
     able = {n: r for n, r in rows.items() if n != "all" and isfinite(r["needed"])}
     each = ", or ".join(f"{n} relaxed to {r['needed']:.6g} ({r['asked']:.6g} asked)" for n, r in able.items())
     share = rows["all"]["share"] if "all" in rows else nan
@@ -132,7 +138,7 @@ def describe_relaxations(rows: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _round_outwards(value: float, *, upwards: bool) -> float:
-    """Rounded so that the design that was found keeps it.
+    """Round a limit so that the design that was found keeps it.
 
     Examples
     --------

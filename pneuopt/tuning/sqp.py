@@ -17,24 +17,32 @@ import numpy as np
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import require
 
-QP_CURVATURE = 3e-3  # of the program, over the objective's slope: at 1e-5 the solver loses its way
-ROW_PADDING = 32  # rows: programs are built for whole multiples of it
-MAX_CUTTING_ROUNDS = 20  # rounds in which rows that the step violates are taken in
-VIOLATION_TOLERANCE = 1e-7  # by more than this
-SHRINK_GAIN_RATIO, GROW_GAIN_RATIO = (
-    0.25,
-    0.75,
-)  # share of the predicted decrease below which the region shrinks, above which it grows
-INFINITE_BOUND = 1e20
+# Curvature of the quadratic program over the objective's slope. At 1e-5 the solver fails on nearly flat programs; a
+# larger one shortens the steps.
+QP_CURVATURE = 3e-3
+# Numbers of rows are rounded up to multiples of it, so that few programs are built. With a smaller one each program is
+# built anew; a larger one makes the solver work on empty rows.
+ROW_PADDING = 32
+# Rounds in which rows that a step violates are added to its program. Fewer may return a step that violates rows; each
+# more costs a program.
+MAX_CUTTING_ROUNDS = 20
+# Violation from which a row is added, as rows count. A smaller one adds rows for rounding errors; a larger one leaves
+# violations in the step.
+VIOLATION_TOLERANCE = 1e-7
+# Actual over predicted decrease below which the trust region shrinks, and above which it grows. Higher ones keep steps
+# short; lower ones accept steps that the linearisation does not predict.
+SHRINK_GAIN_RATIO, GROW_GAIN_RATIO = 0.25, 0.75
+INFINITE_BOUND = 1e20  # stands for no bound; a smaller one might be reached by a slack of a badly scaled objective
 
 
 @dataclass(frozen=True)
 class RowGroups:
-    """What the rows stand for.
+    """The weights and floors of groups of rows: a group is a limit or a term of the objective.
 
     Parameters
     ----------
     weights : ndarray, shape (n_groups,)
+        The penalty of a limit's violation, or the weight of an objective.
     floors : ndarray, shape (n_groups,)
         0 for a limit, -inf for an objective.
     """
@@ -45,7 +53,7 @@ class RowGroups:
 
 @dataclass(frozen=True, eq=False)
 class LinearisedPoint:
-    """A point with the rows linearised there.
+    """A point and the objective's rows linearised there.
 
     Parameters
     ----------
@@ -53,14 +61,16 @@ class LinearisedPoint:
     cost : float
         f(z).
     gradient : ndarray, shape (n,)
-        Of f.
+        The gradient of f.
     values : ndarray, shape (n_rows,)
         -inf: the row does not count here.
     slopes : ndarray, shape (n_rows, n)
+        Derivatives of the values.
     group : ndarray of int, shape (n_rows,)
-    groups : Groups
+        The group of each row.
+    groups : RowGroups
     data : object
-        What the problem keeps to improve the point.
+        Anything that the problem needs to improve the point.
     """
 
     z: Array
@@ -78,7 +88,7 @@ class LinearisedPoint:
         return self._merit(self.values, self.cost)
 
     def predict_merit(self, d: Array) -> float:
-        """The objective after a step, by the linearised rows."""
+        """The objective after a step d by the linearised rows."""
         return self._merit(self.values + self.slopes @ d, self.cost + float(self.gradient @ d))
 
     def _merit(self, values: Array, cost: float) -> float:
@@ -90,7 +100,7 @@ class LinearisedPoint:
 
 
 class MinimaxProblem(Protocol):
-    """What is minimised: least and greatest values, shape (n, 2), and what a trust region of 1 allows, shape (n,)."""
+    """A minimax problem: `bounds`, shape (n, 2), and `scales`, the half widths of a trust region of 1, shape (n,)."""
 
     bounds: Array
     scales: Array
@@ -99,21 +109,21 @@ class MinimaxProblem(Protocol):
         """Linearise at each row of z, shape (m, n)."""
 
     def improve(self, point: LinearisedPoint) -> LinearisedPoint:
-        """A better point that costs no evaluation, or the same."""
+        """A better point that needs no new evaluation, or the same point."""
 
 
 @dataclass(frozen=True)
 class SQP:
-    """Step control.
+    """Step control of the sequential quadratic programs.
 
     Parameters
     ----------
     radius : float
-        Of the first trust region, a box.
+        Half width of the first trust region, a box, as a fraction of the unknowns' ranges.
     least_radius : float
-        At which a point has come to its end.
+        Half width below which a descent ends.
     tolerance : float
-        Predicted relative decrease at which it has.
+        Predicted relative decrease of the objective below which it ends.
     """
 
     radius: float = 0.3
@@ -126,7 +136,7 @@ class SQP:
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """One start: where it is, its trust region, whether it still moves."""
+    """The descent from one start: its present point, its trust region, and whether it goes on."""
 
     point: LinearisedPoint
     radius: float
@@ -136,19 +146,19 @@ class Descent:
 def descend(
     problem: MinimaxProblem, starts: Array, iterations: int, method: SQP | None = None
 ) -> list[LinearisedPoint]:
-    """Improve every start, so many iterations at most.
+    """Descend from every start in lockstep, for so many iterations at most.
 
     Parameters
     ----------
-    problem : Problem
+    problem : MinimaxProblem
     starts : ndarray, shape (m, n)
     iterations : int
     method : SQP, optional
 
     Returns
     -------
-    list of Point
-        One a start, in their order.
+    list of LinearisedPoint
+        One for each start, in their order.
     """
     method = method or SQP()
     first = [problem.improve(p) for p in problem.evaluate(starts)]
@@ -163,7 +173,7 @@ def descend(
 
 
 def _advance(problem: MinimaxProblem, descents: Sequence[Descent], method: SQP) -> list[Descent]:
-    """One iteration of each: a step, and where it disappoints a corrected one."""
+    """Advance each descent by a step; where it gains less than predicted, a second-order correction is tried, too."""
     steps = [solve_quadratic_program(d.point, _step_box(problem, d)) for d in descents]
     trials = _evaluate_and_improve(problem, [d.point.z + step for d, step in zip(descents, steps, strict=True)])
     gains = [
@@ -172,8 +182,8 @@ def _advance(problem: MinimaxProblem, descents: Sequence[Descent], method: SQP) 
     ]
     poor = [
         k
-        for k, (hoped, gained) in enumerate(gains)
-        if _promises_decrease(descents[k], hoped, method) and gained < SHRINK_GAIN_RATIO * hoped
+        for k, (predicted, gained) in enumerate(gains)
+        if _promises_decrease(descents[k], predicted, method) and gained < SHRINK_GAIN_RATIO * predicted
     ]
     seconds = [
         _second_order_step(descents[k].point, steps[k], trials[k][0], _step_box(problem, descents[k])) for k in poor
@@ -186,43 +196,46 @@ def _advance(problem: MinimaxProblem, descents: Sequence[Descent], method: SQP) 
         if second[1].merit < trials[k][1].merit:
             trials[k] = second
     return [
-        _update_descent(d, step / problem.scales, trial[1], hoped, method)
-        for d, step, trial, (hoped, _) in zip(descents, steps, trials, gains, strict=True)
+        _update_descent(d, step / problem.scales, trial[1], predicted, method)
+        for d, step, trial, (predicted, _) in zip(descents, steps, trials, gains, strict=True)
     ]
 
 
 def _evaluate_and_improve(problem: MinimaxProblem, z: Sequence[Array]) -> list[tuple[LinearisedPoint, LinearisedPoint]]:
-    """Each point as it is, and improved."""
+    """Evaluate points within the bounds; each as it is, and improved."""
     if not z:
         return []
     low, up = problem.bounds.T
     return [(p, problem.improve(p)) for p in problem.evaluate(np.clip(np.array(z), low, up))]
 
 
-def _promises_decrease(descent: Descent, hoped: float, method: SQP) -> bool:
-    return hoped > method.tolerance * abs(descent.point.merit)
+def _promises_decrease(descent: Descent, predicted: float, method: SQP) -> bool:
+    """Whether the predicted decrease of the objective is worth a step."""
+    return predicted > method.tolerance * abs(descent.point.merit)
 
 
-def _update_descent(descent: Descent, step: Array, trial: LinearisedPoint, hoped: float, method: SQP) -> Descent:
-    if not _promises_decrease(descent, hoped, method):
-        smaller = 0.25 * descent.radius  # for where the program itself went wrong
-        return replace(descent, radius=smaller, moves=hoped < 0 and smaller > method.least_radius)
+def _update_descent(descent: Descent, step: Array, trial: LinearisedPoint, predicted: float, method: SQP) -> Descent:
+    """Accept or refuse a trial point, and adapt the trust region."""
+    if not _promises_decrease(descent, predicted, method):
+        smaller = 0.25 * descent.radius  # where the program failed, a smaller region may help
+        return replace(descent, radius=smaller, moves=predicted < 0 and smaller > method.least_radius)
     gained, reach = descent.point.merit - trial.merit, float(np.max(np.abs(step)))
     radius = descent.radius
-    if gained < SHRINK_GAIN_RATIO * hoped:
+    if gained < SHRINK_GAIN_RATIO * predicted:
         radius = 0.4 * min(radius, reach)
-    elif gained > GROW_GAIN_RATIO * hoped and reach > 0.9 * radius:
+    elif gained > GROW_GAIN_RATIO * predicted and reach > 0.9 * radius:
         radius = min(2 * radius, 1.0)
     point = trial if gained > 0 else descent.point
     return Descent(point, radius, radius > method.least_radius)
 
 
 def _step_box(problem: MinimaxProblem, descent: Descent) -> Array:
+    """Bounds and trust region as `solve_quadratic_program` takes them, shape (n, 3)."""
     return np.column_stack([problem.bounds, descent.radius * problem.scales])
 
 
 def _second_order_step(point: LinearisedPoint, step: Array, trial: LinearisedPoint, box: Array) -> Array:
-    """The step of the program whose rows are right at the trial: the second-order correction."""
+    """The second-order correction: the step of the program with the rows' true values at the trial point."""
     with np.errstate(invalid="ignore"):
         values = trial.values - point.slopes @ step
     known = np.isfinite(values) & np.isfinite(point.values)
@@ -236,7 +249,7 @@ def solve_quadratic_program(point: LinearisedPoint, box: Array) -> Array:
 
     Parameters
     ----------
-    point : Point
+    point : LinearisedPoint
     box : ndarray, shape (n, 3)
         Least and greatest value of each unknown, and how far it may step.
     """
@@ -263,14 +276,14 @@ def solve_quadratic_program(point: LinearisedPoint, box: Array) -> Array:
 
 
 def _local_maxima(heights: Array, least: float = VIOLATION_TOLERANCE) -> Indices:
-    """Local maxima, for rows that lie beside each other in time hold each other down; the highest of them."""
+    """Indices of the highest local maxima; rows beside them in time, which a step lowers with them, are left out."""
     beside = np.concatenate([[-np.inf], heights, [-np.inf]])
     found = np.flatnonzero((heights > least) & (heights >= beside[:-2]) & (heights >= beside[2:]))
     return np.asarray(found[np.argsort(-heights[found], kind="stable")[:ROW_PADDING]])
 
 
 def _solve_active_rows(point: LinearisedPoint, rows: Indices, low: Array, up: Array) -> tuple[Array, Array] | None:
-    """Step and slacks, one a group; a slack stands at its group's floor, or on its highest row."""
+    """Step and slacks of the program with the chosen rows; a group's slack is its floor or its highest row."""
     n, g = len(low), len(point.groups.weights)
     m = -(-max(1, len(rows)) // ROW_PADDING) * ROW_PADDING
     A, upper = np.zeros((m, n + g)), np.full(m, INFINITE_BOUND)
@@ -300,5 +313,6 @@ def _solve_active_rows(point: LinearisedPoint, rows: Indices, low: Array, up: Ar
 
 @functools.lru_cache(maxsize=256)
 def _qp_solver(n: int, m: int) -> Any:
+    """The solver of dense programs with n unknowns and m rows."""
     sparsity = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(m, n)}
     return ca.conic("program", "daqp", sparsity, {"error_on_fail": False})

@@ -86,7 +86,7 @@ def without_clip(loop: ClosedLoop) -> ClosedLoop:
 
 
 def _extra_unknowns(references: Sequence[Step], spec: Specification) -> ParameterSet:
-    """Parameters beside the loop's: the settling time, an unknown for each other term, a number for each other limit."""
+    """The settling time, an unknown for each other term of the objective, and a number for each other limit."""
     horizon = min(r.horizon - r.at for r in references)
     most = min(spec.limit(SettlingTime), (1 - TAIL_SHARE) * horizon)  # metrics need the rest as the record's end
     free = spec.weight(SettlingTime) > 0

@@ -1,4 +1,4 @@
-"""`validate_design`: what a design is worth on plants, and with gains, that no search has seen."""
+"""`validate_design`: a design's metrics on new plants, or with gains off by a tolerance, that no search has used."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,23 +26,26 @@ from pneuopt.tuning.space import Space
 if TYPE_CHECKING:
     import pandas as pd
 
-SUMMARY_PERCENTILE = 95.0  # [%]
+# Percentile of the plants that the summary shows [%]. A lower one says little of bad plants; near 100 a few plants
+# decide it, as they decide the worst.
+SUMMARY_PERCENTILE = 95.0
 
 
 @dataclass(frozen=True, eq=False)
 class DesignValidation:
-    """What `validate_design` found.
+    """The metrics of a design on new plants.
 
     Attributes
     ----------
     summary : DataFrame
         A row a requirement, in the units of `TuningResult.certified`: "median", "p95" (95 of 100 plants do better) and
-        "worst" by the compiled simulation; "worst_plant", and "certified", what the independent simulation says of that
-        plant; "limit", NaN without; "violations", the plants that break it, or that never settle. NaN: never settles.
+        "worst" by the compiled simulation; "worst_plant", and "certified", that plant's figure by the independent
+        simulation; "limit", NaN without; "violations", the number of plants that break it, or that never settle. A
+        figure is NaN where the response never settles.
     plants : DataFrame
         A row a plant, a column a metric, the worst over the references; by the compiled simulation.
     certified : DataFrame
-        A row a metric, a column a reference and one of the worst plants; by the independent one.
+        A row a metric, a column a reference and one of the worst plants; by the independent simulation.
     """
 
     summary: "pd.DataFrame"
@@ -50,7 +53,7 @@ class DesignValidation:
     certified: "pd.DataFrame"
 
     def __repr__(self) -> str:
-        return f"DesignValidation on {len(self.plants)} fresh plants\n{self.summary.to_string()}"
+        return f"DesignValidation on {len(self.plants)} new plants\n{self.summary.to_string()}"
 
 
 def validate_design(
@@ -62,14 +65,14 @@ def validate_design(
     subject_to: Sequence[Requirement] = (),
     scenarios: Scenarios,
 ) -> DesignValidation:
-    """Try a design on fresh plants: all by compiled simulation, each requirement's worst plant by the independent one.
+    """Simulate a design on new plants: all compiled, the worst one of each requirement by the independent simulation.
 
     Parameters
     ----------
     loop, references, minimise, subject_to
         As for `tune`.
     parameters : ParameterSet
-        Of the design, a `TuningResult.parameters` say.
+        The design's, a `TuningResult.parameters` for example.
     scenarios : mapping of str to mapping
         The plants, or tolerances of the gains: of `samples` or `draws` with another seed than the search had, or
         `tolerances` with a count.
@@ -93,14 +96,14 @@ def validate_design(
     >>> from pneuopt.evaluation.scenarios import samples
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
     >>> design = loop.parameters.with_values({"pid.Kp": 5.0, "pid.Ki": 50.0})
-    >>> fresh = samples(design, {"plant.gain": 0.2}, 50, seed=1)
+    >>> plants = samples(design, {"plant.gain": 0.2}, 50, seed=1)
     >>> found = validate_design(
-    ...     loop, Step(1.0), design, minimise=SettlingTime(), subject_to=[Overshoot(0.01)], scenarios=fresh
+    ...     loop, Step(1.0), design, minimise=SettlingTime(), subject_to=[Overshoot(0.01)], scenarios=plants
     ... )
     >>> int(found.summary.loc["Overshoot", "violations"])
     0
     """
-    require(len(scenarios) > 0, "no fresh plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)")
+    require(len(scenarios) > 0, "no new plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)")
     spec = specify(minimise, subject_to)
     check_closed_loop(loop)
     check_parameters(parameters)
@@ -123,7 +126,7 @@ def validate_design(
 def _simulate_plants(
     loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
 ) -> "pd.DataFrame":
-    """Metrics by compiled simulation, the worst over the references."""
+    """The metrics of each plant by compiled simulation, the worst over the references."""
     import pandas as pd
 
     simulator = Simulator(loop, steps, Space(parameters, ()), scenarios, spec)
@@ -134,7 +137,7 @@ def _simulate_plants(
 
 
 def _worst_by_plant(metrics: "pd.DataFrame", plants: Sequence[str], references: int) -> "pd.DataFrame":
-    """Metrics of one plant after another, so many references each, as the worst of each plant; NaN is the worst."""
+    """The worst of each plant's metrics over its references, from columns plant by plant; NaN is the worst."""
     import pandas as pd
 
     found = {}
@@ -145,11 +148,12 @@ def _worst_by_plant(metrics: "pd.DataFrame", plants: Sequence[str], references: 
 
 
 def _worst_value(values: Array, metric: str) -> float:
+    """The worst value of a metric."""
     return float(values[_rank_order(values, metric)[-1]])
 
 
 def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
-    """From the best to the worst; what is no number is the worst."""
+    """Indices from the best to the worst value of a metric; NaN is the worst."""
     cost = -values if larger_is_better(metric) else values
     return np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
 
@@ -157,6 +161,7 @@ def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
 def _summary(
     values: "pd.DataFrame", worst: Mapping[str, str], certified: "pd.DataFrame", spec: Specification
 ) -> "pd.DataFrame":
+    """The table `DesignValidation.summary`."""
     import pandas as pd
 
     limits, proven = {metric_name(q): _metric_limit(q) for q in spec.limits}, certified.to_dict()
@@ -176,17 +181,18 @@ def _summary(
 
 
 def _quantile(values: Array, metric: str, percent: float) -> float:
-    """The value of the plant that so many do not exceed."""
+    """The value of a metric that so many percent of the plants are as good as or better than."""
     return float(values[_rank_order(values, metric)[math.ceil(len(values) * percent / 100) - 1]])
 
 
 def _metric_limit(requirement: Requirement) -> float:
-    """As the metric counts: percent where it does, a margin itself."""
+    """The limit in the metric's unit, percent where it has percent; NaN without a limit."""
     limit = user_limit(requirement)
     return math.nan if limit is None else requirement.metric.factor * limit
 
 
 def _keeps_limit(values: Array, limit: float, metric: str) -> NDArray[np.bool_]:
+    """Which values keep a limit; without one, which are finite."""
     if math.isnan(limit):
         return np.isfinite(values)
     return np.asarray(values >= limit if larger_is_better(metric) else values <= limit)

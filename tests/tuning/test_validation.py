@@ -26,10 +26,10 @@ def integrator(Kp: float = 5.0) -> tuple[ClosedLoop, ParameterSet]:
 def test_the_figures_are_those_of_the_plants() -> None:
     """Median, 95th of 100, worst and the count above the limit, from each plant's own settling time."""
     loop, design = integrator()
-    fresh = samples(design, {"plant.gain": 0.2}, 100, seed=3)
-    times = {n: math.log(50) / (5 * v["plant.gain"]) for n, v in fresh.items()}
+    plants = samples(design, {"plant.gain": 0.2}, 100, seed=3)
+    times = {n: math.log(50) / (5 * v["plant.gain"]) for n, v in plants.items()}
     limit = 0.9
-    found = validate_design(loop, STEPS, design, minimise=SettlingTime(max=limit), scenarios=fresh)
+    found = validate_design(loop, STEPS, design, minimise=SettlingTime(max=limit), scenarios=plants)
     row, ordered = found.summary.loc["SettlingTime"], sorted(times.values())
     assert row["worst"] == pytest.approx(ordered[-1], rel=1e-3)
     assert row["certified"] == pytest.approx(ordered[-1], rel=1e-3)
@@ -55,14 +55,14 @@ def test_the_smallest_margin_is_the_worst() -> None:
     """PI on a lag: L = (Kp s + Ki) K/(s (T s + 1)), so the margin falls with the gain where Ki leads."""
     loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
     design = loop.parameters.with_values({"pid.Kp": 0.2, "pid.Ki": 40.0})
-    fresh = {"low": {"plant.gain": 0.8}, "high": {"plant.gain": 1.2}}
+    plants = {"low": {"plant.gain": 0.8}, "high": {"plant.gain": 1.2}}
     found = validate_design(
         loop,
         Step(1.0),
         design,
         minimise=SettlingTime(),
         subject_to=[PhaseMargin(40.0), Overshoot(0.9)],
-        scenarios=fresh,
+        scenarios=plants,
     )
     row = found.summary.loc["PhaseMargin"]
     assert row["worst"] == found.plants["PhaseMargin"].min()
@@ -73,7 +73,7 @@ def test_the_smallest_margin_is_the_worst() -> None:
     assert list(found.summary.index) == ["SettlingTime", "Overshoot", "PhaseMargin"]
 
 
-def test_gains_off_by_a_tolerance_are_fresh_plants_too() -> None:
+def test_gains_off_by_a_tolerance_are_new_plants_too() -> None:
     loop, design = integrator()
     drawn = tolerances(design, {"pid.Kp": 0.1}, 40, seed=2)
     gains = np.array([apply_scenario(design, values).value("pid.Kp") for values in drawn.values()])
@@ -85,5 +85,5 @@ def test_gains_off_by_a_tolerance_are_fresh_plants_too() -> None:
 
 def test_no_plant_is_refused() -> None:
     loop, design = integrator()
-    with pytest.raises(InputError, match="no fresh plants"):
+    with pytest.raises(InputError, match="no new plants"):
         validate_design(loop, STEPS, design, minimise=SettlingTime(), subject_to=[MaxSensitivity(2.0)], scenarios={})
