@@ -49,7 +49,7 @@ _EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bou
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What a tuning.toml describes.
+    """A tuning.toml as read: the loop, its references and parameters, what is asked of it, and how it is tuned.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class Tuning:
     specification : Specification
         Objective and limits, checked; without terms of an objective where the file only describes a loop.
     scenarios : callable
-        Of the nominal parameters: the plants and tolerances beside them.
+        It maps the nominal parameters to the plants and tolerances beside them.
     validation_scenarios : callable
-        Likewise: others from the same boxes, to validate a design on.
+        It maps them to other plants and tolerances from the same boxes, on which a design is validated.
     method : Method, optional
-        None: the loop decides.
+        None: the first that suits the loop.
     """
 
     loop: ClosedLoop
@@ -102,12 +102,11 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     loop, parameters = read_loop_sections(table, plant, path)
     weights, limits = _read_objective(table, path), _read_requirements(table, loop, path)
     spec = construct_at(lambda: specify_limits(limits, weights), f"{path}: [minimise] and [limits]")
-    drawn = (
-        partial(read, table.get("scenarios", {}), str(path)) for read in (read_scenarios, read_validation_scenarios)
-    )
+    section = table.get("scenarios", {}), str(path)
+    scenarios, validation = (partial(read, *section) for read in (read_scenarios, read_validation_scenarios))
     method = read_method(table.get("method", {}), f"{path}: [method]")
-    references, (tried, fresh) = _references(table, loop, path), drawn
-    return Tuning(loop, references, parameters, spec, tried, fresh, method)
+    references = _references(table, loop, path)
+    return Tuning(loop, references, parameters, spec, scenarios, validation, method)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") -> None:
@@ -172,6 +171,7 @@ def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: 
 
 
 def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
+    """Read the [[reference]] sections."""
     entries = table.get("reference", [])
     several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
     require(several, f"{path}: write each reference as a section of its own, [[reference]]")
@@ -183,6 +183,7 @@ def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tu
 
 
 def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
+    """Read one [[reference]], in the units of the loop's signals."""
     unit, outputs = loop.feedback.unit, {q.name: q.unit for q in loop.plant.outputs}
     difference = unit.partition("(")[0]
     units = {"step": difference, "initial": unit, "at": "s", "horizon": "s", "scale": difference}
@@ -210,6 +211,7 @@ def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
 
 
 def _read_objective(table: TuningSections, path: str | Path) -> dict[Requirement, float]:
+    """Read [minimise]: requirements and their weights."""
     where = f"{path}: [minimise]"
     check_names("requirement", table.get("minimise", {}), REQUIREMENTS_BY_KEY, where)
     weights = {}
@@ -224,6 +226,7 @@ def _read_objective(table: TuningSections, path: str | Path) -> dict[Requirement
 
 
 def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Requirement, ...]:
+    """Read [limits]: requirements with their bounds."""
     where = f"{path}: [limits]"
     check_names("requirement", table.get("limits", {}), REQUIREMENTS_BY_KEY, where)
     units, found = bound_units(loop), []
@@ -240,6 +243,7 @@ def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path
 
 
 def _make_requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], where: str) -> Requirement:
+    """Make the requirement of a key, with its limit, and with its band or bounds where it has them."""
     own: dict[str, Any] = dict(limit)
     if key == "step_envelope":
         own["bounds"] = _read_envelope(entry.get("bounds"), f"{where} bounds")
@@ -249,6 +253,7 @@ def _make_requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, fl
 
 
 def _read_envelope(table: Any, where: str) -> EnvelopeBounds:
+    """Read the rows of a StepEnvelope: an instant, a lower and an upper bound each."""
     rows = table if isinstance(table, list) else []
     proper = len(rows) > 0 and all(isinstance(row, list) and len(row) == 3 for row in rows)
     require(proper, f'{where}: write instants with a lower and an upper bound, [["0 s", "-10 %", "110 %"], ...]')
@@ -259,10 +264,12 @@ def _read_envelope(table: Any, where: str) -> EnvelopeBounds:
 
 
 def _extra_keys(key: str) -> tuple[str, ...]:
+    """The keys of a requirement beside its limit and weight."""
     return (_EXTRA_KEYS[key],) if key in _EXTRA_KEYS else ()
 
 
 def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
+    """Write the tuned values of the free parameters into a document, in the units that the user gave them in."""
     for section in TUNABLE_SECTIONS:
         for key, entry in document.unwrap().get(section, {}).items():
             if isinstance(entry, dict) and entry.get("free", False):
