@@ -201,7 +201,7 @@ def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
 
 
 def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
-    """By how much parameters and inputs of the plant change."""
+    """Read a disturbance: the changes of parameters and inputs of the plant."""
     require(isinstance(table, dict), f'{where}: write disturbance = {{ "load.force" = "50 N" }}')
     flat = {f"{n}.{m}": v for n, e in table.items() if isinstance(e, dict) for m, v in e.items()}
     flat |= {n: v for n, v in table.items() if not isinstance(v, dict)}

@@ -93,7 +93,7 @@ class Condensed:
     seed : int
         Of the random numbers.
     digits : int, optional
-        Significant digits of the gains handed out; None: all.
+        Significant digits to which the gains are rounded; None: all.
     steps : SQP
         Step control of the programs.
     """
@@ -130,7 +130,7 @@ class Condensed:
 
     @property
     def successor(self) -> None:
-        """None, for its answer is final."""
+        """No method follows this one: its answer is final."""
 
     def check(self, task: TuningTask) -> None:
         """Refuse requirements and parameters without a gradient: `InputError` names them and the remedy."""
@@ -160,7 +160,7 @@ class Condensed:
         return short_screening(margin, self.digits)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
-        """None, for it can only search anew."""
+        """No path: each set of limits needs a new search."""
 
 
 def _nonsmooth_terms(task: TuningTask) -> list[str]:
@@ -288,8 +288,8 @@ class _CondensedSearch:
             start[k] = place
         found = self._descend(starts, cases, self._spec, JUMP_ITERATIONS)
         known = np.vstack([points, self.best[None]])
-        fresh = found[np.abs(found[:, None] - known).max(axis=2).min(axis=1) > MIN_POINT_DISTANCE][: method.keep]
-        return [self._descend(fresh, cases, self._spec, method.iterations)] if len(fresh) else []
+        new = found[np.abs(found[:, None] - known).max(axis=2).min(axis=1) > MIN_POINT_DISTANCE][: method.keep]
+        return [self._descend(new, cases, self._spec, method.iterations)] if len(new) else []
 
     @cached_property
     def _bands(self) -> list[float]:

@@ -31,13 +31,13 @@ STATIC_SIGN_FREQUENCY = 1e-3
 BISECTION_STEPS = 10
 
 
-def check_feasibility(loop: ClosedLoop, every: Sequence[TuningCase], space: Space, spec: Specification) -> None:
+def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Space, spec: Specification) -> None:
     """Refuse a tuning that no gains within the bounds can make feasible.
 
     Parameters
     ----------
     loop : ClosedLoop
-    every : sequence of TuningCase
+    cases : sequence of TuningCase
         The nominal plant's cases first.
     space : Space
     spec : Specification
@@ -49,13 +49,13 @@ def check_feasibility(loop: ClosedLoop, every: Sequence[TuningCase], space: Spac
         command holds it, or none that the limits allow, or all gains allowed have the wrong sign.
     """
     _check_dither(loop, space)
-    for case in every:
+    for case in cases:
         _check_horizon(case.reference, spec)
     _check_noise(loop, space, spec)
-    for case in every:
+    for case in cases:
         _check_travel(loop, case, space)
         _check_hold(loop, case, space, spec)
-    _check_sign(loop, every[0], space)
+    _check_sign(loop, cases[0], space)
 
 
 def _check_dither(loop: ClosedLoop, space: Space) -> None:

@@ -363,7 +363,7 @@ def _check_interruption(result: TuningResult) -> TuningResult:
 
 
 def _count_successes(designs: Sequence[Design]) -> int:
-    """How many designs are certified."""
+    """The number of certified designs."""
     return sum(_design_status(design).converged for design in designs)
 
 

@@ -120,7 +120,7 @@ def is_sound(y: Array, x_end: Array) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class MarginReader:
-    """How to compute margins and peaks of loops linearised about the end of their responses.
+    """A function that computes margins and peaks of loops linearised about the end of their responses.
 
     Attributes
     ----------

@@ -45,12 +45,12 @@ TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.met
 
 @dataclass(frozen=True, eq=False)
 class TuningResult:
-    """What `tune` found.
+    """The design that `tune` found, with its claim, its certificate and what each requirement comes to.
 
     Attributes
     ----------
     parameters : ParameterSet
-        The given ones with the tuned values, as printed; the given ones unchanged where the status is not "converged".
+        The given ones with the tuned values, rounded; the given ones unchanged where the status is not "converged".
     claimed, certified : DataFrame
         A row a metric, a column a reference, then one a reference and scenario: SettlingTime [s], Overshoot and
         SteadyStateError [% of the step], PeakControl [the command's unit], MaxSensitivity, with dither Ripple [the

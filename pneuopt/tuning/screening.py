@@ -59,7 +59,7 @@ class Screening:
     seed : int
         Of the random numbers.
     digits : int, optional
-        Significant digits of the gains handed out; None: all.
+        Significant digits to which the gains are rounded; None: all.
     """
 
     members: int = 40
@@ -82,13 +82,13 @@ class Screening:
 
     @property
     def successor(self) -> None:
-        """None, for its answer is final."""
+        """No method follows this one: its answer is final."""
 
     def check(self, task: TuningTask) -> None:
         """Accept every task: a simulation can be searched whatever the loop."""
 
     def suits(self, task: TuningTask) -> bool:  # noqa: ARG002
-        """Whether it is the one to choose: always, it is the last in `METHODS`."""
+        """Whether it is the one to choose: always, as the last in `METHODS`."""
         return True
 
     def find(
@@ -109,7 +109,7 @@ class Screening:
         return short_screening(margin, self.digits)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
-        """None, for it can only search anew."""
+        """No path: each set of limits needs a new search."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,9 +116,9 @@ class Search:
 
     def certify_point(self, point: Array) -> TuningResult:
         """Round a point and certify it."""
-        printed = self.space.round_point(point, self.method.digits) if self.method.digits else point
-        found = SearchResult(printed, Status(Code.CONVERGED), (), {"optimum": np.inf})
-        return self.certifier.certify(self.simulator, found, printed)
+        rounded = self.space.round_point(point, self.method.digits) if self.method.digits else point
+        found = SearchResult(rounded, Status(Code.CONVERGED), (), {"optimum": np.inf})
+        return self.certifier.certify(self.simulator, found, rounded)
 
     def with_specification(self, spec: Specification, method: Method) -> "Search":
         """A search for another specification of the same kinds of requirements, on the same compiled simulator."""

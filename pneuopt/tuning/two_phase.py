@@ -59,7 +59,7 @@ class TwoPhase:
     seed : int
         Of the random numbers.
     digits : int, optional
-        Significant digits of the gains handed out; None: all.
+        Significant digits to which the gains are rounded; None: all.
     solver : FullSpace
         Settings of the interior-point solver.
     """
