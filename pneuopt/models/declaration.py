@@ -1,7 +1,7 @@
-"""What a kind of drive declares, so that nobody asks a drive for its type: its TOML kind, its sections and their keys.
+"""Declaration of a kind of drive: its name in files, its sections and their keys; no code asks a drive for its type.
 
-A key of a section either says how the drive is built (a `Key`, declared here), or is one of the drive's parameters
-("load.mass" is the key mass of [load]), or says a parameter in another way (an `Alias`).
+A key of a section either chooses how the drive is built (a `Key`, declared here), or is one of the drive's parameters
+("load.mass" is the key mass of [load]), or gives a parameter in another form (an `Alias`).
 """
 
 from collections.abc import Callable, Mapping
@@ -12,35 +12,35 @@ from pneuopt.dynamics.system import System
 from pneuopt.quantities.errors import InputError, check_names, require
 
 Sections = Mapping[str, Mapping[str, Any]]
-"""A drive's file, as written: by section and key."""
+"""Contents of a drive's file as written, by section and key."""
 
 
 class Drive(Protocol):
-    """What a drive.toml describes."""
+    """A drive that a drive.toml can describe."""
 
     kind: ClassVar[str]
-    """Its name in the registry of drives, and in files."""
+    """Name in the registry of drives and in files."""
 
     def system(self) -> System:
-        """Its equations, with every parameter's default."""
+        """Equations of the drive, with every parameter's default."""
         ...
 
 
 @dataclass(frozen=True)
 class Key:
-    """A key that says how a drive is built.
+    """A key of a section that chooses how a drive is built.
 
     Parameters
     ----------
     form : str
-        What may stand there, as a message says it: "true or false".
+        The values that the key takes, as a message names them: "true or false".
     types : tuple of type
     usual : object
-        What counts where the file leaves the key out.
+        The value where the file leaves the key out.
     choices : mapping of str to object, optional
-        The words that may stand there, and what each means.
+        The words that the key takes, and the object that each stands for.
     required : bool
-        Whether the file has to say it.
+        Whether the file must have the key.
     """
 
     form: str
@@ -51,29 +51,29 @@ class Key:
 
 
 def flag(usual: bool) -> Key:
-    """A key that is true or false."""
+    """Key that is true or false."""
     return Key("true or false", (bool,), usual)
 
 
 def choice(choices: Mapping[str, Any], usual: str | None = None) -> Key:
-    """A key that is one of some words; without a usual one, the file has to say it."""
+    """Key that is one of several words; without a usual one it is required."""
     return Key("text", (str,), usual, choices, required=usual is None)
 
 
 @dataclass(frozen=True)
 class Alias:
-    """A key that says a parameter in another way, as a catalogue's flow says a conductance.
+    """A key that gives a parameter in another form, such as a catalogue's nominal flow for a conductance.
 
     Parameters
     ----------
     section, key : str
     parameter : str
-        What it says; a file holds one of the two.
+        The parameter that it gives; a file has either this parameter or the alias.
     uses : tuple of str
-        Parameters whose values the conversion needs; one that the drive has not is left out.
+        Parameters whose values the conversion needs; those that the drive lacks are left out.
     convert : callable
-        ``convert(entry, values, where)``: what is written, the values [SI] of `uses`, what the message of an error
-        begins with; returns the parameter's value [SI].
+        ``convert(entry, values, where)`` returns the parameter's value [SI] from the written entry, the values [SI] of
+        `uses`, and the place with which the message of an error begins.
     """
 
     section: str
@@ -85,44 +85,44 @@ class Alias:
 
 @dataclass(frozen=True)
 class Structure:
-    """How a file says that a drive is built, read key by key against the declared sections.
+    """Sections of a drive's file, read key by key against their declaration.
 
     Parameters
     ----------
     written : mapping
-        The file's sections.
+        Sections of the file.
     declared : mapping
-        Those of the drive's kind.
+        Declared sections of the drive's kind.
     location : callable
-        ``location(section, key)``: file and line, for messages.
+        ``location(section, key)`` returns file and line for messages.
     """
 
     written: Sections
     declared: Mapping[str, Mapping[str, Key]]
     location: Callable[[str, str], str]
 
-    def says(self, section: str, key: str = "") -> bool:
+    def has(self, section: str, key: str = "") -> bool:
         """Whether the file has the section, or the key in it."""
         return section in self.written and (not key or key in self.written[section])
 
     def place(self, section: str, key: str) -> str:
-        """What the message of an error begins with."""
+        """File, line, section and key, with which the message of an error begins."""
         return f"{self.location(section, key)}: [{section}] {key}"
 
     def options(self, section: str) -> dict[str, Any]:
-        """What each declared key of a section means, the usual value where the file does not say.
+        """Value of each declared key of a section, the usual one where the file leaves the key out.
 
         Raises
         ------
         InputError
-            If a required key is missing, or a key holds what may not stand there.
+            If a required key is missing, or a value is not one that the key takes.
         """
         return {key: self.option(section, key) for key in self.declared[section]}
 
     def option(self, section: str, key: str) -> Any:
-        """What one key means; see `options`."""
+        """Value of one key; see `options`."""
         known = self.declared[section][key]
-        if not self.says(section, key):
+        if not self.has(section, key):
             if known.required:
                 words = ", ".join(known.choices or ())
                 where = self.location(section, "")
@@ -138,22 +138,22 @@ class Structure:
 
 @dataclass(frozen=True)
 class DriveKind:
-    """One row of the registry of drives: how a file describes such a drive, and what can be done with it.
+    """A row of the registry of drives: how a file describes such a drive.
 
-    Its log channels are the inputs and outputs of its `System`, by name and unit. Whether it has a friction map, a
-    meter of air or a position is said by its `System`, too (`axis`, `meter`).
+    Its log channels are the inputs and outputs of its `System`, by name and unit. The `System` also declares whether
+    the drive has an axis, and so a friction map, and a meter (`axis`, `meter`).
 
     Parameters
     ----------
     name : str
-        [drive] kind.
+        Value of kind in [drive].
     sections : mapping
-        Each section that such a file may hold, and its keys; a section of parameters alone has none.
+        Sections that such a file may have, with their keys; a section of parameters alone has no keys.
     build : callable
-        Makes the drive.
+        Builds the drive from a `Structure`.
     aliases : tuple of Alias
     any_friction : bool
-        Whether every friction law fits: ``replace(drive, friction=...)``.
+        Whether ``replace(drive, friction=...)`` works with every friction law.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Drives wired from parts: `ForceDrive` (pushed by a known force), `MotionDrive` (moved, its friction measured)."""
+"""Drives wired from parts: `ForceDrive`, pushed by a known force, and `MotionDrive`, a rig that measures friction."""
 
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,7 +16,7 @@ from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
 
-STANDARD_ATMOSPHERE = 101325.0  # [Pa] standard atmosphere, ISO 2533
+STANDARD_ATMOSPHERE = 101325.0  # pressure of the standard atmosphere, ISO 2533 [Pa]
 POSITION = Quantity("position", "m", nominal=0.1)
 SPEED = Quantity("speed", "m/s", nominal=0.5)
 FORCE = Quantity("force", "N", nominal=100.0)
@@ -24,7 +24,7 @@ FORCE = Quantity("force", "N", nominal=100.0)
 
 @dataclass(frozen=True)
 class ForceDrive:
-    """Load and friction pushed by a known force: any servo axis, or a cylinder whose chamber pressures are logged.
+    """A load with friction, pushed by a known force: any servo axis, or a cylinder whose chamber pressures are logged.
 
     M dv/dt = F - F_f(v) - F_L. Inputs: force [N], and the chambers' absolute pressures where friction depends on them.
 
@@ -41,11 +41,11 @@ class ForceDrive:
     @property
     def parameters(self) -> ParameterSet:
         """load.*, friction.*, and ambient.pressure where friction depends on pressure."""
-        own = self.load.parameters.with_prefix("load") | self.friction.parameters.with_prefix("friction")
-        return own | _ambient_parameters(self.friction)
+        parts = self.load.parameters.with_prefix("load") | self.friction.parameters.with_prefix("friction")
+        return parts | _ambient_parameters(self.friction)
 
     def system(self) -> System:
-        """Wire the parts: states position, speed and the friction's; outputs position, speed."""
+        """Build the equations: states position, speed and those of friction; outputs position, speed."""
         inner = tuple(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
@@ -65,10 +65,10 @@ class ForceDrive:
 
 @dataclass(frozen=True)
 class MotionDrive:
-    """A friction rig: the piston is moved at a known speed, the force on it is measured.
+    """A friction rig: it moves a piston at a known speed and measures the force on it.
 
-    force = area * (1 + area_bias) * (p_a - p_ambient) + F_f(v, p) + force_offset, with the pressure in one chamber, the
-    other open. Without a chamber: force = F_f(v) + force_offset.
+    force = area * (1 + area_bias) * (p_a - p_ambient) + F_f(v, p) + force_offset, with pressure in one chamber and the
+    other one open. Without a chamber: force = F_f(v) + force_offset.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class MotionDrive:
         return offset | self.friction.parameters.with_prefix("friction") | ambient
 
     def system(self) -> System:
-        """Wire the parts: no state but the friction's; output force."""
+        """Build the equations: the states are those of friction; output force."""
         inner = tuple(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
@@ -122,12 +122,12 @@ class MotionDrive:
 FORCE_KIND = DriveKind(
     ForceDrive.kind,
     {"load": LOAD_KEYS, "friction": FRICTION_KEYS, "ambient": {}},
-    lambda said: ForceDrive(read_friction(said), Load(**said.options("load"))),
+    lambda structure: ForceDrive(read_friction(structure), Load(**structure.options("load"))),
 )
 MOTION_KIND = DriveKind(
     MotionDrive.kind,
     {"rig": {"chamber": flag(True)}, "friction": FRICTION_KEYS, "ambient": {}},
-    lambda said: MotionDrive(read_friction(said), **said.options("rig")),
+    lambda structure: MotionDrive(read_friction(structure), **structure.options("rig")),
 )
 
 AMBIENT_PARAMETERS = ParameterSet(
@@ -141,9 +141,9 @@ _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 
 
 def _power_meter(system: System) -> ca.Function:
-    """``(t, x, u, p)`` to what the motor draws [W]: the force's power where it drives, nothing where it brakes.
+    """Function ``(t, x, u, p)`` for the power that the motor draws [W]: that of the force where it drives, else zero.
 
-    A servo drive without recovery burns in its brake resistor what comes back.
+    A servo drive that cannot feed back turns braking power into heat in its brake resistor.
     """
     t, x, u, p = (ca.SX.sym(n, system.ode.size1_in(i)) for i, n in enumerate("txup"))
     force, speed = (u[names(system.inputs).index("force")], x[names(system.states).index("speed")])
@@ -155,10 +155,10 @@ def _ambient_parameters(friction: FrictionModel) -> ParameterSet:
 
 
 def _pressure_inputs(friction: FrictionModel) -> tuple[Quantity, ...]:
-    """The absolute pressures that a pressure-dependent friction needs as inputs."""
+    """Absolute pressures that pressure-dependent friction needs as inputs."""
     return tuple(Quantity(q.name, "Pa(a)", nominal=5e5) for q in friction.inputs if q.unit == "Pa(g)")
 
 
 def rename_quantity(quantity: Quantity, name: str) -> Quantity:
-    """The same signal under another name."""
+    """Copy of a signal with another name."""
     return Quantity(name, quantity.unit, quantity.nominal, quantity.lower, quantity.upper)

@@ -1,4 +1,4 @@
-"""The registry of drives, one row a kind: what files and the command line can read, and what they ask of it."""
+"""The registry of drives, a row for each kind: files and the command line read drives through it."""
 
 from collections.abc import Mapping
 

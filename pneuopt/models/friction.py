@@ -25,10 +25,12 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-STICKING_SPEED = 1e-6  # [m/s] rounds |v| in LuGre: larger values creep visibly, smaller ones take finer steps
-STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # [m/s] in the order that succeeded most often
-MIN_COULOMB_SHARE = 0.05  # of the median force, the least Coulomb level that a start has; at zero a search sticks
-BRISTLE_STIFFNESS_RANGE = (1e4, 1e6)  # [N/m] that a start may have: softer bends for mm, stiffer needs steps below 1 us
+STICKING_SPEED = 1e-6  # rounding of |v| in LuGre [m/s]: a larger one creeps visibly, a smaller one needs finer steps
+STRIBECK_VELOCITIES = (0.025, 0.012, 0.05, 0.006, 0.1, 0.003)  # values that a start tries [m/s], most successful first
+MIN_COULOMB_SHARE = 0.05  # least Coulomb level of a start as a share of the median force [1]; a search sticks at zero
+# Least and greatest bristle stiffness of a start [N/m]: softer bristles bend for millimetres, stiffer ones need steps
+# below 1 us.
+BRISTLE_STIFFNESS_RANGE = (1e4, 1e6)
 CHAMBER_PRESSURES = ("pressure_a", "pressure_b")
 
 
@@ -40,7 +42,7 @@ class Force(NamedTuple):
     value : SX
         [N]
     rates : mapping of str to SX
-        One an internal state, by name.
+        Rate of each internal state, by name.
     """
 
     value: ca.SX
@@ -48,7 +50,7 @@ class Force(NamedTuple):
 
 
 class FrictionModel(Protocol):
-    """What drives, starts, files and advice need of a friction law; one level, no inheritance."""
+    """Interface of a friction law for drives, starts, files and advice; one level, no inheritance."""
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -57,7 +59,7 @@ class FrictionModel(Protocol):
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """What friction depends on beside the speed: gauge pressures [Pa(g)], the force that drives the load [N]."""
+        """Signals that friction depends on beside the speed: gauge pressures [Pa(g)], the driving force [N]."""
         ...
 
     @property
@@ -67,7 +69,7 @@ class FrictionModel(Protocol):
 
     @property
     def excitation(self) -> Excitation:
-        """Which motion a log must show for each parameter to be identifiable; parameters by their own names."""
+        """Motion that a log must show for each parameter to be identifiable, by the law's parameter names."""
         ...
 
     @property
@@ -90,16 +92,16 @@ class Viscous:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Its one number: viscous [N*s/m]."""
+        """One parameter: viscous [N*s/m]."""
         return ParameterSet({"viscous": _VISCOUS_PARAMETER})
 
     @property
     def start(self) -> FrictionStart:
-        """Proportional to the speed."""
+        """Regression with a force proportional to the speed."""
         return FrictionStart(lambda s: {"viscous": s.speed}, ("viscous",), floors={"viscous": 0.0})
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
-        """See the class."""
+        """Return the force and the rates of the states; see the class."""
         return Force(p["viscous"] * v, {})
 
 
@@ -113,19 +115,19 @@ class Coulomb:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Numbers: coulomb [N], viscous [N*s/m], smoothing [m/s]."""
+        """Parameters: coulomb [N], viscous [N*s/m], smoothing [m/s]."""
         return ParameterSet(
             {"coulomb": _COULOMB_PARAMETER, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER}
         )
 
     @property
     def start(self) -> FrictionStart:
-        """A level that follows the direction, and a slope."""
+        """Regression with a level in the direction of motion, and a slope."""
         unknowns = ("coulomb", "viscous")
         return FrictionStart(lambda s: {"coulomb": s.side, "viscous": s.speed}, unknowns, floors=_FLOORS)
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
-        """See the class."""
+        """Return the force and the rates of the states; see the class."""
         return Force(p["coulomb"] * smooth_sign(v, p) + p["viscous"] * v, {})
 
 
@@ -139,17 +141,17 @@ class Stribeck:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Numbers: coulomb, static [N], stribeck_velocity [m/s], viscous [N*s/m], smoothing [m/s]."""
+        """Parameters: coulomb, static [N], stribeck_velocity [m/s], viscous [N*s/m], smoothing [m/s]."""
         return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, "smoothing": _SMOOTHING_PARAMETER})
 
     @property
     def start(self) -> FrictionStart:
-        """Linear in all but the Stribeck velocity."""
+        """Regression that is linear in all parameters but the Stribeck velocity, which is scanned."""
         unknowns = ("coulomb", "viscous", "static", "stribeck_velocity")
         return FrictionStart(_stribeck_columns, unknowns, _FLOORS, {"static": "coulomb"}, _STRIBECK_SCAN)
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
-        """See the class."""
+        """Return the force and the rates of the states; see the class."""
         g = stribeck_curve(v, p["coulomb"], p["static"], p["stribeck_velocity"])
         return Force(g * smooth_sign(v, p) + p["viscous"] * v, {})
 
@@ -160,7 +162,8 @@ class LuGre:
 
     .. math:: \dot z = v - \sigma_0 |v| z / g(v), \qquad F = \sigma_0 z + \sigma_1 e^{-(v/v_d)^2} \dot z + \sigma_2 v
 
-    The damping fades with speed (v_d), which keeps the model passive for any viscous friction.
+    The damping fades with speed (v_d). A constant one is passive only with sigma_2 >= sigma_1 (F_s/F_c - 1), because in
+    ``v zdot = v^2 - sigma_0 |v| v z/g`` the deflection may reach F_s/sigma_0 while g has fallen to F_c.
     """
 
     excitation: ClassVar[Excitation] = BRISTLE_EXCITATION
@@ -168,12 +171,12 @@ class LuGre:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """One: bristle [m], the mean deflection of the bristles."""
+        """One state: bristle [m], the mean deflection of the bristles."""
         return (Quantity("bristle", "m", nominal=4e-4),)
 
     @property
     def parameters(self) -> ParameterSet:
-        """Numbers: coulomb, static [N], stribeck_velocity [m/s], viscous, and the bristles' stiffness and damping."""
+        """Parameters of the Stribeck curve, viscous friction, and the bristles' stiffness and damping."""
         bristles = {
             "bristle_stiffness": Parameter(5e4, "N/m", lower=1e3, upper=1e7, log=True),
             "bristle_damping": Parameter(300.0, "N*s/m", lower=1.0, upper=1e4, log=True),
@@ -183,13 +186,13 @@ class LuGre:
 
     @property
     def start(self) -> FrictionStart:
-        """Sliding, a Stribeck curve; while the bristles only bend, a spring."""
+        """Regression on a Stribeck curve while sliding, and on a spring in presliding."""
         sliding = Stribeck().start
         bristles = Bristles("bristle_stiffness", "coulomb", BRISTLE_STIFFNESS_RANGE, _bristle_deflection)
         return replace(sliding, unknowns=(*sliding.unknowns, "bristle_stiffness", "bristle_damping"), bristles=bristles)
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:  # noqa: ARG002 - the protocol's arguments
-        """See the class."""
+        """Return the force and the rates of the states; see the class."""
         g = stribeck_curve(v, p["coulomb"], p["static"], p["stribeck_velocity"])
         rate = v - p["bristle_stiffness"] * ca.sqrt(v**2 + STICKING_SPEED**2) * z["bristle"] / g
         damping = p["bristle_damping"] * ca.exp(-((v / p["damping_velocity"]) ** 2))
@@ -199,7 +202,7 @@ class LuGre:
 
 @dataclass(frozen=True)
 class Asymmetric:
-    """A base model whose levels differ between the directions: times ``1 + asymmetry * tanh(v / asymmetry_width)``.
+    """A base model with levels that differ by direction: scaled by ``1 + asymmetry * tanh(v / asymmetry_width)``.
 
     Coulomb friction is ``coulomb * (1 + coulomb_asymmetry)`` forwards, ``coulomb * (1 - coulomb_asymmetry)`` backwards.
     """
@@ -208,17 +211,17 @@ class Asymmetric:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """Those of the base model."""
+        """States of the base model."""
         return self.base.states
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """Those of the base model."""
+        """Inputs of the base model."""
         return self.base.inputs
 
     @property
     def parameters(self) -> ParameterSet:
-        """Those of the base, coulomb_asymmetry (static shares it), viscous_asymmetry [1], asymmetry_width [m/s]."""
+        """Parameters of the base, coulomb_asymmetry (also of static), viscous_asymmetry [1], asymmetry_width [m/s]."""
         ratio = Parameter(0.0, "1", lower=-0.95, upper=0.95)
         added = {"viscous_asymmetry": ratio, "asymmetry_width": _SMOOTHING_PARAMETER}
         coulomb = {"coulomb_asymmetry": ratio} if "coulomb" in self.base.parameters else {}
@@ -226,18 +229,18 @@ class Asymmetric:
 
     @property
     def excitation(self) -> Excitation:
-        """Both directions, and what the base needs."""
+        """Excitation of the base model, and motion in both directions."""
         return ASYMMETRY_EXCITATION | self.base.excitation
 
     @property
     def start(self) -> FrictionStart:
-        """That of the base: the directions start alike."""
+        """Start of the base model, with equal levels in both directions."""
         base = self.base.start
         asymmetries = tuple(n for n in ("coulomb_asymmetry", "viscous_asymmetry") if n in self.parameters)
         return replace(base, unknowns=(*base.unknowns, *asymmetries))
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
-        """See the class."""
+        """Return the force and the rates of the states; see the class."""
         side = smooth_sign(v, p, "asymmetry_width")
         levels = {"coulomb": "coulomb_asymmetry", "static": "coulomb_asymmetry", "viscous": "viscous_asymmetry"}
         scaled = {n: p[n] * (1 + p[a] * side) for n, a in levels.items() if n in p}
@@ -248,7 +251,7 @@ class Asymmetric:
 class PressureDependent:
     """A base model whose Coulomb and static levels rise with both chambers' gauge pressures: + c_a p_a + c_b p_b.
 
-    Coefficients of 0.5-3e-5 m^2 are plausible for seals of 25-40 mm.
+    Coefficients of 0.5e-5 to 3e-5 m^2 are plausible for seals of 25 to 40 mm bore.
     """
 
     base: FrictionModel
@@ -262,51 +265,51 @@ class PressureDependent:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """Those of the base model."""
+        """States of the base model."""
         return self.base.states
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """The chambers' gauge pressures [Pa(g)]."""
+        """Gauge pressures of the chambers [Pa(g)]."""
         return tuple(Quantity(name, "Pa(g)", nominal=1e5) for name in self.chambers)
 
     @property
     def parameters(self) -> ParameterSet:
-        """Those of the base, and one coefficient [N/Pa] a chamber."""
+        """Parameters of the base model, and a coefficient [N/Pa] for each chamber."""
         slope = Parameter(0.0, "N/Pa", lower=-1e-3, upper=1e-3)
         return self.base.parameters | ParameterSet({f"coulomb_{name}": slope for name in self.chambers})
 
     @property
     def excitation(self) -> Excitation:
-        """What the base needs."""
+        """Excitation that the base model needs."""
         return self.base.excitation
 
     @property
     def start(self) -> FrictionStart:
-        """Levels are linear in the pressures."""
-        base, own = self.base.start, tuple(f"coulomb_{name}" for name in self.chambers)
+        """Start of the base model, with levels that are linear in the pressures."""
+        base, slopes = self.base.start, tuple(f"coulomb_{name}" for name in self.chambers)
 
         def columns(s: FrictionSamples) -> dict[str, Array]:
-            return base.columns(s) | {n: s.side * s.inputs[c] for n, c in zip(own, self.chambers, strict=True)}
+            return base.columns(s) | {n: s.side * s.inputs[c] for n, c in zip(slopes, self.chambers, strict=True)}
 
-        return replace(base, columns=columns, unknowns=(*base.unknowns, *own))
+        return replace(base, columns=columns, unknowns=(*base.unknowns, *slopes))
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
-        """See the class."""
+        """Return the force and the rates of the states; see the class."""
         rise = sum((p[f"coulomb_{name}"] * u[name] for name in self.chambers), start=ca.SX(0))
         raised = {n: p[n] + rise for n in ("coulomb", "static") if n in p}
         return self.base.force(v, z, u, {**p, **raised})
 
 
 def law_inputs(law: FrictionModel, signals: Mapping[str, Any], p: Mapping[str, Any]) -> dict[str, Any]:
-    """What a law asks for, from a drive's signals, symbols or arrays; absolute pressures become gauge pressures."""
+    """Inputs of a law from a drive's signals, symbols or arrays; absolute pressures become gauge pressures."""
     return {
         q.name: signals[q.name] - p["ambient.pressure"] if q.unit == "Pa(g)" else signals[q.name] for q in law.inputs
     }
 
 
 def smooth_sign(v: ca.SX, p: Symbols, width: str = "smoothing") -> ca.SX:
-    """The sign of the speed, smooth over the parameter `width`; a `direction` among p (`Karnopp`) is taken as it is."""
+    """Sign of the speed, smooth over the parameter `width`; where p has a `direction` (`Karnopp`), that one."""
     return p["direction"] if "direction" in p else ca.tanh(v / p[width])
 
 
@@ -345,7 +348,7 @@ def _stribeck_columns(s: FrictionSamples) -> dict[str, Array]:
 
 
 def _bristle_deflection(force: Array, speed: Array, values: Mapping[str, float]) -> dict[str, Array]:
-    """The deflection that gives the force, up to that at which static friction gives way."""
+    """Bristle deflection that gives the force, at most that at break-away."""
     limit = values["static"] / values["bristle_stiffness"]
     deflection = (force - values["viscous"] * speed) / values["bristle_stiffness"]
     return {"bristle": np.clip(deflection, -limit, limit)}

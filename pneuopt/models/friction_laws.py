@@ -1,6 +1,6 @@
-"""The registry of friction laws, one row each: what files read, the ladder climbs and the table test runs.
+"""The registry of friction laws, a row each, for files, model selection (`friction_ladder`) and the table test.
 
-A row is a law's name in files and its class, which declares all else that is known of it (see `FrictionModel`).
+A row is a law's name in files and its class, which declares everything else (see `FrictionModel`).
 """
 
 from collections.abc import Callable, Mapping
@@ -21,16 +21,16 @@ from pneuopt.models.load_dependent import LoadDependent
 
 @dataclass(frozen=True)
 class Wrapper:
-    """A law around another law.
+    """A law that wraps another law.
 
     Parameters
     ----------
     wrap : callable
-        From the law inside, and perhaps a tuple of words, to the law.
+        Builds the law from the inner law and, where there are options, a tuple of them.
     option : str
-        What the words are, "chamber"; empty where it takes none.
+        Name of an option in messages, "chamber"; empty without options.
     options : tuple of str
-        The words that it takes; without any given, all of them.
+        The options that it takes; all of them where none is given.
     """
 
     wrap: Callable[..., FrictionModel]
@@ -44,20 +44,20 @@ FRICTION_LAWS: Mapping[str, Callable[[], FrictionModel]] = {
     "stribeck": Stribeck,
     "lugre": LuGre,
 }
-"""Laws of their own, from the simplest to the richest: `model = "coulomb"` in a file."""
+"""Basic laws from the simplest to the richest: `model = "coulomb"` in a file."""
 
 FRICTION_WRAPPERS: Mapping[str, Wrapper] = {
     "asymmetric": Wrapper(Asymmetric),
     "load_dependent": Wrapper(LoadDependent),
     "pressure_dependent": Wrapper(PressureDependent, "chamber", CHAMBER_PRESSURES),
 }
-"""Laws around another law, the innermost first: `asymmetric = true` in a file."""
+"""Laws that wrap another law, the innermost first: `asymmetric = true` in a file."""
 
 
 def friction_ladder() -> dict[str, FrictionModel]:
-    """From the simplest to the richest, by name: candidates for `select_model`.
+    """Friction laws by name, from the simplest to the richest: candidates for `select_model`.
 
-    Static laws with a Coulomb level stand there with each wrapper, too, that asks for no signal of its own.
+    Static laws with a Coulomb level are there also with each wrapper that needs no further signal.
     """
     ladder: dict[str, FrictionModel] = {}
     for name, law in FRICTION_LAWS.items():
@@ -69,6 +69,6 @@ def friction_ladder() -> dict[str, FrictionModel]:
 
 
 def usual_unknowns() -> tuple[str, ...]:
-    """The parameters that a comparison of the ladder's laws asks logs for, as a drive names them."""
+    """Parameters that a comparison of these laws estimates, as a drive names them."""
     unknowns = (f"friction.{n}" for law in friction_ladder().values() for n in law.start.unknowns)
     return tuple(dict.fromkeys(unknowns))

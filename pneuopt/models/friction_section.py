@@ -1,4 +1,4 @@
-"""[friction] of a drive's file: which law, and what is wrapped around it."""
+"""Section [friction] of a drive's file: the law and its wrappers."""
 
 from collections.abc import Mapping
 
@@ -14,13 +14,13 @@ FRICTION_KEYS: Mapping[str, Key] = {
 }
 
 
-def read_friction(said: Structure) -> FrictionModel:
-    """The friction that [friction] describes."""
-    options = said.options("friction")
+def read_friction(structure: Structure) -> FrictionModel:
+    """Build the friction law that [friction] describes."""
+    options = structure.options("friction")
     law: FrictionModel = options["model"]()
     for name, wrapper in FRICTION_WRAPPERS.items():
         if isinstance(options[name], list) and options[name]:
-            check_names(wrapper.option, options[name], wrapper.options, said.place("friction", name))
+            check_names(wrapper.option, options[name], wrapper.options, structure.place("friction", name))
             law = wrapper.wrap(law, tuple(options[name]))
         elif options[name]:
             law = wrapper.wrap(law)

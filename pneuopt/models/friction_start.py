@@ -1,4 +1,4 @@
-"""What a friction law declares so that an identification starts from logs without a guess (see `starts.friction`)."""
+"""Declarations of a friction law from which an identification starts without a guess (see `starts.friction`)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -8,20 +8,20 @@ from pneuopt.quantities.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class FrictionSamples:
-    """What a log shows of friction; arrays of shape (n,), parameters and inputs by the law's own names.
+    """Samples of a log for a friction law; arrays of shape (n,), parameters and inputs by the law's names.
 
     Attributes
     ----------
     speed : ndarray
-        Filtered [m/s].
+        Filtered speed [m/s].
     side : ndarray
-        The sign of the speed, smooth over the law's `smoothing`; where the drive is about to give way, the side to
-        which it is pulled.
+        The sign of the speed, smooth over the law's `smoothing`; just before break-away, the sign of the force that
+        pulls.
     level_speed : ndarray
-        The speed at which a level is to be read [m/s]: zero where the drive is about to give way.
+        The speed at which the friction level applies [m/s]: zero just before break-away.
     inputs : mapping of str to ndarray
     values : mapping of str to float
-        The law's parameters as given; of the scanned ones the value that is tried.
+        The law's parameters as given; for a scanned one, the value that is tried.
     """
 
     speed: Array
@@ -33,16 +33,18 @@ class FrictionSamples:
 
 @dataclass(frozen=True)
 class Bristles:
-    """How internal deflections start: their stiffness is the slope of the force while they only bend.
+    """Start of bristle deflections: their stiffness is the slope of the force over travel in presliding.
 
     Parameters
     ----------
     stiffness, level : str
-        Parameters: that slope [N/m], and the sliding force [N] well below which they only bend.
+        Names of the parameters for that slope [N/m] and for the sliding force [N], well below which bristles only bend.
     range : tuple of float
-        Stiffnesses that a start may have [N/m]; softer ones bend for millimetres, stiffer ones need steps below 1 us.
+        Least and greatest stiffness of a start [N/m]: softer bristles bend for millimetres, stiffer ones need
+        integration steps below 1 us.
     deflections : callable
-        ``(force, speed, values)``: the friction force [N], the speed [m/s] and the law's parameters to its states.
+        ``(force, speed, values)`` returns the law's states from the friction force [N], the speed [m/s] and the
+        law's parameters.
     """
 
     stiffness: str
@@ -53,22 +55,22 @@ class Bristles:
 
 @dataclass(frozen=True)
 class FrictionStart:
-    """A law as a regression on logs sees it: ``force = sum(column * parameter)`` once the scanned parameters are given.
+    """A friction law as a linear regression: ``force = sum(column * parameter)`` at given scanned parameters.
 
     Parameters
     ----------
     columns : callable
-        From `FrictionSamples` to what multiplies each parameter, by name.
+        Maps `FrictionSamples` to the regression column of each parameter, by name.
     unknowns : tuple of str
-        The parameters that logs are asked for where nothing else is said.
+        Parameters that are estimated unless the user frees others.
     floors : mapping of str to float
-        The least value that the regression may find, over the median force [1]; it keeps friction from pushing.
+        Least value in the regression as a share of the median force [1], which keeps friction from driving the load.
     above : mapping of str to str
-        Parameters whose column multiplies what they exceed another one by: static friction above Coulomb's.
+        Parameters whose column multiplies their excess over another parameter: static friction over Coulomb friction.
     scanned : mapping of str to tuple of float
-        Parameters on which the force does not depend linearly, and the values to try, the most promising first.
+        Parameters on which the force does not depend linearly, with the values to try, the most promising first.
     bristles : Bristles, optional
-        Of a law with internal states.
+        For a law with internal states.
     """
 
     columns: Callable[[FrictionSamples], dict[str, Array]]

@@ -1,7 +1,7 @@
-"""Karnopp's dry friction: the piston sticks, or slides one way; for simulation, which switches between the three.
+"""Karnopp's dry friction for simulation: the piston sticks, or slides one way or the other.
 
-`ForceDrive(Karnopp(Stribeck())).system()` goes wherever a plant goes; `simulate` sees its "friction.direction" and
-locates each break-away and standstill. A solver that does not switch it sees no dry friction at all.
+`ForceDrive(Karnopp(Stribeck())).system()` is a plant like any other. `simulate` switches its "friction.direction" and
+locates each break-away and standstill; a solver that leaves the direction at zero simulates no dry friction at all.
 """
 
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ SMOOTHING_WIDTHS = ("smoothing", "asymmetry_width")
 
 @dataclass(frozen=True)
 class Karnopp:
-    r"""The limit of a smooth map without smoothing: sgn(v) is the parameter `direction`, and 0 where the piston sticks.
+    r"""A static friction map without smoothing: the parameter `direction` is sgn(v), and 0 where the piston sticks.
 
     .. math:: F = g(v) \, d + \sigma_2 v, \quad d = \pm 1; \qquad |F| \le F_s \text{ at rest}
 
-    Asymmetry and pressure dependence follow the direction likewise. Source: Karnopp, J. Dyn. Sys. Meas. Control 107(1),
+    Asymmetry and pressure dependence use the direction likewise. Source: Karnopp, J. Dyn. Sys. Meas. Control 107(1),
     1985, but with events in place of his zone of small speeds.
 
     Parameters
     ----------
     base : FrictionModel
-        Coulomb() or Stribeck(), wrapped or not; its parameters but the smoothing widths are those of this model.
+        Coulomb() or Stribeck(), wrapped or not; its parameters, except the smoothing widths, are those of this model.
 
     Raises
     ------
@@ -47,30 +47,30 @@ class Karnopp:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """None."""
+        """No states."""
         return ()
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """Those of the base model."""
+        """Inputs of the base model."""
         return self.base.inputs
 
     @property
     def parameters(self) -> ParameterSet:
-        """Those of the base but the smoothing widths, and direction [1], which only a simulation sets."""
+        """Parameters of the base without smoothing widths, and direction [1], which only a simulation sets."""
         kept = {n: p for n, p in self.base.parameters.items() if n not in SMOOTHING_WIDTHS}
         return ParameterSet({**kept, "direction": Parameter(0.0, "1", -1.0, 1.0, source="switched by simulate")})
 
     @property
     def excitation(self) -> Excitation:
-        """What the base needs."""
+        """Excitation that the base model needs."""
         return self.base.excitation
 
     @property
     def start(self) -> FrictionStart:
-        """That of the base."""
+        """Start of the base model."""
         return self.base.start
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
-        """See the class."""
+        """Return the force of the base model with this direction; see the class."""
         return self.base.force(v, z, u, p)

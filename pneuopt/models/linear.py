@@ -179,17 +179,17 @@ class Integrator:
 Plant = FirstOrder | SecondOrder | Integrator
 
 
-def _build_plant(said: Structure) -> Plant:
-    options = said.options("plant")
+def _build_plant(structure: Structure) -> Plant:
+    options = structure.options("plant")
     signals = [options["input"], options["output"]]
-    check_names("channel", signals, CHANNELS, f"{said.location('plant', '')}: [plant]")
+    check_names("channel", signals, CHANNELS, f"{structure.location('plant', '')}: [plant]")
     known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
     u, y = (known.get(name, Quantity(name, CHANNELS[name])) for name in signals)
     order = options["pade_order"]
     if order is None:
-        order = USUAL_PADE_ORDER if said.says("plant", "dead_time") else 0
+        order = USUAL_PADE_ORDER if structure.has("plant", "dead_time") else 0
     if options["model"] is SecondOrder:
-        return SecondOrder(order, read_friction(said) if said.says("friction") else None, u, y)
+        return SecondOrder(order, read_friction(structure) if structure.has("friction") else None, u, y)
     plant: Plant = options["model"](order, u, y)
     return plant
 

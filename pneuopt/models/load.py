@@ -9,9 +9,9 @@ from pneuopt.dynamics.system import Symbols
 from pneuopt.models.declaration import flag
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
-GRAVITY = 9.80665  # [m/s^2] standard
+GRAVITY = 9.80665  # standard acceleration of gravity, 3rd CGPM, 1901 [m/s^2]
 LOAD_KEYS = {"spring": flag(False), "inclined": flag(False)}
-"""[load] of a drive's file: the arguments of `Load`."""
+"""Keys of section [load] of a drive's file: the arguments of `Load`."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Load:
     @property
     def parameters(self) -> ParameterSet:
         """Mass [kg], force [N]; with a spring stiffness [N/m], rest_position [m]; inclined: inclination [rad]."""
-        own = {
+        always = {
             "mass": Parameter(5.0, "kg", lower=1e-3, upper=1e5, log=True),
             "force": Parameter(0.0, "N", lower=-1e5, upper=1e5),
         }
@@ -43,10 +43,10 @@ class Load:
             "rest_position": Parameter(0.0, "m"),
         }
         incline = {"inclination": Parameter(pi / 2, "rad", lower=-pi / 2, upper=pi / 2)}
-        return ParameterSet({**own, **(spring if self.spring else {}), **(incline if self.inclined else {})})
+        return ParameterSet({**always, **(spring if self.spring else {}), **(incline if self.inclined else {})})
 
     def acceleration(self, driving: ca.SX, position: ca.SX, p: Symbols) -> ca.SX:
-        """Acceleration [m/s^2] under a driving force net of friction [N] at a position [m]."""
+        """Acceleration [m/s^2] at a position [m] under a driving force less friction [N]."""
         pull = p["stiffness"] * (position - p["rest_position"]) if self.spring else 0
         weight = GRAVITY * ca.sin(p["inclination"]) if self.inclined else 0
         return (driving - p["force"] - pull) / p["mass"] - weight

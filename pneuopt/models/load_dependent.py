@@ -19,8 +19,8 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 class LoadDependent:
     """A base model whose Coulomb and static levels rise with the transmitted force F: + coulomb_load |F|, |F| smooth.
 
-    ``|F| = sqrt(F^2 + load_rounding^2) - load_rounding``: zero without load, and never more than the true size. F is
-    what drives the load: the input of a `ForceDrive`, the torque of a `RotaryDrive`. Gears of servos: coulomb_load
+    ``|F| = sqrt(F^2 + load_rounding^2) - load_rounding``: zero without load, and never more than the exact value. F
+    drives the load: the input of a `ForceDrive`, the torque of a `RotaryDrive`. For gears of servos coulomb_load is
     0.01 to 0.2.
 
     Source: Hamon, Gautier, Garrec, Dynamic identification of robots with a dry friction model depending on load and
@@ -35,33 +35,33 @@ class LoadDependent:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """Those of the base model."""
+        """States of the base model."""
         return self.base.states
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """Those of the base model, and the transmitted force [N]."""
+        """Inputs of the base model, and the transmitted force [N]."""
         return (*self.base.inputs, Quantity("force", "N", nominal=100.0))
 
     @property
     def parameters(self) -> ParameterSet:
-        """Those of the base, coulomb_load [1] and load_rounding [N]."""
-        own = {
+        """Parameters of the base model, coulomb_load [1] and load_rounding [N]."""
+        added = {
             "coulomb_load": Parameter(0.0, "1", lower=0.0, upper=0.9),
             "load_rounding": Parameter(1.0, "N", lower=1e-3, upper=1e3, log=True),
         }
-        return self.base.parameters | ParameterSet(own)
+        return self.base.parameters | ParameterSet(added)
 
     @property
     def excitation(self) -> Excitation:
-        """Loads that differ, and what the base needs."""
+        """Excitation of the base model, and loads that differ."""
         words = "log sliding under a load that is known and large: a weight lifted and lowered, or a spring"
         others = FRICTION_LEVELS | {"viscous", "load.mass", "load.inertia"}
         return Excitation(runs=(SeparatingRun(frozenset({"coulomb_load"}), others, words),)) | self.base.excitation
 
     @property
     def start(self) -> FrictionStart:
-        """Levels are linear in the size of the force."""
+        """Start of the base model, with levels that are linear in the absolute force."""
         base = self.base.start
 
         def columns(s: FrictionSamples) -> dict[str, Array]:
@@ -72,7 +72,7 @@ class LoadDependent:
         return replace(base, columns=columns, unknowns=(*base.unknowns, "coulomb_load"))
 
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
-        """See the class."""
+        """Return the force of the base model with raised levels; see the class."""
         size = ca.sqrt(u["force"] ** 2 + p["load_rounding"] ** 2) - p["load_rounding"]
         raised = {n: p[n] + p["coulomb_load"] * size for n in ("coulomb", "static") if n in p}
         return self.base.force(v, z, u, {**p, **raised})

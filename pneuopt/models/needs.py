@@ -1,4 +1,4 @@
-"""What motion the parameters of drives and friction laws need in a log, and the runs that separate them from others."""
+"""Motion that a log must show for the parameters of drives and friction laws, and runs that separate them."""
 
 import math
 from functools import partial
@@ -8,25 +8,27 @@ import numpy as np
 from pneuopt.dynamics.excitation import Excitation, Lack, LoggedMotion, Need, SeparatingRun
 from pneuopt.quantities.parameters import ParameterSet
 
-MIN_SPEED_RATIO = 3.0  # fast over slow speed [1]; below it a friction curve is a point, above it more logs are refused
-VISCOUS_SPEED_RATIO = 5.0  # speed over the Stribeck velocity [1] from which viscous friction shows beside its peak
-MIN_SLOW_SAMPLES = 20  # samples below the Stribeck velocity; fewer are noise, more would refuse logs that show it
-MIN_DIRECTION_SHARE = 0.05  # of the moving samples; below it the rarer direction is an accident
-MIN_REVERSALS = 2  # reversals that show presliding more than once
-MIN_INERTIA_SHARE = 0.02  # of the friction level [1]; inertia below it is lost in the model's own error
-DEFAULT_STRIBECK_VELOCITY = 0.02  # [m/s] where a model has none
+MIN_SPEED_RATIO = (
+    3.0  # fast over slow speed [1]: a smaller ratio shows one point of the curve, a larger bound refuses logs
+)
+VISCOUS_SPEED_RATIO = 5.0  # speed over the Stribeck velocity [1] beyond which the static peak hides no viscous friction
+MIN_SLOW_SAMPLES = 20  # samples below the Stribeck velocity: fewer are noise, a larger bound refuses good logs
+MIN_DIRECTION_SHARE = 0.05  # share of the moving samples in the rarer direction [1]: fewer are accidental
+MIN_REVERSALS = 2  # reversals of the motion: one alone does not show that presliding repeats
+MIN_INERTIA_SHARE = 0.02  # inertia force over the friction level [1]: less is lost in the model's error
+DEFAULT_STRIBECK_VELOCITY = 0.02  # for laws without a Stribeck velocity [m/s]
 FRICTION_LEVELS = frozenset({"coulomb", "static"})
 STRIBECK_CURVE = FRICTION_LEVELS | {"stribeck_velocity"}
 BRISTLES = frozenset({"bristle_stiffness", "bristle_damping", "damping_velocity"})
 CONSTANT_FORCES = frozenset({"load.force", "rig.force_offset"})
-"""Parameters of drives that push one way whatever the speed."""
+"""Parameters of drives for a force that is constant, whatever the speed."""
 ALIKE_AT_EVERY_SPEED = (
     "they act alike at every speed: fix one, measure the offset with the load uncoupled, or turn the axis round"
 )
 
 
 def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
-    """What a Stribeck curve and its two ends need: slow speeds and fast ones."""
+    """Lack of the slow and fast speeds that a Stribeck curve needs, if any."""
     stribeck = _largest("friction.stribeck_velocity", DEFAULT_STRIBECK_VELOCITY, seen.values)
     speed = np.abs(seen.speed)
     below = int(np.count_nonzero((speed > 0.1 * stribeck) & (speed < stribeck)))
@@ -43,7 +45,7 @@ def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
 
 
 def lacks_speed_range(seen: LoggedMotion) -> Lack | None:
-    """What a slope over speed needs: speeds that differ."""
+    """Lack of the different speeds that a slope over speed needs, if any."""
     if seen.fast < MIN_SPEED_RATIO * seen.slow:
         unit, beyond = _speed_unit(seen), VISCOUS_SPEED_RATIO * seen.fast
         message = f"nearly all speeds lie between {seen.slow:.2g} and {seen.fast:.2g} {unit}, too near for a slope"
@@ -52,7 +54,7 @@ def lacks_speed_range(seen: LoggedMotion) -> Lack | None:
 
 
 def lacks_directions(seen: LoggedMotion) -> Lack | None:
-    """What a force that depends on the direction, or does not, needs: motion both ways."""
+    """Lack of the motion in both directions that asymmetric or constant forces need, if any."""
     if min(seen.forward, 1 - seen.forward) < MIN_DIRECTION_SHARE:
         way = "forwards" if seen.forward > 0.5 else "backwards"
         return Lack(f"the drive moves {way} only", "log both directions")
@@ -60,7 +62,7 @@ def lacks_directions(seen: LoggedMotion) -> Lack | None:
 
 
 def lacks_presliding(seen: LoggedMotion) -> Lack | None:
-    """What bristles need: reversals."""
+    """Lack of the reversals that bristles need, if any."""
     if seen.reversals < MIN_REVERSALS:
         count = f"the motion reverses {seen.reversals} times" if seen.reversals else "the motion never reverses"
         return Lack(
@@ -71,7 +73,7 @@ def lacks_presliding(seen: LoggedMotion) -> Lack | None:
 
 
 def lacks_acceleration(inertia: str, remedy: str, seen: LoggedMotion) -> Lack | None:
-    """What the parameter `inertia` needs: a force that shows beside friction; of two known values the larger counts."""
+    """Lack of the acceleration that `inertia` needs beside friction, if any; the larger of two known values counts."""
     force = _largest(inertia, math.nan, seen.values, seen.given) * seen.acceleration
     friction = _largest("friction.coulomb", math.nan, seen.values)
     if force < MIN_INERTIA_SHARE * friction:
@@ -130,16 +132,16 @@ _LEVELS = frozenset(f"friction.{n}" for n in FRICTION_LEVELS)
 
 
 def load_excitation(inertia: str, force: str, push: str, remedy: str) -> Excitation:
-    """What the load of a drive needs.
+    """Excitation that the load of a drive needs.
 
     Parameters
     ----------
     inertia, force : str
-        Its parameters: what resists acceleration, and what pushes one way whatever the speed.
+        Names of the load's parameters: its inertia, and its constant force.
     push : str
-        What the drive pushes with, in words: "force", "torque".
+        The drive's input in words: "force", "torque".
     remedy : str
-        How the inertia becomes known without a log, in words.
+        How the inertia is found without a log, in words.
     """
     lacks = partial(lacks_acceleration, inertia, f"{remedy}, or log steps of {push}")
     asymmetry, slope = (
@@ -167,5 +169,5 @@ def _speed_unit(seen: LoggedMotion) -> str:
 
 
 def _known_unit(seen: LoggedMotion, *names: str) -> str:
-    """The unit of the first parameter that is known; empty where none is."""
+    """Unit of the first parameter that is known; empty where none is."""
     return next((known[n].unit for n in names for known in (seen.given, seen.values) if n in known), "")

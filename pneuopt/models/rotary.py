@@ -46,7 +46,7 @@ class RotaryDrive:
     Raises
     ------
     ModelError
-        If the friction depends on signals that an axis has not, as on a cylinder's pressures.
+        If the friction depends on signals that an axis lacks, such as a cylinder's pressures.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class RotaryDrive:
 
     def __post_init__(self) -> None:
         needed = ", ".join(q.name for q in self.friction.inputs if q.name != "force")
-        require(not needed, f"{type(self.friction).__name__} needs {needed}, which a rotary axis has not", ModelError)
+        require(not needed, f"{type(self.friction).__name__} needs {needed}, which a rotary axis lacks", ModelError)
 
     @property
     def parameters(self) -> ParameterSet:
@@ -69,7 +69,7 @@ class RotaryDrive:
         return ParameterSet(load) | ParameterSet(friction).with_prefix("friction")
 
     def system(self) -> System:
-        """Wire the parts."""
+        """Build the equations; states and outputs as in the class."""
         states = (ANGLE, SPEED, *(_turning_state(q) for q in self.friction.states))
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
@@ -87,7 +87,7 @@ class RotaryDrive:
 
 @dataclass(frozen=True)
 class _RotaryStarts:
-    """Starts from logs: those of a mass that slides along the shaft's circumference of `RADIUS`."""
+    """Starts from logs, computed as for a mass that slides on a circle of `RADIUS` about the shaft."""
 
     friction: FrictionModel
 
@@ -96,10 +96,10 @@ class _RotaryStarts:
         return [self._turning_start(start) for start in force_starts(self.friction, sliding)]
 
     def _factors(self) -> dict[str, tuple[str, str, float]]:
-        """By its name each parameter's name and unit for sliding, and what it is multiplied by for turning."""
+        """Name and unit of each parameter for sliding, and the factor that turns its value into that of the shaft."""
         load = {"load.inertia": ("load.mass", "kg", RADIUS**2), "load.torque": ("load.force", "N", RADIUS)}
-        own = self.friction.parameters
-        return load | {f"friction.{n}": (f"friction.{n}", p.unit, _turning_unit(p.unit)[1]) for n, p in own.items()}
+        friction = self.friction.parameters.items()
+        return load | {f"friction.{n}": (f"friction.{n}", p.unit, _turning_unit(p.unit)[1]) for n, p in friction}
 
     def _sliding_parameters(self, log: Log) -> ParameterSet:
         return ParameterSet(
@@ -118,7 +118,7 @@ class _RotaryStarts:
 
 
 def _turning_unit(unit: str) -> tuple[str, float]:
-    """A sliding friction's unit for a shaft, and what its values are multiplied by.
+    """Unit of a sliding friction's parameter on a shaft, and the factor on its values.
 
     Examples
     --------
@@ -143,17 +143,17 @@ def _scale(parameter: Parameter, unit: str, factor: float) -> Parameter:
 
 
 def _sliding_log(measured: Trajectory) -> Trajectory:
-    """The log of the mass."""
+    """Log of a shaft as that of the sliding mass."""
     factors = {"torque": ("force", 1 / RADIUS), "angle": ("position", RADIUS), "speed": ("speed", RADIUS)}
     return Trajectory(measured.t, {factors[n][0]: factors[n][1] * measured[n] for n in measured if n in factors})
 
 
 def _turning_run(run: Trajectory) -> Trajectory:
-    """The shaft's states along a log, from those of the mass."""
+    """States of the shaft along a log, from those of the sliding mass."""
     names = {"position": "angle"}
     return Trajectory(run.t, {names.get(n, n): run[n] / RADIUS for n in run})
 
 
 ROTARY_KIND = DriveKind(
-    RotaryDrive.kind, {"load": {}, "friction": FRICTION_KEYS}, lambda said: RotaryDrive(read_friction(said))
+    RotaryDrive.kind, {"load": {}, "friction": FRICTION_KEYS}, lambda structure: RotaryDrive(read_friction(structure))
 )

@@ -96,7 +96,7 @@ def test_advice_speaks_in_the_axis_units() -> None:
 
 
 def test_a_friction_that_needs_pressures_is_refused() -> None:
-    with pytest.raises(ModelError, match="needs pressure_a, pressure_b, which a rotary axis has not"):
+    with pytest.raises(ModelError, match="needs pressure_a, pressure_b, which a rotary axis lacks"):
         RotaryDrive(PressureDependent(Coulomb()))
 
 

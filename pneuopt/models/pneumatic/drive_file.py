@@ -38,16 +38,16 @@ _SECTIONS: Mapping[str, Mapping[str, Key]] = {
 }
 
 
-def _build_drive(said: Structure) -> PneumaticDrive:
-    options = said.options("valve")
-    valve = ProportionalValve(options["law"](), options["spool"], _read_smoothing(options["smoothing"], said))
-    cylinder, load = Cylinder(**said.options("cylinder")), Load(**said.options("load"))
-    return PneumaticDrive(valve, read_friction(said), load, _read_chamber(said), cylinder)
+def _build_drive(structure: Structure) -> PneumaticDrive:
+    options = structure.options("valve")
+    valve = ProportionalValve(options["law"](), options["spool"], _read_smoothing(options["smoothing"], structure))
+    cylinder, load = Cylinder(**structure.options("cylinder")), Load(**structure.options("load"))
+    return PneumaticDrive(valve, read_friction(structure), load, _read_chamber(structure), cylinder)
 
 
-def _read_smoothing(table: Mapping[str, Any], said: Structure) -> Smoothing:
+def _read_smoothing(table: Mapping[str, Any], structure: Structure) -> Smoothing:
     """How the orifice's law is rounded: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
-    where = said.place("valve", "smoothing")
+    where = structure.place("valve", "smoothing")
     check_names("key", table, _SMOOTHING_UNITS, where)
     widths = {n: read_value(v, _SMOOTHING_UNITS[n], where=f"{where}: {n}") for n, v in table.items()}
     for name, width in widths.items():
@@ -55,12 +55,12 @@ def _read_smoothing(table: Mapping[str, Any], said: Structure) -> Smoothing:
     return Smoothing(**widths)
 
 
-def _read_chamber(said: Structure) -> ChamberModel:
-    options = said.options("chamber")
+def _read_chamber(structure: Structure) -> ChamberModel:
+    options = structure.options("chamber")
     if options["model"] is Polytropic:
         return Polytropic(options["mixed"])
-    message = f"{said.place('chamber', 'mixed')}: a thermal chamber has no exponents; leave it out"
-    require(not said.says("chamber", "mixed"), message)
+    message = f"{structure.place('chamber', 'mixed')}: a thermal chamber has no exponents; leave it out"
+    require(not structure.has("chamber", "mixed"), message)
     return Thermal()
 
 
