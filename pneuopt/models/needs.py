@@ -8,9 +8,7 @@ import numpy as np
 from pneuopt.dynamics.excitation import Excitation, Lack, LoggedMotion, Need, SeparatingRun
 from pneuopt.quantities.parameters import ParameterSet
 
-MIN_SPEED_RATIO = (
-    3.0  # fast over slow speed [1]: a smaller ratio shows one point of the curve, a larger bound refuses logs
-)
+MIN_SPEED_RATIO = 3.0  # fast over slow speed [1]: less shows one point of the curve, a larger bound refuses good logs
 VISCOUS_SPEED_RATIO = 5.0  # speed over the Stribeck velocity [1] beyond which the static peak hides no viscous friction
 MIN_SLOW_SAMPLES = 20  # samples below the Stribeck velocity: fewer are noise, a larger bound refuses good logs
 MIN_DIRECTION_SHARE = 0.05  # share of the moving samples in the rarer direction [1]: fewer are accidental

@@ -134,7 +134,7 @@ def test_bad_input_is_named() -> None:
         evaluate(Rig(loop.plant, {"speed": Sensor()}), Step(0.1), p)
     with pytest.raises(InputError, match=r"two references are '0 to 0.1'"):
         evaluate(loop, [Step(0.1), Step(0.1, horizon=0.5)], p)
-    with pytest.raises(InputError, match="told by position, speed and pressure_b, not by valve"):
+    with pytest.raises(InputError, match="starts from position, speed and pressure_b, not from valve"):
         evaluate(cylinder(Stribeck())[0], Step(0.1, start={"valve": 0.0}), p)
 
 

@@ -1,4 +1,4 @@
-"""The air in a cylinder's chamber: pressure, and where wanted temperature, from flows and motion."""
+"""The air in a cylinder's chamber: its pressure, and optionally its temperature, from flows and motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,10 @@ from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import ISENTROPIC_EXPONENT
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
-FLOW_REVERSAL_WIDTH = 1e-5  # [kg/s] over which a flow's exponent or temperature changes from outflow's to inflow's
-MIN_CHAMBER_PRESSURE = 1e3  # [Pa] below it nothing here is meant to hold
+# Mass flow over which exponent or temperature change from outflow to inflow [kg/s]: a narrower one is stiffer at rest,
+# a wider one mixes the two in motion.
+FLOW_REVERSAL_WIDTH = 1e-5
+MIN_CHAMBER_PRESSURE = 1e3  # absolute pressure [Pa] below which the models are not valid
 PRESSURE = Quantity("pressure", "Pa(a)", nominal=5e5, lower=MIN_CHAMBER_PRESSURE)
 
 
@@ -23,7 +25,7 @@ class Inflow(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """What a chamber does not determine: volume [m^3], its rate [m^3/s], temperature of supply and wall [K], R."""
+    """Quantities outside the air: volume [m^3], its rate [m^3/s], temperature of supply and wall [K], gas constant."""
 
     volume: ca.SX
     volume_rate: ca.SX
@@ -32,16 +34,16 @@ class Surroundings(NamedTuple):
 
 
 class ChamberModel(Protocol):
-    """What a drive needs of a chamber; one level, no inheritance."""
+    """Interface of a chamber for a drive; one level, no inheritance."""
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """Pressure, and what else the air needs."""
+        """States of the air: the pressure, and others if the model has them."""
         ...
 
     @property
     def parameters(self) -> ParameterSet:
-        """Shared by a drive's chambers."""
+        """Parameters, which a drive's chambers share."""
         ...
 
     def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:
@@ -55,19 +57,19 @@ class ChamberModel(Protocol):
 
 @dataclass(frozen=True)
 class Polytropic:
-    r"""No temperature state: an exponent between isothermal (1) and adiabatic (1.4).
+    r"""A polytropic chamber without temperature state: its exponent lies between isothermal (1) and adiabatic (1.4).
 
     .. math:: \dot p = \frac{1}{V} \left( \alpha(w) R T w - \alpha_V p \dot V \right), \qquad w = \sum_j w_j
 
     With all three exponents 1 mass is conserved exactly; all 1.4 is eq. (7) and (8) of Ye, Wang, Chen (IJRES 3(7),
-    2015). The exponent of inflow or outflow goes by the net flow: with one a flow, a valve that leaks at its null would
-    rest where more air leaves than enters.
+    2015). The net flow decides between the exponents of inflow and outflow. If each flow had its own, a valve that
+    leaks at its null would be at rest where more air leaves than enters.
 
     Parameters
     ----------
     mixed : bool
-        Exponents of their own for inflow, outflow and volume; Richer & Hurmuzlu, J. Dyn. Sys. Meas. Control 122(3),
-        2000, found 1.4, 1 and 1.2 to agree with experiment.
+        Whether inflow, outflow and volume have separate exponents; Richer & Hurmuzlu, J. Dyn. Sys. Meas. Control
+        122(3), 2000, found 1.4, 1 and 1.2 to agree with experiment.
     """
 
     mixed: bool = False
@@ -79,7 +81,7 @@ class Polytropic:
 
     @property
     def parameters(self) -> ParameterSet:
-        """The exponent [1]; if mixed, inflow_exponent, outflow_exponent, volume_exponent."""
+        """Parameters: exponent [1], or if mixed inflow_exponent, outflow_exponent, volume_exponent."""
         if not self.mixed:
             return ParameterSet({"exponent": Parameter(1.2, "1", 0.9, 1.5)})
         values = {"inflow_exponent": 1.4, "outflow_exponent": 1.0, "volume_exponent": 1.2}
@@ -87,11 +89,11 @@ class Polytropic:
         return ParameterSet({n: Parameter(v, "1", 0.9, 1.5, source=source) for n, v in values.items()})
 
     def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
-        """That of the surroundings."""
+        """Temperature of the surroundings."""
         return outside
 
     def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
-        """See the class."""
+        """Return the rates of the states; see the class."""
         w = sum((flow.rate for flow in flows), start=ca.SX(0))
         inward, outward, swept = (
             p[f"{n}_exponent" if self.mixed else "exponent"] for n in ("inflow", "outflow", "volume")
@@ -108,7 +110,7 @@ class Thermal:
         \dot p = \frac{\kappa R}{V} \sum_j T_j w_j - \kappa \frac{p \dot V}{V} + \frac{\kappa - 1}{V} h A (T_w - T)
         \qquad \dot T = T \left( \frac{\dot p}{p} + \frac{\dot V}{V} - \frac{R T}{p V} \sum_j w_j \right)
 
-    T_j is that of the source for inflow, the chamber's for outflow; the wall keeps the surroundings' temperature.
+    T_j is the source's temperature for inflow, the chamber's for outflow; the wall has the surroundings' temperature.
     """
 
     @property
@@ -118,15 +120,15 @@ class Thermal:
 
     @property
     def parameters(self) -> ParameterSet:
-        """wall_conductance [W/K], heat transfer coefficient times wall area."""
+        """Parameter: wall_conductance [W/K], heat transfer coefficient times wall area."""
         return ParameterSet({"wall_conductance": Parameter(0.5, "W/K", 0.0, 1e3)})
 
     def temperature(self, z: Symbols, outside: ca.SX) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
-        """Its own."""
+        """Temperature of the air, a state."""
         return z["temperature"]
 
     def rates(self, z: Symbols, flows: Sequence[Inflow], around: Surroundings, p: Symbols) -> dict[str, ca.SX]:
-        """See the class."""
+        """Return the rates of the states; see the class."""
         pressure, temperature, k = z["pressure"], z["temperature"], ISENTROPIC_EXPONENT
         enthalpy = sum((w * blend(w, source, temperature) for w, source in flows), start=ca.SX(0))
         heat = p["wall_conductance"] * (around.temperature - temperature)
@@ -140,14 +142,14 @@ class Thermal:
 
 
 def blend(flow: ca.SX, inward: ca.SX, outward: ca.SX) -> ca.SX:
-    """A property of the air that passes: `inward` for flow into the chamber, `outward` for flow out, smooth between.
+    """Property of the flowing air: `inward` for flow into the chamber, `outward` for flow out, smooth in between.
 
     Parameters
     ----------
     flow : SX or float
         Mass flow into the chamber [kg/s].
     inward, outward : SX or float
-        The property either way, in any unit.
+        The property in either direction, in any unit.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A double-acting cylinder's geometry: areas, volumes, end stops, leakage past the piston.
+"""Geometry of a double-acting cylinder: areas, volumes, end stops, leakage past the piston.
 
 Position counts from the end at which chamber a is smallest; the rod is on side b.
 """
@@ -12,25 +12,28 @@ from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import REFERENCE_PRESSURE
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
-STOP_ROUNDING = 1e-4  # [m] of the end stops' onset; 10 mm away a stop of 1e6 N/m still pushes with 0.25 N
+# Rounding of the end stops' onset [m]: with a larger one the stops push far inside the stroke (now 0.25 N at 10 mm from
+# a stop of 1e6 N/m), with a smaller one impacts need finer steps.
+STOP_ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Bore, rod, stroke and what belongs to them.
+    """A double-acting cylinder: bore, rod, stroke, dead volumes, leakage and end stops.
 
     Parameters
     ----------
     stops : bool
-        Whether the covers act; else position runs on beyond the stroke, for optimisers that bound it themselves.
+        Whether the covers stop the piston; otherwise it runs on beyond the stroke, for optimisers that bound the
+        position themselves.
     """
 
     stops: bool = True
 
     @property
     def parameters(self) -> ParameterSet:
-        """Geometry, leak; start, where a drive at rest stands; with stops their stiffness and damping."""
-        own = {
+        """Parameters: geometry, leak, the rest position `start`, and with stops their stiffness and damping."""
+        always = {
             "bore": Parameter(0.032, "m", 1e-3, 1.0),
             "rod": Parameter(0.012, "m", 0.0, 1.0),
             "stroke": Parameter(0.2, "m", 1e-3, 20.0),
@@ -43,7 +46,7 @@ class Cylinder:
             "stop_stiffness": Parameter(1e6, "N/m", 0.0, 1e9),
             "stop_damping": Parameter(1.0, "s/m", 0.0, 100.0),
         }
-        return ParameterSet({**own, **(stops if self.stops else {})})
+        return ParameterSet({**always, **(stops if self.stops else {})})
 
     def stop_force(self, y: ca.SX, v: ca.SX, p: Symbols) -> ca.SX:
         r"""Force of the covers on the piston [N] at position y [m] and speed v [m/s].
@@ -58,7 +61,7 @@ class Cylinder:
 
 
 def areas(bore: ca.SX, rod: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Piston areas of chamber a and of chamber b, where the rod is.
+    """Piston areas towards chamber a and towards chamber b, where the rod is.
 
     Parameters
     ----------
@@ -80,7 +83,7 @@ def areas(bore: ca.SX, rod: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def volumes(y: ca.SX, p: Symbols) -> tuple[ca.SX, ca.SX]:
-    """Volumes of both chambers [m^3] at position y [m], dead volumes counted.
+    """Volumes of both chambers [m^3] at position y [m], dead volumes included.
 
     Parameters
     ----------

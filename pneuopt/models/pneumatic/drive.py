@@ -1,4 +1,4 @@
-"""`PneumaticDrive`: supply, proportional valve, cylinder and load, wired by hand into one ODE."""
+"""`PneumaticDrive`: supply, proportional valve, cylinder and load in one ODE."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -47,10 +47,10 @@ class PneumaticDrive:
     ----------
     valve : ProportionalValve
     friction : FrictionModel
-        One that depends on pressure gets both chambers' gauge pressures.
+        A law that depends on pressure gets both chambers' gauge pressures.
     load : Load
     chamber : ChamberModel
-        Of both chambers.
+        Model of both chambers.
     cylinder : Cylinder
     """
 
@@ -63,7 +63,7 @@ class PneumaticDrive:
 
     @property
     def parameters(self) -> ParameterSet:
-        """cylinder.*, valve.*, supply.pressure, ambient.*, gas.constant, chamber.*, load.*, friction.*."""
+        """Parameters cylinder.*, valve.*, supply.pressure, ambient.*, gas.constant, chamber.*, load.*, friction.*."""
         parts = {
             "cylinder": self.cylinder.parameters,
             "valve": self.valve.parameters,
@@ -73,19 +73,19 @@ class PneumaticDrive:
             "friction": self.friction.parameters,
         }
         joined = ParameterSet()
-        for name, own in parts.items():
-            joined |= own.with_prefix(name)
+        for name, parameters in parts.items():
+            joined |= parameters.with_prefix(name)
         return joined | AMBIENT_PARAMETERS | _AIR_PARAMETERS
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """The load's, the chambers', the valve's, the friction's."""
+        """States of load, chambers, valve and friction, in this order."""
         air = tuple(rename_quantity(q, f"{q.name}_{side}") for q in self.chamber.states for side in SIDES)
         spool = tuple(rename_quantity(q, f"valve.{q.name}") for q in self.valve.states)
         return POSITION, SPEED, *air, *spool, *(rename_quantity(q, f"friction.{q.name}") for q in self.friction.states)
 
     def system(self) -> System:
-        """Wire the parts."""
+        """Build the equations; states, input and outputs as in the class."""
         return self._system
 
     def check(self, parameters: ParameterSet, start: Mapping[str, float] | None = None) -> None:
@@ -94,16 +94,16 @@ class PneumaticDrive:
         Parameters
         ----------
         parameters : ParameterSet
-            A missing one counts with its default.
+            Missing parameters have their defaults.
         start : mapping of state to value, optional
 
         Raises
         ------
         InputError
-            Naming parameter, value, source and what would be possible.
+            Names parameter, value, source and possible values.
         """
-        own = self.parameters
-        used = own | parameters.select(n for n in parameters if n in own)
+        defaults = self.parameters
+        used = defaults | parameters.select(n for n in parameters if n in defaults)
         check_hardware(used)
         if start is not None:
             check_start(used, start)
@@ -116,12 +116,12 @@ class PneumaticDrive:
         speed: float = 0.0,
         pressure_b: float | None = None,
     ) -> Rest:
-        """Where the drive stands still, friction unloaded, or moves steadily.
+        """State in which the drive is at rest with unloaded friction, or moves steadily.
 
-        No air flows on balance and the forces cancel: a cylinder with a rod, or under load, needs a spool a little off
-        its centre for that. It is an equilibrium of the ODE, whatever the friction. In motion every rate but that of
-        the position is zero, wherever the piston is: the valve feeds and drains what the piston sweeps, the bristles
-        are as bent as they stay. The end stops, whose force depends on the position, count with that at the start.
+        At rest the net flow into each chamber is zero and the forces balance; with a rod, or under load, the spool is
+        then slightly off centre. This is an equilibrium of the ODE, whatever the friction. In steady motion every rate
+        but that of the position is zero: the valve feeds and drains what the piston sweeps, and the bristles keep their
+        deflection. The end stops have the force that they have at the given position.
 
         Parameters
         ----------
@@ -131,8 +131,8 @@ class PneumaticDrive:
         speed : float
             [m/s]
         pressure_b : float, optional
-            The air that a closed valve has trapped, absolute [Pa]: the spool stays centred, chamber a balances the
-            forces, and what leaks past the edges makes this a rest for a while only.
+            Absolute pressure that a closed valve has trapped [Pa]: the spool is centred, and chamber a balances the
+            forces. Leakage past the edges ends this rest after a while.
 
         Returns
         -------
@@ -156,19 +156,19 @@ class PneumaticDrive:
         return Rest(dict(zip(names(self.states), states, strict=True)), {VALVE_VOLTAGE.name: voltage})
 
     def air_force(self, measured: Trajectory, parameters: ParameterSet) -> Array:
-        """Force of the air on the piston, from both logged pressures: the input "force" of a `ForceDrive`.
+        """Force of the air on the piston from both logged pressures, which is the input "force" of a `ForceDrive`.
 
         Parameters
         ----------
         measured : Trajectory
             pressure_a and pressure_b, absolute [Pa].
         parameters : ParameterSet
-            A missing one counts with its default.
+            Missing parameters have their defaults.
 
         Returns
         -------
         ndarray, shape (n,)
-            A_a (p_a - p_o) - A_b (p_b - p_o) [N]; the pressures' noise is in it.
+            A_a (p_a - p_o) - A_b (p_b - p_o) [N], with the noise of the pressures.
         """
         self.check(parameters)
         used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
@@ -180,16 +180,16 @@ class PneumaticDrive:
         outputs = (POSITION, SPEED, *CHAMBER_PRESSURES)
         starts = PneumaticStarts(self.system, self.friction, _air_force)
         system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._find_rest)
-        doubts = partial(_log_warnings, PressureZeroCheck(starts.prepare_logs))
-        known = replace(
+        warnings = partial(_log_warnings, PressureZeroCheck(starts.prepare_logs))
+        declared = replace(
             system,
             hardware_check_hook=self.check,
             validity_limits=cylinder_guards(self.cylinder.stops),
-            log_warning_hook=doubts,
+            log_warning_hook=warnings,
             excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION | _FLOW_EXCITATION,
             axis=Axis(),
         )
-        return replace(known, meter=self._meter_function())
+        return replace(declared, meter=self._meter_function())
 
     def _rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG002 - no time in it
         y, v, a, b = (x[n] for n in ("position", "speed", "pressure_a", "pressure_b"))
@@ -218,14 +218,14 @@ class PneumaticDrive:
         rates: dict[str, ca.SX] = {}
         for side, volume in zip(SIDES, volumes(x["position"], without_prefix(p, "cylinder")), strict=True):
             around = Surroundings(volume, swept[side], outside, R)
-            own = self.chamber.rates(
+            chamber_rates = self.chamber.rates(
                 inside[side], [Inflow(*flow) for flow in flows[side]], around, without_prefix(p, "chamber")
             )
-            rates |= {f"{name}_{side}": rate for name, rate in own.items()}
+            rates |= {f"{name}_{side}": rate for name, rate in chamber_rates.items()}
         return rates
 
     def _chambers_and_ports(self, x: Symbols, p: Symbols) -> tuple[dict[str, dict[str, ca.SX]], dict[str, Port]]:
-        """The chambers' states, and how the valve sees them, by side."""
+        """States of the chambers, and the ports that they are for the valve, by side."""
         inside = {side: {q.name: x[f"{q.name}_{side}"] for q in self.chamber.states} for side in SIDES}
         outside = p["ambient.temperature"]
         return inside, {side: Port(z["pressure"], self.chamber.temperature(z, outside)) for side, z in inside.items()}
@@ -242,10 +242,10 @@ class PneumaticDrive:
         return self.valve.position(u["valve_voltage"], without_prefix(x, "valve"), without_prefix(p, "valve"))
 
     def _meter_function(self) -> ca.Function:
-        """``(t, x, u, p)`` to the air that both edges draw from the supply [kg/s], the spool's position, and air power.
+        """Function ``(t, x, u, p)`` for air from the supply [kg/s], spool position [half travels], air power [W].
 
-        Air power [W] is what that air could do in an isothermal expansion to ambient pressure: the integral of p dV of
-        an ideal gas, p V = m R T, per unit time, ``m' R T ln(p_s/p_o)``; at ambient temperature its flow exergy.
+        Air power is the work that this air could do in an isothermal expansion to ambient pressure: the integral of
+        p dV of an ideal gas, p V = m R T, per unit time, ``m' R T ln(p_s/p_o)``; at ambient temperature its flow exergy.
         """
         x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
         through = self._edge_flows(x, u, p)
@@ -257,9 +257,9 @@ class PneumaticDrive:
 
     @cached_property
     def _balance_function(self) -> ca.Function:
-        """``(y, v, spool, a, b, p) -> (rates of pressure_a, pressure_b and speed; states)``, the friction's own steady.
+        """``(y, v, spool, a, b, p) -> (rates of pressure_a, pressure_b, speed; states)``, friction states steady.
 
-        Bristles' rates are linear in their deflections: one Newton step from zero finds where they stay.
+        The bristles' rates are linear in their deflections, so one Newton step from zero gives the steady ones.
         """
         given = {n: ca.SX.sym(n) for n in ("position", "speed", "valve.spool", "pressure_a", "pressure_b")}
         p = {n: ca.SX.sym(n) for n in self.parameters}
@@ -276,7 +276,9 @@ class PneumaticDrive:
 
     def _find_rest(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
         others = ", ".join(sorted(outputs.keys() - {"position", "speed", "pressure_b"}))
-        require(not others, f"a cylinder's start is told by position, speed and pressure_b, not by {others}")
+        require(
+            not others, f"a cylinder starts from position, speed and pressure_b, not from {others}; leave {others} out"
+        )
         return self.rest(parameters, **outputs)
 
 
@@ -299,7 +301,10 @@ _AIR_PARAMETERS = ParameterSet(
 
 
 def _log_warnings(zeros: LogWarningHook, logs: Mapping[str, Log]) -> Sequence[str]:
-    """Positions that cannot be, and pressures; these say nothing where the chambers' volumes are wrong."""
+    """Warnings of impossible positions or, where there are none, of wrong zero points of the pressures.
+
+    A wrong position gives wrong chamber volumes, from which no zero point of a pressure can be judged.
+    """
     moved = {name: log for name, log in logs.items() if "position" in log.measured}
     found = {name: position_warning(log.parameters, log.measured["position"]) for name, log in moved.items()}
     outside = [f"{name}: {sentence}" for name, sentence in found.items() if sentence]

@@ -1,4 +1,4 @@
-"""The pneumatic drive in a file: its sections and keys, and a catalogue's nominal flow in place of a conductance."""
+"""Sections and keys of a pneumatic drive in a file, with a catalogue's nominal flow in place of a conductance."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -46,7 +46,7 @@ def _build_drive(structure: Structure) -> PneumaticDrive:
 
 
 def _read_smoothing(table: Mapping[str, Any], structure: Structure) -> Smoothing:
-    """How the orifice's law is rounded: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
+    """Read the rounding of the flow law: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
     where = structure.place("valve", "smoothing")
     check_names("key", table, _SMOOTHING_UNITS, where)
     widths = {n: read_value(v, _SMOOTHING_UNITS[n], where=f"{where}: {n}") for n, v in table.items()}
@@ -65,7 +65,7 @@ def _read_chamber(structure: Structure) -> ChamberModel:
 
 
 def _read_nominal_flow(entry: Any, values: Mapping[str, float], where: str) -> float:
-    """The conductance [m^3/(s*Pa)] of a flow in l/min(ANR), 6 to 5 bar(g), at the critical ratio given."""
+    """Conductance [m^3/(s*Pa)] of a nominal flow in l/min(ANR), 6 to 5 bar(g), at the critical ratio in `values`."""
     is_anr = isinstance(entry, str) and entry.strip().endswith("(ANR)")
     advice = 'a nominal flow, 6 to 5 bar(g), is written at ANR (20 degC, 100 kPa): "700 l/min(ANR)"'
     require(is_anr, f"{where}: {entry!r}: {advice}", UnitError)

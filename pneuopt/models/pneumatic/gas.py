@@ -1,7 +1,7 @@
-"""Air and its flow through an orifice: one smooth kernel for ISO 6358 and for the isentropic nozzle.
+"""Air and its flow through an orifice, by ISO 6358 or as an isentropic nozzle, both smooth.
 
-Both laws are a plateau (choked) and a falling branch; with z the distance of the pressure ratio from 1 in units of the
-critical one's, clipped smoothly at -1 and 1, flow runs through zero without a kink, in either direction. Errors of the
+Both laws have a choked plateau and a falling branch. They are written in z, the pressure ratio's distance from 1 over
+that of the critical ratio, clipped smoothly at -1 and 1, so that flow passes zero without a kink. Errors of the
 smoothing, as a fraction of the choked flow, for zero = 1e-3: 5e-5 where choked, 2e-4 below a pressure ratio of 0.99,
 1.1 % at worst (above 0.9998); for zero = 1e-2: 1.6 % below 0.99.
 """
@@ -15,29 +15,29 @@ import casadi as ca
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
-GAS_CONSTANT = 287.05  # [J/(kg K)] dry air
-ISENTROPIC_EXPONENT = 1.4  # [-] ratio of specific heats of air
-REFERENCE_DENSITY = 1.185  # [kg/m^3] ANR, ISO 8778: 100 kPa, 20 degC, 65 % humidity
-REFERENCE_TEMPERATURE = 293.15  # [K] ANR
-REFERENCE_PRESSURE = 1e5  # [Pa] ANR
-CRITICAL_RATIO = (2 / (ISENTROPIC_EXPONENT + 1)) ** (
-    ISENTROPIC_EXPONENT / (ISENTROPIC_EXPONENT - 1)
-)  # 0.528282, of the isentropic nozzle
+GAS_CONSTANT = 287.05  # specific gas constant of dry air [J/(kg K)]
+ISENTROPIC_EXPONENT = 1.4  # ratio of specific heats of air [-]
+REFERENCE_DENSITY = 1.185  # density of air at ANR, ISO 8778: 100 kPa, 20 degC, 65 % humidity [kg/m^3]
+REFERENCE_TEMPERATURE = 293.15  # temperature at ANR [K]
+REFERENCE_PRESSURE = 1e5  # pressure at ANR [Pa]
 _TEMPERATURE_EXPONENT = (ISENTROPIC_EXPONENT - 1) / ISENTROPIC_EXPONENT
+# Critical pressure ratio of the isentropic nozzle, 0.528282 [-].
+CRITICAL_RATIO = (2 / (ISENTROPIC_EXPONENT + 1)) ** (ISENTROPIC_EXPONENT / (ISENTROPIC_EXPONENT - 1))
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """How the orifice laws are rounded.
+    """Rounding widths of the flow laws.
 
     Parameters
     ----------
     corner : float
-        Rounds the corner to the plateau [-].
+        Rounding of the corner to the choked plateau [-].
     zero : float
-        Rounds the square root at zero flow [-]; smaller is stiffer: a chamber's decay rate grows with its -1/2 power.
+        Rounding of the square root at zero flow [-]; a chamber's decay rate, and so stiffness, grows with its power
+        -1/2.
     pressure : float
-        Rounds the larger of the two pressures [Pa].
+        Rounding of the maximum of the two pressures [Pa].
     """
 
     corner: float = 0.02
@@ -46,15 +46,15 @@ class Smoothing:
 
 
 class FlowLaw(Protocol):
-    """How much an orifice of conductance 1 passes between two pressures."""
+    """Interface of a flow law: flow through an orifice of unit conductance between two pressures."""
 
     @property
     def parameters(self) -> ParameterSet:
-        """Numbers of the law beside the conductance."""
+        """Parameters of the law beside the conductance."""
         ...
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
-        """Mass flow over conductance, reference density and sqrt(T0/T) [Pa]; odd in the pressures' exchange."""
+        """Mass flow over conductance, reference density and sqrt(T0/T) [Pa]; it changes sign with the pressures."""
         ...
 
 
@@ -72,7 +72,7 @@ class Iso6358:
 
     @property
     def parameters(self) -> ParameterSet:
-        """critical_ratio, b [1]."""
+        """Parameter: critical_ratio, b [1]."""
         return ParameterSet({"critical_ratio": Parameter(0.3, "1", 0.05, 0.6)})
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:
@@ -84,14 +84,16 @@ class Iso6358:
 
 @dataclass(frozen=True)
 class IsentropicNozzle:
-    """Saint-Venant and Wantzel: eq. (1) and (2) of Ye, Wang, Chen (IJRES 3(7), 2015), scaled to 1 where choked.
+    """Isentropic nozzle (Saint-Venant, Wantzel), scaled to 1 where choked.
+
+    Eq. (1) and (2) of Ye, Wang, Chen (IJRES 3(7), 2015).
 
     Its critical ratio is 0.5283; the ellipse of ISO 6358 with b = 0.5283 differs by 0.15 % of the choked flow.
     """
 
     @property
     def parameters(self) -> ParameterSet:
-        """None."""
+        """No parameters."""
         return ParameterSet()
 
     def flow(self, upstream: ca.SX, downstream: ca.SX, p: Symbols, smoothing: Smoothing) -> ca.SX:  # noqa: ARG002 - the protocol's arguments
@@ -105,7 +107,7 @@ class IsentropicNozzle:
 
 
 def clip_pressure_ratio(p1: ca.SX, p2: ca.SX, b: ca.SX | float, smoothing: Smoothing) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """The higher pressure, the clipped ratio z in (-1, 1) and its rounded size s, as every flow law needs them.
+    """Higher pressure, clipped ratio z in (-1, 1) and its rounded magnitude s, which every flow law needs.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which hardware can exist, and where a simulation leaves what its model describes: end stops, empty chambers."""
+"""Limits of a pneumatic drive: impossible hardware, and where its model ends: end stops, empty chambers."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -15,9 +15,13 @@ from pneuopt.quantities.errors import HardwareError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 
-EMPTY_CHAMBER_RATIO = 0.5  # of the ambient pressure: lip seals let air in long before
-MAX_STOP_TRAVEL = 0.01  # of the stroke, by which a piston that presses into a stop may stand outside
-MAX_POSITION_ZERO_ERROR = 0.05  # of the stroke, by which a position sensor's zero may be off
+# Chamber pressure over ambient pressure [1] below which a chamber counts as empty: lip seals let air in well above it;
+# a larger ratio warns of chambers that just exhaust.
+EMPTY_CHAMBER_RATIO = 0.5
+MAX_STOP_TRAVEL = 0.01  # share of the stroke by which a piston that presses on a stop may be outside
+# Share of the stroke by which a position sensor's zero may be off: a smaller one warns of usual mounting errors, a
+# larger one overlooks a wrong unit or stroke.
+MAX_POSITION_ZERO_ERROR = 0.05
 _END_NAMES = {"a": "rear", "b": "front"}
 
 
@@ -32,7 +36,7 @@ def check_hardware(p: ParameterSet) -> None:
     Raises
     ------
     HardwareError
-        Naming parameter, value, source and what would be possible.
+        Names parameter, value, source and possible values.
     """
     for name, limit in _hardware_limits(p).items():
         if name in p and not limit.allows(p.value(name)):
@@ -42,7 +46,7 @@ def check_hardware(p: ParameterSet) -> None:
 
 
 def check_start(p: ParameterSet, start: Mapping[str, float]) -> None:
-    """Refuse a start outside the stroke; a piston that presses into a stop stands a little outside.
+    """Refuse a start outside the stroke; a piston that presses on a stop is slightly outside.
 
     Parameters
     ----------
@@ -60,7 +64,7 @@ def check_start(p: ParameterSet, start: Mapping[str, float]) -> None:
 
 
 def position_warning(p: ParameterSet, position: NDArray[np.float64]) -> str:
-    """What speaks against a logged position: that it lies outside the stroke by more than a sensor's zero is off.
+    """Warning of a logged position that is outside the stroke by more than a sensor's zero error.
 
     Parameters
     ----------
@@ -71,7 +75,7 @@ def position_warning(p: ParameterSet, position: NDArray[np.float64]) -> str:
     Returns
     -------
     str
-        A sentence; empty if nothing does.
+        A sentence; empty without an objection.
     """
     stroke = p.value("cylinder.stroke")
     low, high = (float(np.nanpercentile(position, q)) for q in (1, 99))
@@ -83,16 +87,16 @@ def position_warning(p: ParameterSet, position: NDArray[np.float64]) -> str:
 
 
 def cylinder_guards(stops: bool) -> tuple[ValidityLimit, ...]:
-    """What a simulation of a cylinder watches.
+    """Validity limits that a simulation of a cylinder watches.
 
     Parameters
     ----------
     stops : bool
-        Whether the covers act.
+        Whether the covers stop the piston.
 
     Returns
     -------
-    tuple of Guard
+    tuple of ValidityLimit
         Both ends of the stroke, and both chambers at half the ambient pressure.
     """
     return (*(_end_guard(side, stops) for side in _END_NAMES), *(_empty_chamber_guard(side) for side in _END_NAMES))
@@ -123,7 +127,7 @@ def _empty_chamber_pressure(p: ParameterSet) -> float:
 
 
 class _Limit(NamedTuple):
-    """What a parameter may be at all."""
+    """Possible range of a parameter, with the remedy for a value outside."""
 
     remedy: str
     lower: float = -inf

@@ -1,4 +1,4 @@
-"""Where a `PneumaticDrive` stands still, or moves steadily: spool and pressures at which nothing else changes."""
+"""Rest and steady motion of a `PneumaticDrive`: spool position and pressures at which only the position changes."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
 BALANCE_RATES = ("pressure_a", "pressure_b", "speed")
-MAX_COMPRESSION_RATIO = 20.0  # times the supply's pressure: the most that a moving piston may compress a chamber to
+MAX_COMPRESSION_RATIO = 20.0  # largest chamber pressure over supply pressure [1] that is searched in steady motion
 
 
 class MotionBalance(NamedTuple):
-    """A drive at a position [m] and a speed [m/s], over its spool's position and both pressures.
+    """Rates of a drive at a position [m] and speed [m/s] as functions of spool position and pressures.
 
     Attributes
     ----------
     function : casadi.Function
-        ``(position, speed, spool, pressure_a, pressure_b, p) -> (rates of BALANCED; states)``.
+        ``(position, speed, spool, pressure_a, pressure_b, p) -> (BALANCE_RATES; states)``.
     p : ndarray
     position, speed : float
     """
@@ -32,31 +32,31 @@ class MotionBalance(NamedTuple):
     speed: float
 
     def rates(self, spool: float, a: float, b: float) -> tuple[float, float, float]:
-        """Of both pressures [Pa/s] and of the speed [m/s^2]."""
+        """Rates of both pressures [Pa/s] and of the speed [m/s^2]."""
         rate_a, rate_b, acceleration = self.function(self.position, self.speed, spool, a, b, self.p)[0].nonzeros()
         return rate_a, rate_b, acceleration
 
     def states(self, spool: float, a: float, b: float) -> list[float]:
-        """All of them."""
+        """States of the drive."""
         found: list[float] = self.function(self.position, self.speed, spool, a, b, self.p)[1].full().ravel().tolist()
         return found
 
 
 def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float | None) -> tuple[list[float], float]:
-    """The states, and the valve's voltage, at which no rate but that of the position is left.
+    """States and valve voltage at which only the position changes.
 
     Parameters
     ----------
-    glide : Glide
+    glide : MotionBalance
     p : ParameterSet
-        The drive's, complete.
+        All parameters of the drive.
     pressure_b : float, optional
-        What a closed valve has trapped [Pa(a)]; chamber a balances it.
+        Pressure that a closed valve has trapped [Pa(a)]; chamber a balances it.
 
     Raises
     ------
     InputError
-        If no spool position does, or there is no such motion.
+        If no spool position balances the load, or there is no such motion.
     """
     if glide.speed:
         _check_motion(p, glide.speed, pressure_b)
@@ -68,16 +68,16 @@ def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float
 
 
 def _check_motion(p: ParameterSet, speed: float, pressure_b: float | None) -> None:
-    words = f"no steady motion at speed = {speed:g} m/s: "
-    require(pressure_b is None, words + "trapped air (pressure_b) holds a drive still; give one of both")
+    verdict = f"no steady motion at speed = {speed:g} m/s: "
+    require(pressure_b is None, verdict + "trapped air (pressure_b) holds a drive still; give only one of the two")
     spring = p.value("load.stiffness") if "load.stiffness" in p else 0.0
-    require(spring == 0, words + f"load.stiffness = {spring:g} N/m pulls more the farther it goes; start at rest")
+    require(spring == 0, verdict + f"load.stiffness = {spring:g} N/m pulls more the farther it goes; start at rest")
 
 
 def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float, float]:
-    """Spool and pressures at which nothing changes: nested bisections, each on a function with one zero.
+    """Spool position and pressures at which nothing changes, by nested root searches on functions with one zero each.
 
-    In motion a chamber may hold more than the supply's pressure: the piston pumps, the spool throttles.
+    In motion a chamber may exceed the supply pressure: the piston compresses the air that the spool throttles.
     """
     low, high, rates = p.value("ambient.pressure"), p.value("supply.pressure"), glide.rates
     if glide.speed:
@@ -115,7 +115,7 @@ def _solve_balance(glide: MotionBalance, p: ParameterSet) -> tuple[float, float,
 
 
 def _balance_pressure_a(glide: MotionBalance, p: ParameterSet, b: float) -> float:
-    """The pressure in chamber a that balances pressure b; the force is linear in it."""
+    """Pressure in chamber a that balances pressure b; the force is linear in it."""
     require(
         b > MIN_CHAMBER_PRESSURE,
         f"pressure_b = {b:g} Pa is no absolute pressure of a chamber; give more than {MIN_CHAMBER_PRESSURE:g} Pa",
@@ -131,7 +131,7 @@ def _balance_pressure_a(glide: MotionBalance, p: ParameterSet, b: float) -> floa
 
 
 def _zero_crossing_or_end(rate: Callable[[float], float], low: float, high: float) -> float:
-    """Where a pressure's rate falls through zero; an end where it does not."""
+    """Pressure at which its rate falls through zero; an end of the range where it does not."""
     if rate(high) >= 0:
         return high
     return low if rate(low) <= 0 else _brent_root(rate, low, high)

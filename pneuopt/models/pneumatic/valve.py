@@ -13,7 +13,7 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 
 class Spool(Enum):
-    """How the spool follows its command."""
+    """Order of the lag with which the spool follows its command."""
 
     RIGID = 0
     FIRST_ORDER = 1
@@ -38,14 +38,14 @@ class Flows(NamedTuple):
 
 @dataclass(frozen=True)
 class ProportionalValve:
-    r"""Positive voltage opens supply to a and b to exhaust.
+    r"""A 5/3 proportional valve: positive voltage opens supply to port a and port b to exhaust.
 
     The spool's position x is a fraction of its half travel, 1 at the voltage `span`, where it stops. Each edge opens by
 
     .. math:: o(x) = \tfrac12 \left[(x - x_0) + \sqrt{(x - x_0)^2 + \delta^2}\right] + leak
 
     with x_0 the overlap (a dead zone; negative for underlap) and delta the edge's rounding, and passes
-    C o(x) rho_0 sqrt(T_0/T) times the law's pressure. The command's stop is a hard clip, for it is one.
+    C o(x) rho_0 sqrt(T_0/T) times the law's pressure. The command is clipped hard at the stops.
 
     Parameters
     ----------
@@ -60,13 +60,13 @@ class ProportionalValve:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """Spool [1] and spool_rate [1/s], as far as the spool lags."""
+        """States of the lag: spool [1] and spool_rate [1/s], as many as its order."""
         lagging = (Quantity("spool", "1", nominal=0.3), Quantity("spool_rate", "1/s", nominal=50.0))
         return lagging[: self.spool.value]
 
     @property
     def parameters(self) -> ParameterSet:
-        """Conductance of a fully open edge, the law's, the spool's geometry and speed, the command's span."""
+        """Parameters: conductance of an open edge, flow law, geometry and lag of the spool, span of the command."""
         lag = {
             "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True),
             "damping": Parameter(0.7, "1", 0.1, 5.0, log=True),
@@ -82,7 +82,7 @@ class ProportionalValve:
         return conductance | self.law.parameters | ParameterSet({**geometry, **moving})
 
     def position(self, voltage: ca.SX, z: Symbols, p: Symbols) -> ca.SX:
-        """The spool's position [1] at a command [V] and the states z."""
+        """Spool position [1] at a command [V] and the states z."""
         return _spool_command(voltage, p) if self.spool is Spool.RIGID else z["spool"]
 
     def rates(self, voltage: ca.SX, z: Symbols, p: Symbols) -> dict[str, ca.SX]:
@@ -111,7 +111,7 @@ class ProportionalValve:
         )
 
     def _upstream_temperature(self, one: Port, two: Port) -> ca.SX:
-        """The temperature of the port with the higher pressure, smooth between."""
+        """Temperature of the port with the higher pressure, smooth in between."""
         fall = one.pressure - two.pressure
         share = (1 + fall / ca.sqrt(fall**2 + self.smoothing.pressure**2)) / 2
         return two.temperature + (one.temperature - two.temperature) * share

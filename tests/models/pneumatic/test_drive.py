@@ -195,7 +195,7 @@ def test_a_loop_finds_its_rest() -> None:
         assert x[0] == pytest.approx(0.04)
     position = ClosedLoop(drive.system(), PID(), measured="position")
     assert position.initial(position.parameters, reference=0.13)[0] == 0.13
-    with pytest.raises(InputError, match="told by position, speed and pressure_b, not by valve"):
+    with pytest.raises(InputError, match="starts from position, speed and pressure_b, not from valve"):
         loop.initial(p, start={"valve": 0.1})
 
 
