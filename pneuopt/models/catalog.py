@@ -1,4 +1,4 @@
-"""Drives with numbers: cited sets, fresh at each call. A range in brackets is what the numbers were picked from."""
+"""Drives with cited numbers, built afresh at each call; a range in brackets is the published one."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -47,7 +47,7 @@ def s40() -> DriveSet:
 def r25(lugre: bool = False) -> DriveSet:
     """25 mm rodless, 1 m stroke: at rest it linearises to eq. (16), ``1270.12/(s^2 + 17.5 s + 86.34)`` [V/V].
 
-    The speed counts 20 V/(m/s) there: a transducer's gain that belongs to the feedback, not to this drive.
+    In eq. (16) the speed is measured by a transducer of 20 V/(m/s), which belongs to the feedback, not to this drive.
 
     Source: reconstructed from Ye, Wang, Chen, IJRES 3(7), 2015; the paper prints no hardware. The dead volumes are
     about 2.5 m of 8 mm hose, the valve is about 650 l/min(ANR).
@@ -55,7 +55,7 @@ def r25(lugre: bool = False) -> DriveSet:
     Parameters
     ----------
     lugre : bool
-        LuGre friction (25 N, 40 N, 20 mm/s) instead of viscous friction alone, of which the paper speaks.
+        LuGre friction (25 N, 40 N, 20 mm/s) instead of the viscous friction alone that the paper has.
     """
     friction: FrictionModel = LuGre() if lugre else Viscous()
     valve = ProportionalValve(IsentropicNozzle(), Spool.RIGID)
@@ -77,8 +77,8 @@ def r25(lugre: bool = False) -> DriveSet:
 def b32(lugre: bool = False) -> DriveSet:
     """The identification benchmark: 32/12 mm, 0.2 m stroke, 5 kg, spool of first order at 50 Hz, command -1 to 1 V.
 
-    Source: chosen. The orifice's corner to the plateau is rounded by 1e-3 where the benchmark clips: a difference of at
-    most 2.5e-7 of the choked flow, with the default rounding 1e-4.
+    Source: chosen. The corner of the flow law is rounded by 1e-3 where the benchmark clips, a difference of at most
+    2.5e-7 of the choked flow; with the default rounding it would be 1e-4.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Transfer-function plants with named signals: first order, second order, integrator; dead time; a delay by samples.
+"""Transfer-function plants with named signals: first order, second order, integrator; dead time; sample delays.
 
-A dead time is a Padé approximant of order 1 to 5, realised in states: a lossless ladder whose states keep the input's
-unit and size at every dead time, so that the dead time is an ordinary, differentiable parameter. Its fastest pole lies
-at 2, 3.5, 5.1, 6.8, 8.5 divided by the dead time (orders 1 to 5), and RK4 steps of h are stable for dead times above
-0.72, 1.22, 1.87, 2.57, 3.26 h: the lower limit. At zero the approximant is singular; `pade_order=0` leaves it out.
+A dead time is a Padé approximant of order 1 to 5. Its states form a lossless ladder and keep the input's unit and size
+at every dead time, so that the dead time is an ordinary, differentiable parameter. Its fastest pole is at 2, 3.5, 5.1,
+6.8, 8.5 over the dead time (orders 1 to 5), and RK4 steps of h are stable for dead times above 0.72, 1.22, 1.87, 2.57,
+3.26 h, the lower limit. At zero the approximant is singular; `pade_order=0` leaves it out.
 """
 
 import re
@@ -25,8 +25,8 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, wit
 from pneuopt.quantities.units import difference_unit
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
-MAX_PADE_ORDER = 5
-USUAL_PADE_ORDER = 3  # of a file's dead time: follows a delay up to 4.6 rad of phase, and adds three states
+MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known (see above)
+USUAL_PADE_ORDER = 3  # of a dead time in a file: it follows the delay up to 4.6 rad of phase, with three states
 Dynamics = Callable[[ca.SX, Symbols, Symbols], dict[str, ca.SX]]
 
 
@@ -60,32 +60,32 @@ class FirstOrder:
         def dynamics(u: ca.SX, x: Symbols, p: Symbols) -> dict[str, ca.SX]:
             return {y: (p["plant.gain"] * u - x[y]) / p["plant.time_constant"]}
 
-        own = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True)}
+        shaping = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True)}
         shape = ResponseShape(("plant.time_constant",), _first_order_polynomials)
         return _assemble_plant(
-            self, (self.output,), _gain_parameter(self.input, self.output, ""), ParameterSet(own), dynamics, shape
+            self, (self.output,), _gain_parameter(self.input, self.output, ""), ParameterSet(shaping), dynamics, shape
         )
 
 
 @dataclass(frozen=True)
 class SecondOrder:
-    r"""``y'' + 2 damping w y' + w² y = gain w² u(t - dead_time)``, w the natural frequency; with friction if wanted.
+    r"""``y'' + 2 damping w y' + w² y = gain w² u(t - dead_time)``, w the natural frequency; friction is optional.
 
-    Friction is an equivalent input: in steady motion the speed y takes the voltage ``y / gain + F(y)``. It acts where
-    the force does, behind the drive's own lag, so that the drive sticks; with d, the acceleration without friction::
+    Friction is an equivalent input: in steady motion the speed y needs the voltage ``y / gain + F(y)``. It acts where
+    the force does, after the drive's lag, so that the drive can stick. With d, the acceleration without friction::
 
         y' = d - gain w F(y) / (2 damping)        d' = w² (gain u(t - dead_time) - y) - 2 damping w d
 
-    Without friction, d is y' and the two equations are the transfer function above. All damping is taken as the drive's
-    (a motor's winding, a valve's leakage). F is smooth and in the input's unit; its viscous part is zero by default,
-    because the gain holds it already.
+    Without friction, d is y' and the two equations are the transfer function above. All damping counts as the drive's
+    (of a motor's winding or a valve's leakage). F is smooth and in the input's unit. Its viscous part is zero by
+    default, because the gain includes it.
 
     Parameters
     ----------
     pade_order : int
         Order of the dead time's approximant; 0: no dead time.
     friction : FrictionModel, optional
-        Its forces are read in the unit of the input, its speed is the output.
+        Its forces are in the unit of the input; its speed is the output.
     input, output : Quantity
         The signals u and y; the parameters' units follow from theirs.
 
@@ -106,12 +106,12 @@ class SecondOrder:
     def __post_init__(self) -> None:
         require(
             self.friction is None or not self.friction.inputs,
-            f"{type(self.friction).__name__} needs pressures or a force, which this plant has not; choose another",
+            f"{type(self.friction).__name__} needs pressures or a force, which this plant lacks; choose another law",
             ModelError,
         )
 
     def system(self) -> System:
-        """The plant as an ODE; its states are the output, "drive" (d above), then those of friction and dead time."""
+        """Build the equations; the states are the output, "drive" (d above), then those of friction and dead time."""
         y, friction = self.output.name, self.friction
 
         def dynamics(u: ca.SX, x: Symbols, p: Symbols) -> dict[str, ca.SX]:
@@ -123,27 +123,27 @@ class SecondOrder:
             rates[y] -= gain * w / (2 * zeta) * force.value
             return rates | {f"friction.{n}": rate for n, rate in force.rates.items()}
 
-        own = ParameterSet(
+        shaping = ParameterSet(
             {
                 "plant.natural_frequency": Parameter(10.0, "rad/s", 1e-3, 1e5, log=True),
                 "plant.damping": Parameter(0.7, "1", 1e-3, 1e3, log=True),
             }
         )
         if friction is not None:
-            own = own | _in_input_unit(friction.parameters, self.input).with_prefix("friction")
+            shaping = shaping | _in_input_unit(friction.parameters, self.input).with_prefix("friction")
         inner = friction.states if friction is not None else ()
         drive = Quantity("drive", _quotient_unit(self.output, "s"), 10 * self.output.nominal)
         states = (self.output, drive, *(replace(s, name=f"friction.{s.name}") for s in inner))
         shape = ResponseShape(
-            tuple(own)[:2], _second_order_polynomials, None if friction is None else _friction_polynomials
+            tuple(shaping)[:2], _second_order_polynomials, None if friction is None else _friction_polynomials
         )
-        plant = _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), own, dynamics, shape)
+        plant = _assemble_plant(self, states, _gain_parameter(self.input, self.output, ""), shaping, dynamics, shape)
         return plant if friction is None else replace(plant, excitation=friction.excitation.with_prefix("friction"))
 
 
 @dataclass(frozen=True)
 class Integrator:
-    """``dy/dt = gain u(t - dead_time)``: a valve's opening to a position, say.
+    """``dy/dt = gain u(t - dead_time)``: from a valve's opening to a position, for example.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def delay_inputs(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] =
     Returns
     -------
     DiscreteSystem
-        With `samples` + 1 more states an input, named "valve_voltage_delay_0" (now) and so on.
+        With `samples` + 1 more states for each delayed input, named "valve_voltage_delay_0" (the latest) and so on.
 
     Raises
     ------
@@ -255,8 +255,8 @@ def delay_inputs(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] =
         "step", [t, h, x, u, p], [ca.vertcat(x_next, x[n:]), y], ["t", "h", "x", "u", "p"], ["x_next", "y"]
     )
     if system.update is not None:
-        now = ca.substitute(late, x, shifted)
-        shifted[:n] = system.update(t, x[:n], now, p)
+        inputs_after = ca.substitute(late, x, shifted)
+        shifted[:n] = system.update(t, x[:n], inputs_after, p)
     update = ca.Function("update", [t, x, u, p], [shifted], ["t", "x", "u", "p"], ["x_after"])
     return replace(system, states=system.states + registers, step=step, update=update)
 
@@ -265,14 +265,14 @@ def _assemble_plant(
     plant: Plant,
     states: tuple[Quantity, ...],
     gain: Parameter,
-    own: ParameterSet,
+    shaping: ParameterSet,
     dynamics: Dynamics,
     shape: ResponseShape,
 ) -> System:
-    """Put the gain and the dead time around a plant's own dynamics."""
+    """Assemble a plant from its dynamics, its gain and its dead time."""
     order, source = plant.pade_order, plant.input
     line = _delay_line(source, order)
-    parameters = ParameterSet({"plant.gain": gain}) | own
+    parameters = ParameterSet({"plant.gain": gain}) | shaping
     if order:
         parameters = parameters | ParameterSet({"plant.dead_time": Parameter(0.01, "s", 1e-3, 10.0, log=True)})
 
@@ -296,7 +296,7 @@ def _second_order_polynomials(w: float, damping: float) -> Polynomials:
 
 
 def _friction_polynomials(w: float, damping: float) -> Polynomials:
-    """Response to friction, of unit gain: ``w² (s / (2 damping w) + 1)`` over the plant's denominator."""
+    """Response to friction at unit gain: ``w² (s / (2 damping w) + 1)`` over the plant's denominator."""
     return [w / (2 * damping), w**2], [1.0, 2 * damping * w, w**2]
 
 
@@ -311,10 +311,10 @@ def _delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:
 
 
 def _pade_delay(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX]]:
-    """Padé approximant [n/n] of a delay: the ladder that Lambert's continued fraction of tanh(s/2) stands for.
+    """Padé approximant [n/n] of a delay as an LC ladder, by Lambert's continued fraction of tanh(s/2).
 
-    ``exp(-s) = (1 - tanh(s/2)) / (1 + tanh(s/2))``: a wave u meets inductors and capacitors of 1 / (2 (2k - 1)) in
-    turn; u - v, with v the voltage at the port, is minus the wave sent back: the delayed one.
+    ``exp(-s) = (1 - tanh(s/2)) / (1 + tanh(s/2))`` is, but for its sign, the reflection of a wave u from inductors and
+    capacitors of 1 / (2 (2k - 1)) in turn; with v the voltage at the port, the delayed wave is u - v.
     """
     if not x:
         return u, []
@@ -337,7 +337,7 @@ def _quotient_unit(output: Quantity, unit: str) -> str:
 
 
 def _in_input_unit(parameters: ParameterSet, source: Quantity) -> ParameterSet:
-    """Friction's parameters in the unit of the input instead of newtons; the defaults shrink to a hundredth."""
+    """Parameters of friction in the unit of the input instead of newtons, with values and bounds over 100."""
     shrunk = {n: _convert_force_unit(q, difference_unit(source.unit)) for n, q in parameters.items()}
     return ParameterSet({n: replace(q, value=0.0) if n == "viscous" else q for n, q in shrunk.items()})
 

@@ -1,8 +1,9 @@
-"""`with_sensors`: a plant whose logged channels come late, lag behind or are off, each by a parameter of its own.
+"""`with_sensors`: a plant whose measured outputs have delays, lags or offsets, each a parameter of its own.
 
-The outputs keep their names, so logs, loops and tables read them as before. What is free among "sensor.*" is estimated
-with the rest, with its interval: a zero point of each log (`per_log`), or the skew between two channels. Of delays only
-differences show, unless the inputs' own time is trusted: a channel that leads is one after which all others come late.
+The outputs keep their names, so logs, loops and tables read them as before. Free parameters "sensor.*" are estimated
+with the others and have intervals: a zero point of each log (`per_log`) for example, or the skew between two channels.
+Only differences of delays are identifiable, unless the time of the inputs is exact: where one channel leads, give the
+others delays.
 """
 
 import math
@@ -21,9 +22,9 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 Channels = tuple[str, ...]
-MIN_SENSOR_DELAY = 2e-4  # [s] of delay and lag: shorter ones are stiffer than they are visible at a kHz
-MAX_SENSOR_DELAY = 0.05  # [s] of a delay that a short series still follows
-DEFAULT_SENSOR_DELAY = 1e-3  # [s]
+MIN_SENSOR_DELAY = 2e-4  # least delay or lag [s]: shorter ones make the ODE stiff and do not show in logs at 1 kHz
+MAX_SENSOR_DELAY = 0.05  # greatest delay or lag [s]: longer delays are not followed by a Padé form of second order
+DEFAULT_SENSOR_DELAY = 1e-3  # delay or lag before an identification [s]
 
 
 def with_sensors(
@@ -33,7 +34,7 @@ def with_sensors(
     delay: Sequence[str] = (),
     lag: Sequence[str] = (),
 ) -> System:
-    """Put sensors before the named outputs: first delay, then lag, then offset.
+    """Add sensors to the named outputs: first a delay, then a lag, then an offset.
 
     Parameters
     ----------
@@ -42,15 +43,16 @@ def with_sensors(
         Outputs with a parameter "sensor.<name>.offset" [the output's unit], 0 by default.
     delay : sequence of str
         Outputs with "sensor.<name>.delay" [s]: a Padé form of second order,
-        ``(1 - s T/2 + (s T)^2/12) / (1 + s T/2 + (s T)^2/12)``. It passes every frequency at its size; its phase is
-        late by ``(w T)^5/720`` too little, 0.08 degrees at w T = 1 (at 32 Hz for 5 ms), 2.1 degrees at w T = 2.
+        ``(1 - s T/2 + (s T)^2/12) / (1 + s T/2 + (s T)^2/12)``. Its gain is one at every frequency; its phase lags
+        by ``(w T)^5/720`` too little, 0.08 degrees at w T = 1 (at 32 Hz for 5 ms), 2.1 degrees at w T = 2.
     lag : sequence of str
         Outputs with "sensor.<name>.lag" [s], a first-order filter's time constant.
 
     Returns
     -------
     System
-        With the sensors' states ("sensor.*") after the plant's; its guards, checks, rest and starts are the plant's.
+        With the sensors' states ("sensor.*") after the plant's; it keeps the plant's validity limits, checks, rest and
+        starts.
 
     Raises
     ------
@@ -68,8 +70,8 @@ def with_sensors(
     sensors = _Sensors(system, tuple(offset), tuple(delay), tuple(lag))
     for kind, channels in (("offset", offset), ("delay", delay), ("lag", lag)):
         check_names("output", channels, names(system.outputs), f"with_sensors: {kind}")
-    own = (system.states + sensors.states, system.inputs, system.outputs, system.parameters | sensors.parameters)
-    sensed = define(*own, sensors.rates, start_hook=sensors.starts)
+    signals = (system.states + sensors.states, system.inputs, system.outputs, system.parameters | sensors.parameters)
+    sensed = define(*signals, sensors.rates, start_hook=sensors.starts)
     finder = partial(sensors.rest, system.rest_hook) if system.rest_hook else None
     return replace(
         sensed,
@@ -82,21 +84,20 @@ def with_sensors(
 
 
 def coarse_delay(log: Trajectory, late: str, other: str, longest: float = MAX_SENSOR_DELAY) -> float:
-    """How much later one of two related channels comes, by cross-correlation: a start value for its delay.
+    """Delay of one of two related channels against the other by cross-correlation: a start value for its parameter.
 
     Parameters
     ----------
     log : Trajectory
     late, other : str
-        Two measurements of the same motion: a speed and a speed, or a position and a speed (the position is
-        differentiated, or the speed's delay against it found).
+        Two measurements of the same motion: two speeds, or a position and a speed; the position is differentiated.
     longest : float
-        Delays tried, either way [s].
+        Greatest delay that is tried, in either direction [s].
 
     Returns
     -------
     float
-        [s], negative where the other one is later; to a fraction of a sample.
+        Delay [s], to a fraction of a sample; negative where the other channel is later.
 
     Examples
     --------
@@ -121,7 +122,7 @@ def coarse_delay(log: Trajectory, late: str, other: str, longest: float = MAX_SE
 
 @dataclass(frozen=True, eq=False)
 class _Sensors:
-    """What stands between a plant's outputs and a log."""
+    """Sensors between a plant's outputs and a log."""
 
     plant: System
     offset: Channels
@@ -130,7 +131,7 @@ class _Sensors:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """Two of each delay (the Padé form's, in units of the channel), one of each lag."""
+        """States: two for each delay (of the Padé form, in the channel's unit), one for each lag."""
         shown = {q.name: q for q in self.plant.outputs}
         late = [replace(shown[n], name=f"sensor.{n}.{part}") for n in self.delay for part in ("level", "late")]
         slow = [replace(shown[n], name=f"sensor.{n}.slow") for n in self.lag]
@@ -140,12 +141,12 @@ class _Sensors:
     def parameters(self) -> ParameterSet:
         units = {q.name: q.unit.partition("(")[0] for q in self.plant.outputs}
         time = Parameter(DEFAULT_SENSOR_DELAY, "s", lower=MIN_SENSOR_DELAY, upper=MAX_SENSOR_DELAY)
-        own = {f"sensor.{n}.offset": Parameter(0.0, units[n]) for n in self.offset}
-        own |= {f"sensor.{n}.delay": time for n in self.delay} | {f"sensor.{n}.lag": time for n in self.lag}
-        return ParameterSet(own)
+        out = {f"sensor.{n}.offset": Parameter(0.0, units[n]) for n in self.offset}
+        out |= {f"sensor.{n}.delay": time for n in self.delay} | {f"sensor.{n}.lag": time for n in self.lag}
+        return ParameterSet(out)
 
     def rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
-        """The plant's, then its sensors'."""
+        """Rates of the plant's and the sensors' states, and the measured outputs."""
         plant = self.plant
         xs, ps = ca.vertcat(*(x[n] for n in names(plant.states))), ca.vertcat(*(p[n] for n in plant.parameters))
         xdot, y = plant.ode(t, xs, stack(u), ps)
@@ -162,7 +163,7 @@ class _Sensors:
         return rates, shown | {n: shown[n] + p[f"sensor.{n}.offset"] for n in self.offset}
 
     def rest(self, finder: RestHook, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
-        """The plant's rest, or steady motion; what the sensors show there."""
+        """Rest or steady motion of the plant, with settled sensors."""
         off = {n: self._parameter_value(parameters, n, "offset") for n in self.offset}
         rest = finder(parameters, {n: value - off.get(n, 0.0) for n, value in outputs.items()})
         x, u = (
@@ -178,7 +179,7 @@ class _Sensors:
         return Rest({**rest.states, **{n: float(column[0]) for n, column in settled.items()}}, rest.inputs)
 
     def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
-        """The plant's own candidates from logs put right with the given delays and offsets; the sensors settled."""
+        """Candidates of the plant, from logs corrected for delays and offsets, with settled sensors."""
         guessed = {name: self._guess_delays(log) for name, log in logs.items()}
         plant = {name: self._correct_log(log, guessed[name]) for name, log in logs.items()}
         out = []
@@ -190,7 +191,7 @@ class _Sensors:
         return out
 
     def _guess_delays(self, log: Log) -> dict[str, float]:
-        """Free delays of a log that cross-correlation tells: position against speed, where both are logged."""
+        """Free delays of a log by cross-correlation of position and speed, where both are logged."""
         found = {}
         for late, other in (("position", "speed"), ("speed", "position")):
             name = f"sensor.{late}.delay"
@@ -203,20 +204,20 @@ class _Sensors:
     def _start_parameters(
         self, logs: Mapping[str, Log], guessed: Mapping[str, Mapping[str, float]]
     ) -> dict[str, float]:
-        """The guesses as a start's parameters; a shared delay takes the median."""
+        """Parameters of a start from the guessed delays; a shared delay is the median over the logs."""
         out: dict[str, float] = {}
-        for name in dict.fromkeys(n for own in guessed.values() for n in own):
-            own = {log: values[name] for log, values in guessed.items() if name in values}
-            per_log = any(logs[log].parameters[name].per_log for log in own)
+        for name in dict.fromkeys(n for delays in guessed.values() for n in delays):
+            by_log = {log: values[name] for log, values in guessed.items() if name in values}
+            per_log = any(logs[log].parameters[name].per_log for log in by_log)
             out |= (
-                {f"{name}[{log}]": v for log, v in own.items()}
+                {f"{name}[{log}]": v for log, v in by_log.items()}
                 if per_log
-                else {name: float(np.median([*own.values()]))}
+                else {name: float(np.median([*by_log.values()]))}
             )
         return out
 
     def _correct_log(self, log: Log, guessed: Mapping[str, float]) -> Log:
-        """The log as the plant's own start finder would like it."""
+        """Log without the sensors' delays, lags and offsets, for the plant's starts."""
         columns, t = {}, log.measured.t
         for n in (n for n in names(self.plant.outputs) if n in log.measured):
             late = sum(
@@ -231,9 +232,9 @@ class _Sensors:
 
     def _complete_states(self, start: Start, name: str, log: Log, guessed: Mapping[str, float]) -> Trajectory:
         run, p = start.states[name], log.parameters
-        own = {n.removesuffix(f"[{name}]"): v for n, v in start.parameters.items()} | dict(guessed)
-        own = {n: v for n, v in own.items() if n in p}
-        p = p.with_bounds(dict.fromkeys(own, (-math.inf, math.inf))).with_values(own)
+        values = {n.removesuffix(f"[{name}]"): v for n, v in start.parameters.items()} | dict(guessed)
+        values = {n: v for n, v in values.items() if n in p}
+        p = p.with_bounds(dict.fromkeys(values, (-math.inf, math.inf))).with_values(values)
         plant = self.plant
         u, x = log.measured.matrix(names(plant.inputs)), run.matrix(names(plant.states))
         ode = plant.ode.map(len(run))
@@ -246,7 +247,7 @@ class _Sensors:
     def _steady_sensor_states(
         self, true: Mapping[str, Array], rate: Mapping[str, Array], p: ParameterSet
     ) -> dict[str, Array]:
-        """The sensors' states behind outputs that change slowly."""
+        """States of the sensors for outputs that change slowly."""
         out: dict[str, Array] = {}
         for n in self.delay:
             T = self._parameter_value(p, n, "delay")
@@ -270,7 +271,7 @@ class _Sensors:
 
 
 def _resample_channel(log: Trajectory, name: str, grid: Array, other: str) -> Array:
-    """A channel on an even grid; a position differentiated where the other channel is none."""
+    """Channel on an even grid; a position is differentiated unless the other channel is one too."""
     known = np.isfinite(log[name])
     require(bool(known.any()), f"channel {name!r} holds no sample")
     column = np.interp(grid, log.t[known], log[name][known])

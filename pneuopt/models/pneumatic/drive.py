@@ -225,7 +225,7 @@ class PneumaticDrive:
         return rates
 
     def _chambers_and_ports(self, x: Symbols, p: Symbols) -> tuple[dict[str, dict[str, ca.SX]], dict[str, Port]]:
-        """States of the chambers, and the ports that they are for the valve, by side."""
+        """States of the chambers, and the valve's ports to them, by side."""
         inside = {side: {q.name: x[f"{q.name}_{side}"] for q in self.chamber.states} for side in SIDES}
         outside = p["ambient.temperature"]
         return inside, {side: Port(z["pressure"], self.chamber.temperature(z, outside)) for side, z in inside.items()}
@@ -245,7 +245,8 @@ class PneumaticDrive:
         """Function ``(t, x, u, p)`` for air from the supply [kg/s], spool position [half travels], air power [W].
 
         Air power is the work that this air could do in an isothermal expansion to ambient pressure: the integral of
-        p dV of an ideal gas, p V = m R T, per unit time, ``m' R T ln(p_s/p_o)``; at ambient temperature its flow exergy.
+        p dV of an ideal gas, p V = m R T, per unit time, ``m' R T ln(p_s/p_o)``; its flow exergy at ambient
+        temperature.
         """
         x, u, p = symbols(self.states), symbols((VALVE_VOLTAGE,)), {n: ca.SX.sym(n) for n in self.parameters}
         through = self._edge_flows(x, u, p)

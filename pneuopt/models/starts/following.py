@@ -1,7 +1,7 @@
-"""A drive's states that no log holds, integrated along those that one does: the air follows the logged motion.
+"""`AirSimulator`: states of a drive that a log lacks, integrated along the logged ones.
 
-With position, speed and command known, the chambers' pressures are an ODE of their own, and a stable one: what each
-holds leaks away. No friction enters, so it needs none.
+With position, speed and command known, the chambers' pressures follow an ODE of their own. It is stable, because a
+chamber forgets its initial pressure through the open edges, and it does not depend on friction.
 """
 
 import math
@@ -17,18 +17,20 @@ from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
 PRESSURE_NAMES = ("pressure_a", "pressure_b")
-MAX_INTEGRATION_STEP = 5e-5  # [s] of integration; a chamber of a few cm^3 at the end of its stroke answers in 1e-4 s
+# Largest step [s]: a chamber of a few cm^3 at the end of its stroke has a time constant of 1e-4 s, which a larger step
+# makes unstable; smaller ones cost time in proportion.
+MAX_INTEGRATION_STEP = 5e-5
 
 
 class AirSimulator:
-    """Compiled integration of a pneumatic drive whose states in `given_states` are given.
+    """Compiled integration of a pneumatic drive along given states.
 
-    Friction's own states stay at zero, for no air feels them.
+    Friction's states stay at zero, since the air does not depend on them.
 
     Parameters
     ----------
     system : System
-        A pneumatic drive's.
+        A pneumatic drive's system.
     given_states : sequence of str
         Names of the states that are given; position and speed at least.
     """
@@ -52,18 +54,18 @@ class AirSimulator:
         self._rollout = Rollout(Pieces(discretise(inner).step))
 
     def simulate_states(self, given: Trajectory, sets: Sequence[ParameterSet]) -> list[dict[str, Array]]:
-        """The states that follow, for each of several parameter sets; pressures start at half the supply.
+        """States that are not given, for each of several parameter sets; pressures start between ambient and supply.
 
         Parameters
         ----------
         given : Trajectory
-            The drive's inputs, held over each sample, and the states that lead, linear in between.
+            The drive's inputs, held over each sample, and the given states, linear in between.
         sets : sequence of ParameterSet
 
         Returns
         -------
         list of dict
-            By state, shape (n,).
+            Arrays of shape (n,) by state, for each parameter set.
         """
         u = given.matrix(self._inputs)
         inner = [i for i, n in enumerate(self._inputs) if n in self.given_states]
@@ -75,7 +77,7 @@ class AirSimulator:
         return [dict(zip(names(self.states), columns.T, strict=True)) for columns in x]
 
     def pressure_rates(self, given: Trajectory, sets: Sequence[ParameterSet]) -> Array:
-        """Rates of both pressures at every sample [Pa/s], for each of several parameter sets; every state leads.
+        """Rates of both pressures at every sample [Pa/s], for each of several parameter sets; every state is given.
 
         Returns
         -------
@@ -97,7 +99,7 @@ class AirSimulator:
         m = len(sets)
         p = np.array([parameter_vector(self._parameters, one) for one in sets])
         inputs, (t, h) = np.tile(u, (m, 1, 1)), (np.tile(a, (m, 1)) for a in grid)
-        with np.errstate(all="ignore"):  # an absurd set may overflow; whoever judges it sees no finite number then
+        with np.errstate(all="ignore"):  # absurd parameters may overflow; the caller then gets no finite number
             run = self._rollout.run(x0, inputs, p, t, h, substeps=substeps, states=states)
         return run.y if run.x is None else run.x
 

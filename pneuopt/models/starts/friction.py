@@ -1,7 +1,7 @@
-"""Where an identification of friction starts, without a guess from the user: equation error on the filtered log.
+"""Starts of an identification of friction without a guess from the user: equation error on the filtered log.
 
-Given the few parameters that a law scans (a Stribeck velocity), a drive's force is linear in the others; so for each of
-a few values one bounded linear least squares gives a candidate, in milliseconds. The law declares all this (`start`).
+A drive's force is linear in its parameters, except a few that the law scans, such as the Stribeck velocity. So each of
+a few values gives a candidate by one bounded linear least squares, in milliseconds. The law declares this (`start`).
 """
 
 import itertools
@@ -22,21 +22,30 @@ from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-FILTER_TIME = 0.031  # [s] window of the Savitzky-Golay filter, order 3
-SLIDING_SPEED = 4e-3  # [m/s] slower samples say nothing of sliding friction
-RIDGE_WEIGHT = 1e-2  # on columns of unit length: sliding one way only, Coulomb friction and a constant force are one
-MIN_LEVEL_EXCESS = 0.03  # of a level over the one it stands above (static, Coulomb's), as a fraction of it; below it
-# a search starts without a Stribeck curve and finds none
-DEFAULT_SMOOTHING = 1e-3  # [m/s] over which the sign of the speed turns, for laws without a smoothing of their own
-MAX_VALVE_SAMPLES = 2000  # samples of a log, about, by which a valve is judged
-PRESLIDING_DEFLECTIONS = 3.0  # bristle deflections since the last reversal, within which bristles still bend
-SLOW_SPEED = 1e-2  # [m/s] below it friction comes near its static level, and bristles still bend
-STATIC_QUANTILE = 0.995  # quantile of the force in slow samples that counts as static friction
-STATIC_WEIGHT = 0.003  # squared weight of that, in sliding samples; more, and one stuck sample bends the whole curve
+# Window of the Savitzky-Golay filter of order 3 [s]: a shorter one leaves noise in the acceleration, a longer one
+# flattens stick and slip.
+FILTER_TIME = 0.031
+# Speed above which a sample shows sliding friction [m/s]: below a smaller one the drive sticks, a larger one drops the
+# Stribeck curve.
+SLIDING_SPEED = 4e-3
+# Ridge on columns of unit length, which splits what no row separates: for motion one way, Coulomb friction and a
+# constant force. A larger one biases the other parameters, a smaller one leaves the split to rounding.
+RIDGE_WEIGHT = 1e-2
+# Least excess of a level (static) over the one below it (Coulomb), as a fraction of that one: with less, a search
+# starts without a Stribeck curve and finds none.
+MIN_LEVEL_EXCESS = 0.03
+DEFAULT_SMOOTHING = 1e-3  # speed over which the sign of the speed turns, for laws without a smoothing parameter [m/s]
+MAX_VALVE_SAMPLES = 2000  # approximate samples of a log from which a valve is estimated; more only cost time
+# Travel since the last reversal within which bristles still bend, in bristle deflections: with a smaller one,
+# presliding counts as sliding; a larger one drops sliding samples.
+PRESLIDING_DEFLECTIONS = 3.0
+SLOW_SPEED = 1e-2  # speed below which friction is near its static level and bristles still bend [m/s]
+STATIC_QUANTILE = 0.995  # quantile of the force in slow samples that counts as static friction; 1 would be an outlier
+STATIC_WEIGHT = 0.003  # squared weight of that sample, in sliding samples; with more it bends the whole curve
 
 
 def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
-    """Candidates for a `ForceDrive`: states from the filtered logs, parameters from M a + F_f(v) + F_L = F.
+    """Starts of a `ForceDrive`: states from the filtered logs, parameters from M a + F_f(v) + F_L = F.
 
     Raises
     ------
@@ -52,7 +61,7 @@ def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[S
 
 
 def motion_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
-    """Candidates for a `MotionDrive`: parameters from the measured force at the imposed speed and pressure."""
+    """Starts of a `MotionDrive`: parameters from the measured force at the imposed speed and pressure."""
     rows = {}
     for name, (measured, parameters) in logs.items():
         force, rig = measured["force"], {"rig.force_offset": np.ones(len(measured))}
@@ -65,7 +74,7 @@ def motion_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[
 
 
 def load_columns(parameters: ParameterSet, position: Array, acceleration: Array) -> dict[str, Array]:
-    """What multiplies each of the load's parameters in the force that moves it."""
+    """Regression columns of the load's parameters in the force that moves it."""
     sine = math.sin(parameters.value("load.inclination")) if "load.inclination" in parameters else 0.0
     columns = {"load.mass": acceleration + GRAVITY * sine, "load.force": np.ones_like(position)}
     if "load.stiffness" in parameters:
@@ -77,7 +86,7 @@ def filter_motion(measured: Trajectory) -> tuple[Array, Array, Array]:
     """Filtered position [m], speed [m/s] and acceleration [m/s^2], from whichever of position and speed is logged."""
     require(
         "position" in measured or "speed" in measured,
-        "the log has neither 'position' nor 'speed'; friction cannot be told without motion",
+        "the log has neither 'position' nor 'speed', without which friction is unidentifiable; log one of them",
         LogError,
     )
     if "position" in measured:
@@ -88,7 +97,7 @@ def filter_motion(measured: Trajectory) -> tuple[Array, Array, Array]:
 
 
 def filter_channel(measured: Trajectory, name: str, derivative: int) -> Array:
-    """A channel, or its derivative by time, by Savitzky and Golay's filter; missing samples interpolated."""
+    """Channel, or its derivative by time, by a Savitzky-Golay filter; missing samples are interpolated."""
     step = float(np.median(np.diff(measured.t)))
     window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
     window = min(window, (len(measured) - 1) // 2 * 2 + 1)
@@ -98,7 +107,7 @@ def filter_channel(measured: Trajectory, name: str, derivative: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class RegressionRows:
-    """One log's part of the regression: ``force = sum(columns * parameters) + friction``."""
+    """Rows of one log in the regression ``force = sum(columns * parameters) + friction``."""
 
     measured: Trajectory
     parameters: ParameterSet
@@ -109,14 +118,14 @@ class RegressionRows:
 
 
 def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> Sequence[Start]:
-    """One start for each value tried of the parameters that the law scans, from the rows of all logs."""
+    """Starts from the rows of all logs, one for each set of values of the parameters that the law scans."""
     parameters = next(iter(logs.values())).parameters
-    own, starts = {n: rows.parameters for n, rows in logs.items()}, []
+    by_log, starts = {n: rows.parameters for n, rows in logs.items()}, []
     for tried in _scanned_values(friction.start, parameters):
         values, _ = _regress(friction, logs, parameters, tried)
         guess: dict[str, float] = {}
         for name, value in tried.items():
-            guess |= per_log_values(f"friction.{name}", value, own)
+            guess |= per_log_values(f"friction.{name}", value, by_log)
         values |= guess
         words = [f"{n.replace('_', ' ')} {v:g} {parameters[f'friction.{n}'].unit}" for n, v in tried.items()]
         bristles = _bristle_deflections(friction, logs, values)
@@ -126,7 +135,7 @@ def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRo
 
 
 def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:
-    """Mean size of the force that no friction explains, of all that the sliding samples show [N]."""
+    """Mean absolute force in sliding samples that friction does not explain [N]."""
     thinned = {name: _thin_rows(rows) for name, rows in logs.items()}
     parameters = next(iter(logs.values())).parameters
     if not all(np.isfinite(rows.force).all() for rows in thinned.values()):
@@ -136,14 +145,14 @@ def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) ->
 
 
 def _scanned_values(start: FrictionStart, parameters: ParameterSet) -> list[dict[str, float]]:
-    """Each set of values to try of the free ones among the scanned parameters, within their bounds."""
+    """Sets of values to try of the free scanned parameters, within their bounds."""
     free = {n: parameters[f"friction.{n}"] for n in start.scanned if f"friction.{n}" in parameters.free_names}
     tried = [dict.fromkeys(np.clip(start.scanned[n], p.lower, p.upper).tolist()) for n, p in free.items()]
     return [dict(zip(free, values, strict=True)) for values in itertools.product(*tried)]
 
 
 def per_log_values(name: str, value: float, logs: Mapping[str, ParameterSet]) -> dict[str, float]:
-    """A start value, for each log where the parameter is each log's own."""
+    """Start value of a parameter, one for each log where the parameter is `per_log`."""
     per_log = any(parameters[name].per_log for parameters in logs.values())
     return (
         {f"{name}[{log}]": value for log, parameters in logs.items() if parameters[name].free}
@@ -153,7 +162,7 @@ def per_log_values(name: str, value: float, logs: Mapping[str, ParameterSet]) ->
 
 
 def _thin_rows(rows: RegressionRows) -> RegressionRows:
-    """At most about `MAX_VALVE_SAMPLES` of the samples."""
+    """Rows of about `MAX_VALVE_SAMPLES` samples at most."""
     every = slice(None, None, max(1, len(rows.measured) // MAX_VALVE_SAMPLES))
     measured = Trajectory(rows.measured.t[every], {n: rows.measured[n][every] for n in rows.measured})
     columns, states = ({n: c[every] for n, c in part.items()} for part in (rows.columns, rows.states))
@@ -165,7 +174,7 @@ def _thin_rows(rows: RegressionRows) -> RegressionRows:
 def _regress(
     friction: FrictionModel, logs: Mapping[str, RegressionRows], parameters: ParameterSet, tried: Mapping[str, float]
 ) -> tuple[dict[str, float], Array]:
-    """Bounded linear least squares over all logs' sliding samples, with four Cauchy reweights; and what is left [N]."""
+    """Bounded robust least squares over all logs' sliding samples; returns the values and the residuals [N]."""
     parts = [_log_columns(friction, name, rows, tried) for name, rows in logs.items()]
     free = list(dict.fromkeys(n for columns, _ in parts for n in columns))
     A = np.vstack(
@@ -194,12 +203,12 @@ def _regress(
 
 
 def _raise_levels(start: FrictionStart, values: dict[str, float], parameters: ParameterSet) -> dict[str, float]:
-    """The values with every excess over another level made the level itself."""
+    """Values in which each excess over another level becomes the level itself."""
     levels = {f"friction.{n}": f"friction.{base}" for n, base in start.above.items()}
     out = dict(values)
     for name in (n for n in values if n.split("[")[0] in levels):
-        own, _, log = name.partition("[")
-        base = levels[own]
+        level, _, log = name.partition("[")
+        base = levels[level]
         usual = values.get(base, parameters.value(base))
         below = values.get(f"{base}[{log}", usual) if log else usual
         out[name] = below + max(values[name], MIN_LEVEL_EXCESS * below)
@@ -213,7 +222,7 @@ def _coefficient_row(columns: Mapping[str, float], free: Sequence[str]) -> Array
 def _static_levels(
     friction: FrictionModel, logs: Mapping[str, RegressionRows], tried: Mapping[str, float]
 ) -> list[tuple[dict[str, float], float]]:
-    """For each log a slow sample in which friction is about to give way: it is static there, whatever the speed."""
+    """Regression row and force of a slow sample just before break-away, for each log: friction is static there."""
     out, levels = [], {f"friction.{n}" for n in friction.start.above}
     for name, rows in logs.items():
         _, pull = _log_columns(friction, name, rows, tried)
@@ -228,14 +237,17 @@ def _static_levels(
 def _log_columns(
     friction: FrictionModel, name: str, rows: RegressionRows, tried: Mapping[str, float], stuck: Array | None = None
 ) -> tuple[dict[str, Array], Array]:
-    """A log's free columns ("name[log]" if its own), and its force less what is known; `stuck`: see below."""
+    """Columns of a log's free parameters ("name[log]" if per log), and its force less the terms of fixed ones.
+
+    For `stuck` see `_friction_columns`.
+    """
     p = rows.parameters
     columns = {n: c for n, c in {**rows.columns, **_friction_columns(friction, rows, tried, stuck)}.items() if n in p}
     known = {n: p.value(n) for n in columns}
     for level, base in ((f"friction.{n}", f"friction.{below}") for n, below in friction.start.above.items()):
         known[level] -= p.value(base)
         if p[base].free and not p[level].free:
-            # the level is known, so what is above the other shrinks as the other grows
+            # the level is fixed, so its excess over the other level shrinks as that one grows
             known[level] = p.value(level)
             columns[base] = columns[base] - columns[level]
     target = rows.force - sum(
@@ -247,15 +259,15 @@ def _log_columns(
 def _friction_columns(
     friction: FrictionModel, rows: RegressionRows, tried: Mapping[str, float], stuck: Array | None = None
 ) -> dict[str, Array]:
-    """What multiplies each friction parameter in the force.
+    """Regression columns of the friction parameters.
 
-    If stuck (1 or -1: the side to which a sample is pulled) friction has its static level, whatever the filtered speed.
+    With `stuck`, the sign of the force that pulls, friction has its static level, whatever the filtered speed.
     """
     p, speed = rows.parameters, rows.speed
-    own = {n: p.value(f"friction.{n}") for n in friction.parameters} | dict(tried)
+    values = {n: p.value(f"friction.{n}") for n in friction.parameters} | dict(tried)
     signals = {**{n: rows.measured[n] for n in rows.measured}, "force": rows.force}
     inputs = law_inputs(friction, signals, {n: p.value(n) for n in p if n.startswith("ambient.")})
-    samples = FrictionSamples(speed, np.tanh(speed / own.get("smoothing", DEFAULT_SMOOTHING)), speed, inputs, own)
+    samples = FrictionSamples(speed, np.tanh(speed / values.get("smoothing", DEFAULT_SMOOTHING)), speed, inputs, values)
     if stuck is not None:
         samples = replace(samples, side=stuck, level_speed=np.zeros_like(speed))
     return {f"friction.{n}": c for n, c in friction.start.columns(samples).items()}
@@ -264,7 +276,7 @@ def _friction_columns(
 def _robust_least_squares(
     A: Array, y: Array, lower: Array, upper: Array, given: tuple[Array, Array] | None = None
 ) -> Array:
-    """Bounded least squares, reweighted but for the given rows; `RIDGE_WEIGHT` splits what no row tells apart."""
+    """Bounded least squares with Cauchy weights, except on the given rows, and a ridge (`RIDGE_WEIGHT`)."""
     k = A.shape[1]
     given_A, given_y = (np.empty((0, k)), np.empty(0)) if given is None else given
     scale = np.linalg.norm(A, axis=0) + 1e-300
@@ -281,11 +293,11 @@ def _robust_least_squares(
 
 
 def _regression_bounds(start: FrictionStart, bases: Mapping[str, Parameter], level: float) -> tuple[Array, Array]:
-    """Of the regression: the parameters' own, and the law's floors, which keep friction positive."""
+    """Bounds of the regression: those of the parameters, and the law's floors, which keep friction positive."""
     floors = {f"friction.{n}": share * level for n, share in start.floors.items()}
-    excesses, own = {f"friction.{n}" for n in start.above}, {n: n.split("[")[0] for n in bases}
-    given = [0.0 if own[n] in excesses else p.lower for n, p in bases.items()]
-    lower = np.array([max(floors.get(own[n], -np.inf), lo) for n, lo in zip(bases, given, strict=True)])
+    excesses, shared = {f"friction.{n}" for n in start.above}, {n: n.split("[")[0] for n in bases}
+    given = [0.0 if shared[n] in excesses else p.lower for n, p in bases.items()]
+    lower = np.array([max(floors.get(shared[n], -np.inf), lo) for n, lo in zip(bases, given, strict=True)])
     upper = np.array([max(p.upper, lo + 1e-9) for p, lo in zip(bases.values(), lower, strict=True)])
     return lower, upper
 
@@ -293,21 +305,21 @@ def _regression_bounds(start: FrictionStart, bases: Mapping[str, Parameter], lev
 def _bristle_deflections(
     friction: FrictionModel, logs: Mapping[str, RegressionRows], values: dict[str, float]
 ) -> dict[str, dict[str, Array]]:
-    """The bristle deflection along each log, and their stiffness from presliding motion (changes `values`)."""
+    """Bristle deflections along each log; the stiffness is estimated from presliding and written to `values`."""
     bristles = friction.start.bristles
     if bristles is None:
         return {}
     parameters = next(iter(logs.values())).parameters
-    own = {n: values.get(f"friction.{n}", parameters.value(f"friction.{n}")) for n in friction.parameters}
+    law = {n: values.get(f"friction.{n}", parameters.value(f"friction.{n}")) for n in friction.parameters}
     forces = {n: _friction_force(n, rows, values) for n, rows in logs.items()}
     name = f"friction.{bristles.stiffness}"
     stiffness = parameters[name]
     if stiffness.free:
-        slope = _presliding_slope(logs, forces, 0.6 * own[bristles.level])
+        slope = _presliding_slope(logs, forces, 0.6 * law[bristles.level])
         low, high = max(bristles.range[0], stiffness.lower), min(bristles.range[1], stiffness.upper)
-        own[bristles.stiffness] = float(np.clip(slope, low, high))
-        values |= per_log_values(name, own[bristles.stiffness], {n: rows.parameters for n, rows in logs.items()})
-    deflections = {n: bristles.deflections(forces[n], rows.speed, own) for n, rows in logs.items()}
+        law[bristles.stiffness] = float(np.clip(slope, low, high))
+        values |= per_log_values(name, law[bristles.stiffness], {n: rows.parameters for n, rows in logs.items()})
+    deflections = {n: bristles.deflections(forces[n], rows.speed, law) for n, rows in logs.items()}
     return {n: {f"friction.{state}": z for state, z in found.items()} for n, found in deflections.items()}
 
 
@@ -319,7 +331,7 @@ def _presliding_slope(logs: Mapping[str, RegressionRows], friction: Mapping[str,
         rate.append(np.gradient(friction[n], rows.measured.t)[presliding])
         speed.append(rows.speed[presliding])
     v = np.concatenate(speed)
-    # a step of the force, or the log's edge, is no presliding: the robust weights take it out
+    # a step of the force, or the log's edge, is no presliding: the robust weights suppress it
     return (
         float(_robust_least_squares(v[:, None], np.concatenate(rate), np.zeros(1), np.full(1, np.inf))[0])
         if v.size
@@ -336,7 +348,7 @@ def _distance_since_reversal(rows: RegressionRows) -> Array:
 
 
 def _friction_force(name: str, rows: RegressionRows, values: Mapping[str, float]) -> Array:
-    """The force less what inertia, load and offsets take [N]."""
+    """Friction force: the force less those of inertia, load and offsets [N]."""
     p = rows.parameters
     used = {n: c for n, c in rows.columns.items() if n in p}
     taken = (values.get(n, values.get(f"{n}[{name}]", p.value(n))) * c for n, c in used.items())

@@ -1,4 +1,4 @@
-"""How a linear plant starts from logs without a user's guess: separable output error over a grid, then refined.
+"""Starts of a linear plant from logs without a user's guess: separable output error over a grid, then refined.
 
 Gain, start states and Coulomb friction enter the response linearly, so each point of a grid over the few other values
 (time constants, damping, dead time) costs one small linear least squares; the best of them are refined.
@@ -18,9 +18,11 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
 Polynomials = tuple[list[float], list[float]]
-MAX_GRID_SAMPLES, MAX_REFINEMENT_SAMPLES, MIN_SAMPLES = 600, 4000, 20
-MAX_CANDIDATES = 4
-DAMPING_GRID = (0.1, 0.3, 0.7, 1.5, 4.0)
+# Samples of all logs together in the grid search and in the refinement: fewer hide fast plants, more cost time.
+MAX_GRID_SAMPLES, MAX_REFINEMENT_SAMPLES = 600, 4000
+MIN_SAMPLES = 20  # samples that a log needs: fewer than a few for each parameter fit anything
+MAX_CANDIDATES = 4  # candidates that are refined and returned: fewer miss the right one, each costs a refinement
+DAMPING_GRID = (0.1, 0.3, 0.7, 1.5, 4.0)  # damping ratios of the grid [1], from ringing to two separate lags
 PLANT_DAMPING, PLANT_DEAD_TIME, PLANT_GAIN, COULOMB_LEVEL = (
     "plant.damping",
     "plant.dead_time",
@@ -31,14 +33,14 @@ PLANT_DAMPING, PLANT_DEAD_TIME, PLANT_GAIN, COULOMB_LEVEL = (
 
 @dataclass(frozen=True)
 class ResponseShape:
-    """A plant's response at unit gain, apart from its dead time.
+    """Transfer function of a plant at unit gain, without its dead time.
 
     Parameters
     ----------
     names : tuple of str
-        The parameters that shape it.
+        Names of its parameters.
     polynomials : callable
-        Their values to numerator and denominator, highest power first.
+        Maps their values to numerator and denominator, highest power first.
     friction_polynomials : callable, optional
         The same for the response to friction.
     """
@@ -50,17 +52,17 @@ class ResponseShape:
 
 @dataclass(frozen=True)
 class LinearStarts:
-    """The start finder of a linear plant.
+    """Start hook of a linear plant.
 
     Parameters
     ----------
-    shape : Shape
+    shape : ResponseShape
     source, output : str
-        The plant's input and output.
+        Names of the plant's input and output.
     delay_line : tuple of str
-        The states of its dead time.
+        Names of the states of its dead time.
     zero_states : tuple of str
-        States of which a log tells nothing; they start at zero.
+        Names of states that no log shows; they start at zero.
 
     Raises
     ------
@@ -80,7 +82,7 @@ class LinearStarts:
         parameters = next(iter(logs.values())).parameters
         records = [_resample_log(name, log, self.source, self.output) for name, log in logs.items()]
         moves = any(np.ptp(r.u) > 0 for r in records)
-        require(moves, f"{self.source} never changes, which tells nothing of the plant; log a step of it", LogError)
+        require(moves, f"{self.source} never changes, so the plant is unidentifiable; log a step of it", LogError)
         coarse, fine = (
             [_thin_log(r, n // len(records)) for r in records] for n in (MAX_GRID_SAMPLES, MAX_REFINEMENT_SAMPLES)
         )
@@ -118,7 +120,7 @@ class LinearStarts:
 
 @dataclass(frozen=True, eq=False)
 class _EvenLog:
-    """A log on an even grid from zero: held input, output, sign of the output; its gain if that is known."""
+    """A log on an even grid from zero: held input, output, smooth sign of the output, and the gain if it is fixed."""
 
     t: Array
     u: Array
@@ -130,7 +132,7 @@ class _EvenLog:
 
 @dataclass(frozen=True, eq=False)
 class _UnitResponses:
-    """One log's responses of unit gain: to the input as it was before, to its moves since, to friction; free ones."""
+    """Responses of unit gain on one log: to the initial input, to its changes, to friction, and free responses."""
 
     initial_input: Array
     input_changes: Array
@@ -140,7 +142,7 @@ class _UnitResponses:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A point of the search: its shaping values (dead time last), what is linear in the response, its errors by log."""
+    """A point of the search: shaping values (dead time last), linear parameters, and errors by log."""
 
     values: tuple[float, ...]
     misfit: float
@@ -172,7 +174,7 @@ def _thin_log(record: _EvenLog, most: int) -> _EvenLog:
 
 
 def _trial_values(name: str, records: Sequence[_EvenLog], parameters: ParameterSet) -> Array:
-    """Values to try: one if the parameter is fixed; else across what the logs can show, within the bounds."""
+    """Values to try: one if the parameter is fixed, else the range that the logs can show, within the bounds."""
     known = parameters[name]
     if not known.free:
         return np.array([known.value])
@@ -187,26 +189,26 @@ def _trial_values(name: str, records: Sequence[_EvenLog], parameters: ParameterS
 
 
 def _search_grid(shape: ResponseShape, records: Sequence[_EvenLog], grids: Sequence[Array]) -> list[_Fit]:
-    """Every point of the grid, the best first."""
-    own_grids, dead_grids = grids[: len(shape.names)], grids[len(shape.names) :]
+    """Fits at every point of the grid, the best first."""
+    shape_grids, dead_grids = grids[: len(shape.names)], grids[len(shape.names) :]
     fits = []
-    for own in itertools.product(*own_grids):
-        responses = [_unit_responses(shape, r, own) for r in records]
-        fits += [_solve_linear_part(responses, records, own, dead) for dead in itertools.product(*dead_grids)]
+    for shaping in itertools.product(*shape_grids):
+        responses = [_unit_responses(shape, r, shaping) for r in records]
+        fits += [_solve_linear_part(responses, records, shaping, dead) for dead in itertools.product(*dead_grids)]
     return sorted(fits, key=lambda fit: fit.misfit)
 
 
 def _refine_fit(
     shape: ResponseShape, records: Sequence[_EvenLog], fit: _Fit, names: Sequence[str], parameters: ParameterSet
 ) -> _Fit:
-    """Follow the misfit downhill over the logarithms of the free shaping values."""
+    """Minimise the misfit over the logarithms of the free shaping values."""
 
     def fit_at(logs: Array) -> _Fit:
         values = list(fit.values)
         for i, value in zip(free, np.exp(logs), strict=True):
             values[i] = float(value)
-        own, dead = values[: len(shape.names)], values[len(shape.names) :]
-        return _solve_linear_part([_unit_responses(shape, r, own) for r in records], records, own, dead)
+        shaping, dead = values[: len(shape.names)], values[len(shape.names) :]
+        return _solve_linear_part([_unit_responses(shape, r, shaping) for r in records], records, shaping, dead)
 
     def residuals(logs: Array) -> Array:
         return np.concatenate(fit_at(logs).errors)
@@ -221,7 +223,7 @@ def _refine_fit(
 
 
 def _distinct_fits(fits: Sequence[_Fit]) -> list[_Fit]:
-    """The best few that differ by more than a fifth in one of their values."""
+    """Best few fits that differ by more than a fifth in one of their values."""
     kept: list[_Fit] = []
     for fit in fits:
         apart = all(np.max(np.abs(np.log(np.divide(fit.values, k.values))), initial=0.0) > 0.2 for k in kept)
@@ -230,25 +232,25 @@ def _distinct_fits(fits: Sequence[_Fit]) -> list[_Fit]:
     return kept
 
 
-def _unit_responses(shape: ResponseShape, record: _EvenLog, own: Sequence[float]) -> _UnitResponses:
+def _unit_responses(shape: ResponseShape, record: _EvenLog, shaping: Sequence[float]) -> _UnitResponses:
     t, u = record.t, record.u
-    numerator, denominator = shape.polynomials(*own)
+    numerator, denominator = shape.polynomials(*shaping)
     b, a = _zero_order_hold_filter((numerator, denominator), float(t[1]))
     before: Array = u[0] * (np.full(len(t), numerator[-1] / denominator[-1]) if denominator[-1] else t)
     decays = np.column_stack([_apply_filter(np.ones(1), a, pulse) for pulse in np.eye(len(a) - 1, len(t))])
     free = np.linalg.qr(decays / np.abs(decays).max(axis=0))[0]
-    rubbing = (
+    friction = (
         ()
         if shape.friction_polynomials is None
-        else (_apply_filter(*_zero_order_hold_filter(shape.friction_polynomials(*own), float(t[1])), record.sign),)
+        else (_apply_filter(*_zero_order_hold_filter(shape.friction_polynomials(*shaping), float(t[1])), record.sign),)
     )
-    return _UnitResponses(before, _apply_filter(b, a, u - u[0]), rubbing, free)
+    return _UnitResponses(before, _apply_filter(b, a, u - u[0]), friction, free)
 
 
 def _solve_linear_part(
-    responses: Sequence[_UnitResponses], records: Sequence[_EvenLog], own: Sequence[float], dead: Sequence[float]
+    responses: Sequence[_UnitResponses], records: Sequence[_EvenLog], shaping: Sequence[float], dead: Sequence[float]
 ) -> _Fit:
-    """Least squares for what is linear: gain, gain times Coulomb voltage, and each log's free response."""
+    """Least squares for the linear parameters: gain, gain times Coulomb voltage, and each log's free response."""
     blocks, targets = [], []
     for q, r in zip(responses, records, strict=True):
         forced = q.initial_input + np.interp(r.t - sum(dead), r.t, q.input_changes, left=0.0)
@@ -267,11 +269,11 @@ def _solve_linear_part(
     coulomb = float(weights[0 if known is not None else 1]) / gain if responses[0].friction_responses and gain else 0.0
     ends = np.cumsum([len(r.t) for r in records])[:-1]
     split = tuple(np.split(errors, ends))
-    return _Fit((*own, *dead), misfit if np.isfinite(misfit) else np.inf, gain, coulomb, split)
+    return _Fit((*shaping, *dead), misfit if np.isfinite(misfit) else np.inf, gain, coulomb, split)
 
 
 def _zero_order_hold_filter(polynomials: Polynomials, step: float) -> tuple[Array, Array]:
-    """The filter that gives the exact response at samples to an input that is held between them."""
+    """Digital filter with the exact response at samples to an input that is held between them."""
     numerator, denominator = polynomials
     n = len(denominator) - 1
     joint = np.eye(n + 1, k=-1)
@@ -284,7 +286,7 @@ def _zero_order_hold_filter(polynomials: Polynomials, step: float) -> tuple[Arra
 
 
 def _matrix_exponential(matrix: Array) -> Array:
-    """exp(matrix) by scaling, Taylor series and squaring; for matrices this small far faster than scipy's."""
+    """Exponential of a small matrix by scaling, Taylor series and squaring, far faster than scipy's."""
     halvings = max(0, int(np.ceil(np.log2(np.abs(matrix).sum(axis=1).max() + 1e-300))) + 2)
     term = total = np.eye(len(matrix))
     for k in range(1, 14):

@@ -1,8 +1,8 @@
-"""Where the identification of a `PneumaticDrive` starts, without a guess from the user: equation error on the logs.
+"""Starts of the identification of a `PneumaticDrive` without a guess from the user: equation error on the logs.
 
-What is not logged (a pressure, the spool, a temperature) is integrated along the logged motion. A logged pressure's
-rate is linear in the valve's conductance and in conductance times leak; where no pressure is logged, the valve is
-searched with which the forces balance best. Friction is then the same regression as for a known force (see
+States that are not logged (a pressure, the spool, a temperature) are integrated along the logged motion. A logged
+pressure's rate is linear in the valve's conductance and in conductance times leak. Where no pressure is logged, a
+search finds the valve with the best balance of forces. Friction is then the same regression as for a known force (see
 `starts.friction`).
 """
 
@@ -35,36 +35,30 @@ from pneuopt.quantities.parameters import ParameterSet
 ValveValues = Mapping[str, float]
 AirForce = Callable[[Mapping[str, Any], Any, Any], Any]
 VALVE_CONDUCTANCE, VALVE_LEAK = "valve.conductance", "valve.leak"
-VALVE_SHAPE_GRID = {
-    "valve.critical_ratio": (0.15, 0.3, 0.45),
-    "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2),
-}  # tried, if free
-LEAK_GRID = (0.003, 0.01, 0.03, 0.1)  # tried, where no pressure is logged
-CONDUCTANCE_FACTORS = 2.0 ** np.arange(-1, 5)  # likewise, times what the logged speed needs at half the supply pressure
-MIN_LEAK = 1e-4  # at zero the search would begin on a bound
-REFINEMENT_STEPS = {
-    VALVE_CONDUCTANCE: 1.4,
-    VALVE_LEAK: 1.8,
-    "valve.critical_ratio": 0.08,
-    "valve.dead_zone": 0.02,
-}  # factors, then steps
-GRID_REFINEMENTS = 5  # each halves the step
+# Values of the valve's shape that are tried where they are free [1].
+VALVE_SHAPE_GRID = {"valve.critical_ratio": (0.15, 0.3, 0.45), "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2)}
+LEAK_GRID = (0.003, 0.01, 0.03, 0.1)  # leaks that are tried where no pressure is logged [1]
+CONDUCTANCE_FACTORS = 2.0 ** np.arange(-1, 5)  # conductances tried there, over `PneumaticLog.min_conductance`
+MIN_LEAK = 1e-4  # least leak of a start [1]: at zero the search would begin on a bound
+# First steps of the refinement: factors on conductance and leak, then differences of critical ratio and dead zone.
+REFINEMENT_STEPS = {VALVE_CONDUCTANCE: 1.4, VALVE_LEAK: 1.8, "valve.critical_ratio": 0.08, "valve.dead_zone": 0.02}
+GRID_REFINEMENTS = 5  # refinements, each with half the step of the last
 
 
 @dataclass(frozen=True, eq=False)
 class PneumaticStarts:
-    """The start finder of a pneumatic drive.
+    """Start hook of a pneumatic drive.
 
-    A log without position takes it as the integral of the speed, from cylinder.start of the stroke; the fit moves that
-    beginning to where the air in both chambers has it (from 20 mm off in 200 mm it did).
+    For a log without position, the position is the integral of the speed from cylinder.start of the stroke. The fit
+    corrects that start, which the air in both chambers determines (from 20 mm off in 200 mm it did).
 
     Parameters
     ----------
     system : callable
-        Returns the drive's System (not held: it holds this).
+        Returns the drive's System, which holds this hook and is therefore not held here.
     friction : FrictionModel
     air_force : callable
-        From the parameters' mapping and both pressures [Pa] to the force of the air on the piston [N].
+        Maps the parameters and both pressures [Pa] to the force of the air on the piston [N].
     """
 
     system: Callable[[], System]
@@ -72,23 +66,23 @@ class PneumaticStarts:
     air_force: AirForce
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
-        """Return candidates: one valve, friction for each of the Stribeck velocities tried."""
+        """Return candidates with one valve, and with friction for each scanned Stribeck velocity."""
         runs = self.prepare_logs(logs)
         valve = _estimate_valve(self.friction, runs)
         starts = friction_candidates(self.friction, {name: run.force_balance(valve) for name, run in runs.items()})
-        own: dict[str, float] = {}
+        valve_values: dict[str, float] = {}
         for name, value in valve.items():
-            own |= per_log_values(name, value, {n: log.parameters for n, log in logs.items()})
-        return [replace(start, parameters={**start.parameters, **own}) for start in starts]
+            valve_values |= per_log_values(name, value, {n: log.parameters for n, log in logs.items()})
+        return [replace(start, parameters={**start.parameters, **valve_values}) for start in starts]
 
     def prepare_logs(self, logs: Mapping[str, Log]) -> dict[str, "PneumaticLog"]:
-        """The logs as this drive's motion and air."""
-        followers = functools.cache(functools.partial(AirSimulator, self.system()))
-        return {name: PneumaticLog(log, followers, self.air_force) for name, log in logs.items()}
+        """Logs with the motion and the air of this drive."""
+        simulator_for = functools.cache(functools.partial(AirSimulator, self.system()))
+        return {name: PneumaticLog(log, simulator_for, self.air_force) for name, log in logs.items()}
 
 
 class PneumaticLog:
-    """One log: its filtered motion and pressures, and what follows from them with any valve."""
+    """A log with its filtered motion and pressures, and the states that follow from them for a given valve."""
 
     def __init__(self, log: Log, simulator_for: Callable[[tuple[str, ...]], AirSimulator], push: AirForce) -> None:
         self.measured, self.parameters = log
@@ -105,21 +99,21 @@ class PneumaticLog:
         self._known_signals = self.measured.select(["valve_voltage"]).with_columns(self.known_states)
 
     def _start_position(self, travel: Array) -> float:
-        """The position where a log without one begins [m]: cylinder.start, or the nearest that keeps to the stroke."""
+        """Initial position of a log without position [m]: cylinder.start, or the nearest that stays in the stroke."""
         stroke = self.parameters.value("cylinder.stroke")
         lowest, highest = -float(travel.min()), stroke - float(travel.max())
         return min(max(self.parameters.value("cylinder.start") * stroke, lowest), max(lowest, highest))
 
     def force_balance(self, valve: ValveValues) -> RegressionRows:
-        """The forces with this valve, for the regression of friction."""
+        """Rows for the regression of friction, with this valve."""
         return self.force_balances([valve])[0]
 
     def force_balances(self, valves: Sequence[ValveValues]) -> list[RegressionRows]:
-        """The forces with each of several valves."""
+        """Rows for the regression of friction, with each of several valves."""
         columns = load_columns(self.parameters, self.known_states["position"], self._acceleration)
         out = []
-        for follow in self._simulate_air(valves):
-            states = {**self.known_states, **follow}
+        for air in self._simulate_air(valves):
+            states = {**self.known_states, **air}
             measured = self.measured.with_columns({n: states[n] for n in PRESSURE_NAMES})
             force = self._air_force(
                 {n: q.value for n, q in self.parameters.items()}, *(states[n] for n in PRESSURE_NAMES)
@@ -128,15 +122,15 @@ class PneumaticLog:
         return out
 
     def valve_columns(self, shape: ValveValues) -> tuple[Array, Array]:
-        """The regression of the m logged pressures' rates on conductance, and conductance times leak.
+        """Regression of the m logged pressures' rates on conductance, and conductance times leak.
 
         Returns
         -------
         columns : ndarray, shape (n, m, 2)
         rates : ndarray, shape (n, m)
-            As logged, less what they are behind a closed valve [Pa/s].
+            Logged rates less those with a closed valve [Pa/s].
         """
-        unit, leak = 1e-8, 0.01  # the rates are linear in both: any two values tell the columns
+        unit, leak = 1e-8, 0.01  # the rates are linear in both, so any two values give the columns
         probes = [{**shape, VALVE_CONDUCTANCE: c, VALVE_LEAK: x} for c, x in ((1e-12, 0.0), (unit, 0.0), (unit, leak))]
         closed, edges, leaking = self._pressure_rates(probes)
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
@@ -151,7 +145,7 @@ class PneumaticLog:
         return rates[:, :, [PRESSURE_NAMES.index(n) for n in self.logged_pressures]]
 
     def min_conductance(self) -> float:
-        """Of an open edge, choked, to feed the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
+        """Conductance of a choked edge that feeds the fastest motion at half the supply pressure [m^3/(s*Pa)]."""
         fastest = float(np.quantile(np.abs(self.known_states["speed"]), 0.99))
         gas = self.parameters.value("gas.constant") * self.parameters.value("ambient.temperature")
         area = math.pi / 4 * self.parameters.value("cylinder.bore") ** 2
@@ -159,7 +153,7 @@ class PneumaticLog:
 
     @functools.cached_property
     def _default_air_states(self) -> dict[str, Array]:
-        """What follows with the valve's given values."""
+        """States that are not logged, with the given values of the valve."""
         return self._simulate_air([{}])[0]
 
     def _simulate_air(self, valves: Sequence[ValveValues]) -> list[dict[str, Array]]:
@@ -168,14 +162,14 @@ class PneumaticLog:
         )
 
     def _with_valves(self, valves: Iterable[ValveValues]) -> list[ParameterSet]:
-        """The log's parameters with other valves, and no bounds on those."""
+        """Parameters of the log with each of several valves, whose values have no bounds."""
         return [
             self.parameters.with_bounds(dict.fromkeys(valve, (-np.inf, np.inf))).with_values(valve) for valve in valves
         ]
 
 
 def _estimate_valve(friction: FrictionModel, runs: Mapping[str, PneumaticLog]) -> dict[str, float]:
-    """What is free of conductance, leak, critical ratio and dead zone."""
+    """Estimates of the free parameters among conductance, leak, critical ratio and dead zone."""
     parameters = next(iter(runs.values())).parameters
     free = [
         n
@@ -201,7 +195,7 @@ def _search_values(
     parameters: ParameterSet,
     misfits: Callable[[Sequence[ValveValues]], Sequence[float]],
 ) -> dict[str, float]:
-    """The values of least misfit: the best of a grid, then of ever closer ones around the best."""
+    """Values of least misfit: the best of a grid, then of ever finer ones around it."""
     if not tried:
         return {}
     names = list(tried)
@@ -225,7 +219,7 @@ def _search_values(
 def _fit_valve_to_pressures(
     runs: Mapping[str, PneumaticLog], free: Sequence[str], shape: ValveValues
 ) -> tuple[dict[str, float], float]:
-    """Conductance and leak, as far as free, by linear regression; and the squares that are left [Pa^2/s^2]."""
+    """Free ones of conductance and leak by linear regression, and the sum of squared residuals [Pa^2/s^2]."""
     parameters = next(iter(runs.values())).parameters
     parts = [run.valve_columns(shape) for run in runs.values() if run.logged_pressures]
     A = np.concatenate([columns.reshape(-1, 2) for columns, _ in parts])
@@ -241,7 +235,7 @@ def _fit_valve_to_pressures(
 
 
 def _affine_basis(conductance: float, leak: float, conductance_free: bool, leak_free: bool) -> tuple[Array, Array]:
-    """(C, C * leak) as a known part and a basis of what is free."""
+    """Vector (C, C * leak) as a known part and a basis for the free part."""
     if conductance_free:
         return np.zeros(2), np.eye(2) if leak_free else np.array([[1.0], [leak]])
     if leak_free:
@@ -252,6 +246,6 @@ def _affine_basis(conductance: float, leak: float, conductance_free: bool, leak_
 def _force_misfits(
     friction: FrictionModel, runs: Mapping[str, PneumaticLog], valves: Sequence[ValveValues]
 ) -> list[float]:
-    """How badly the forces balance with each of several valves [N]."""
+    """Misfit of the force balance with each of several valves [N]."""
     balances = {name: run.force_balances(valves) for name, run in runs.items()}
     return [force_misfit(friction, {name: rows[k] for name, rows in balances.items()}) for k in range(len(valves))]

@@ -1,8 +1,9 @@
-"""Whether a log's pressures count from vacuum: what the air in a chamber tells of their zero point.
+"""Check that a log's pressures are absolute, by the mass balance of the chambers.
 
-Boyle's law: a moving piston changes a pressure in proportion to the absolute one, and the valve's flow depends on the
-ratio of absolute pressures. A gauge pressure read as absolute misses that, whatever the valve's conductance and leak.
-Sensors and supply all an atmosphere off keep nearly every ratio; a wrong exponent looks the same: that is not told.
+By Boyle's law a moving piston changes a pressure in proportion to its absolute value, and the valve's flow depends on
+the ratio of absolute pressures. A gauge pressure that is read as absolute violates this, whatever the valve's
+conductance and leak. If sensors and supply are all off by an atmosphere, nearly every ratio stays the same; a wrong
+exponent looks alike, so this case is not detected.
 """
 
 import itertools
@@ -21,21 +22,21 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.units import ATMOSPHERE
 
 PrepareLogs = Callable[[Mapping[str, Log]], Mapping[str, PneumaticLog]]
-MIN_RESIDUAL_RATIO = (
-    1.5  # times smaller residuals make another zero point the better one (tests/models/test_pressure_zero.py)
-)
-MAX_UNQUESTIONED_SHARE = (
-    0.02  # the same: what a right zero point may leave unquestioned (a wrong one leaves 0.03 or more)
-)
-MAX_RESIDUAL_SHARE = 0.2  # of a pressure's squared rates: what a zero point that is believed leaves at most
-MIN_LOG_DURATION = 1.0  # [s] of a log that is judged on its own
-MAX_SAMPLES_PER_LOG = 2000  # samples of a log that are looked at
+# Ratio of residuals by which another zero point must be better to be advised: a smaller one warns of right pressures, a
+# larger one misses wrong ones (tests/models/starts/test_pressure_zero.py).
+MIN_RESIDUAL_RATIO = 1.5
+# Share of a pressure's squared rates that a zero point may leave without a check of others: a wrong one leaves 0.03 or
+# more (tests/models/starts/test_pressure_zero.py), a smaller share checks right ones at the cost of time.
+MAX_UNQUESTIONED_SHARE = 0.02
+MAX_RESIDUAL_SHARE = 0.2  # largest such share that an advised zero point may leave: with more, the model does not fit
+MIN_LOG_DURATION = 1.0  # duration from which a log is checked alone as well [s]; shorter ones hold too little motion
+MAX_SAMPLES_PER_LOG = 2000  # samples of a log that are checked; more only cost time
 SUPPLY_PRESSURE = "supply.pressure"
 ATMOSPHERE_ADDED, ATMOSPHERE_TAKEN_OFF = f"{ATMOSPHERE / 1e5:.3f} bar added", f"{ATMOSPHERE / 1e5:.3f} bar taken off"
 
 
 class ZeroShift(NamedTuple):
-    """What is added to the logged pressures and to the supply's [atmospheres], and what that would mean."""
+    """Shift of the logged pressures and of the supply pressure [atmospheres], and the advice if it fits better."""
 
     sensors: int
     supply: int
@@ -54,27 +55,27 @@ ZERO_SHIFTS = (
 
 @dataclass(frozen=True, eq=False)
 class PressureZeroCheck:
-    """The doubter of a pneumatic drive, for logs with pressures, motion and command.
+    """Log warning hook of a pneumatic drive, for logs with pressures, motion and command.
 
     Parameters
     ----------
     prepare : callable
-        From logs to what the start finder makes of them.
+        Prepares logs as the start hook does, `PneumaticStarts.prepare_logs`.
     """
 
     prepare: PrepareLogs
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """Return a sentence for each pressure whose chamber's equation holds better from another zero point."""
-        telling = {name: _most_active_part(log) for name, log in logs.items() if _is_informative(log)}
-        left = self._doubtful_residuals(telling) if telling else {}
-        together = left.values() if len(left) == len(telling) else ()
-        told = list(_warning_sentences("".join(logs) if len(logs) == 1 else "", together))
-        long = [] if told else [name for name in left if float(np.ptp(telling[name].measured.t)) >= MIN_LOG_DURATION]
-        return told + [sentence for name in long for sentence in _warning_sentences(name, [left[name]])]
+        active = {name: _most_active_part(log) for name, log in logs.items() if _is_informative(log)}
+        left = self._doubtful_residuals(active) if active else {}
+        together = left.values() if len(left) == len(active) else ()
+        warnings = list(_warning_sentences("".join(logs) if len(logs) == 1 else "", together))
+        long = [] if warnings else [n for n in left if float(np.ptp(active[n].measured.t)) >= MIN_LOG_DURATION]
+        return warnings + [sentence for name in long for sentence in _warning_sentences(name, [left[name]])]
 
     def _doubtful_residuals(self, logs: Mapping[str, Log]) -> dict[str, dict[str, Array]]:
-        """By doubtful log and logged pressure: its rates' squares, and what of them each shift leaves [Pa^2/s^2]."""
+        """Squared rates of each pressure of doubtful logs, and the squared residuals with each shift [Pa^2/s^2]."""
         spread = {
             name: {n: _rate_sum_of_squares(log, n) for n in _pressure_channels(log)} for name, log in logs.items()
         }
@@ -91,7 +92,7 @@ class PressureZeroCheck:
         }
 
     def _shift_residuals(self, logs: Mapping[str, Log], remedy: ZeroShift) -> dict[str, dict[str, float]]:
-        """What a shift of the zero points leaves of each log's pressure rates [Pa^2/s^2]."""
+        """Squared residuals of each log's pressure rates with shifted zero points [Pa^2/s^2]."""
         left: dict[str, dict[str, float]] = {}
         for name, run in self.prepare({n: _shift_zero(log, remedy) for n, log in logs.items()}).items():
             parts = [run.valve_columns(shape) for shape in _valve_shapes(logs[name])]
@@ -105,13 +106,13 @@ class PressureZeroCheck:
 
 
 def _is_informative(log: Log) -> bool:
-    """Whether it holds motion and a pressure, and the supply is known: the ratio to a guess says nothing."""
+    """Whether a log has motion and a pressure, and the supply pressure is known, without which no ratio is."""
     known = SUPPLY_PRESSURE not in log.parameters.free_names
     return known and any(n in log.measured for n in ("position", "speed")) and bool(_pressure_channels(log))
 
 
 def _most_active_part(log: Log) -> Log:
-    """The part of a long log in which the pressures change most: enough to tell, for less than a fit's step costs."""
+    """Part of a long log in which the pressures change most, which is enough for the check and cheap."""
     data = log.measured
     if len(data) <= MAX_SAMPLES_PER_LOG:
         return log
@@ -128,13 +129,13 @@ def _pressure_channels(log: Log) -> list[str]:
 
 
 def _rate_sum_of_squares(log: Log, name: str) -> float:
-    """Of a pressure's rates, squared."""
+    """Sum of the squared deviations of a pressure's rates from their mean."""
     rates = filter_channel(log.measured, name, 1)
     return float(np.sum((rates - rates.mean()) ** 2))
 
 
 def _shift_zero(log: Log, remedy: ZeroShift) -> Log:
-    """The log with other zero points, so many atmospheres away."""
+    """Log with the zero points shifted by whole atmospheres."""
     measured, p = log
     measured = measured.with_columns({n: measured[n] + remedy.sensors * ATMOSPHERE for n in _pressure_channels(log)})
     moved = {SUPPLY_PRESSURE: p.value(SUPPLY_PRESSURE) + remedy.supply * ATMOSPHERE}
@@ -142,21 +143,21 @@ def _shift_zero(log: Log, remedy: ZeroShift) -> Log:
 
 
 def _valve_shapes(log: Log) -> Iterator[dict[str, float]]:
-    """The valve's other values, tried where they are free."""
+    """Values of the valve's shape parameters to try, where they are free."""
     free = [n for n in VALVE_SHAPE_GRID if n in log.parameters.free_names]
     for values in itertools.product(*(VALVE_SHAPE_GRID[n] for n in free)):
         yield dict(zip(free, values, strict=True))
 
 
 def _regression_residual(columns: Array, wanted: Array) -> float:
-    """What a regression leaves; infinite where a hypothesis has left the numbers' range."""
+    """Sum of squared residuals of a regression; infinite where a shift has made numbers overflow."""
     if not np.isfinite(columns).all() or not np.isfinite(wanted).all():
         return math.inf
     return float(np.sum((wanted - columns @ np.linalg.lstsq(columns, wanted, rcond=None)[0]) ** 2))
 
 
 def _warning_sentences(name: str, logs: Collection[Mapping[str, Array]]) -> Iterator[str]:
-    """One for each pressure with a better zero point in these logs together."""
+    """Sentences, one for each pressure for which another zero point fits better in these logs together."""
     for channel in PRESSURE_NAMES:
         rows = [left[channel] for left in logs if channel in left]
         total, given, *shifted = np.sum(rows, axis=0) if rows else np.zeros(1 + len(ZERO_SHIFTS))
