@@ -13,7 +13,7 @@ from pneuopt.quantities.parameters import Quantity
 
 
 def add_disturbances(loop: ClosedLoop, references: Iterable[Step]) -> ClosedLoop:
-    """The loop whose plant takes what the references disturb it with, as inputs named by `disturbing`.
+    """Give the plant an input for each disturbance of the references, named by `disturbance_input`.
 
     A parameter becomes its value plus that input, an input of the plant likewise; so 0 is the plant as it was.
 

@@ -97,7 +97,7 @@ class Step:
     def trajectory(self, step: float) -> Trajectory:
         """The column "reference" on the grid 0, step, 2 step, ... to the horizon, held from sample to sample.
 
-        Each disturbance is a column, too, by its name in `disturbed`.
+        Each disturbance is a column, too, named by `disturbance_input`.
 
         Parameters
         ----------

@@ -14,7 +14,7 @@ from pneuopt.quantities.parameters import ParameterSet
 
 @dataclass(frozen=True, eq=False)
 class LoggedMotion:
-    """What the logs' speeds look like, all together, and the parameters as far as they are known.
+    """Statistics of the speed over all logs, and the parameters as far as they are known.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class LoggedMotion:
     speed : ndarray
         Every known sample [m/s].
     values, given : ParameterSet
-        As the logs seem to say, and as the user says.
+        As estimated so far, and as the user gave them.
     """
 
     slow: float
@@ -42,7 +42,7 @@ class LoggedMotion:
 
 
 class Lack(NamedTuple):
-    """What the logs do not show of a parameter, and the run that would show it, in words."""
+    """Why a parameter is not identifiable from the motion in the logs, and the run that would show it, in words."""
 
     reason: str
     remedy: str
@@ -50,7 +50,7 @@ class Lack(NamedTuple):
 
 @dataclass(frozen=True)
 class Need:
-    """What a parameter needs of the logs' motion.
+    """The motion that a parameter needs in the logs to be identifiable.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class Excitation:
         )
 
     def with_prefix(self, prefix: str) -> "Excitation":
-        """The same with every part's own name ("viscous") made whole ("friction.viscous")."""
+        """Put `prefix.` before the names of a part's own parameters: "viscous" becomes "friction.viscous"."""
 
         def whole(names: frozenset[str]) -> frozenset[str]:
             return frozenset(n if "." in n else f"{prefix}.{n}" for n in names)

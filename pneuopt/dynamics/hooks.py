@@ -14,7 +14,7 @@ from pneuopt.quantities.units import write_value
 
 
 class Log(NamedTuple):
-    """One log as a start finder sees it: its channels, and the parameters as they are in it (conditions included)."""
+    """One log as a start hook reads it: its channels, and the parameters that hold in it, its conditions included."""
 
     measured: Trajectory
     parameters: ParameterSet
@@ -22,7 +22,7 @@ class Log(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A candidate to start an identification from.
+    """A candidate from which an identification can start.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Start:
         By name; a `per_log` one as "name[log]".
     label : str
     trial_parameters : tuple of str
-        Those of the parameters that the log does not tell, and the candidates try: one value each.
+        Those of the parameters that the logs do not determine: each candidate tries one value of them.
     """
 
     states: Mapping[str, Trajectory]
@@ -42,7 +42,7 @@ class Start:
 
 
 class StartHook(Protocol):
-    """What a model knows about starting from logs (equation error); see `System.starts`."""
+    """Finds starts of an identification from logs, by equation error for instance; see `System.starts`."""
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[Start]:
         """Return candidates, the most plausible first."""
@@ -50,14 +50,14 @@ class StartHook(Protocol):
 
 
 class Rest(NamedTuple):
-    """A plant at rest: its states, and the inputs that keep it there; absent ones are zero."""
+    """A plant at rest: its states, and the inputs that hold it there; absent ones are zero."""
 
     states: Mapping[str, float]
     inputs: Mapping[str, float]
 
 
 class RestHook(Protocol):
-    """What a model knows about resting where an equilibrium from zeros would not be found (a drive under pressure)."""
+    """Gives the state at rest where Newton's method from zeros finds no equilibrium (a drive under pressure)."""
 
     def __call__(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
         """Return a rest at which the named outputs have these values, or raise `InputError`."""
@@ -65,15 +65,15 @@ class RestHook(Protocol):
 
 
 class LogWarningHook(Protocol):
-    """What a model can tell against the logs themselves, as a sensor's zero point; see `System.doubts`."""
+    """Finds faults in the logs that only the model can see, a sensor's zero shift say; see `System.log_warnings`."""
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[str]:
-        """Return a sentence for each doubt, with figures and the remedy."""
+        """Return a sentence for each fault, with figures and the remedy."""
         ...
 
 
 class HardwareCheckHook(Protocol):
-    """What a model knows about hardware that cannot exist."""
+    """Refuses parameters of hardware that cannot exist."""
 
     def __call__(self, parameters: ParameterSet, start: Mapping[str, float] | None = None) -> None:
         """Raise `InputError` for an impossible number, or for a start (by state) where the plant cannot be."""
@@ -82,7 +82,7 @@ class HardwareCheckHook(Protocol):
 
 @dataclass(frozen=True)
 class ValidityLimit:
-    """A value of a state beyond which a response is no longer what the model is meant for: an end stop, a vacuum.
+    """A value of a state beyond which the model's equations no longer describe the plant: an end stop, a vacuum.
 
     Attributes
     ----------
@@ -92,9 +92,9 @@ class ValidityLimit:
     side : int
         1 where the state normally lies below the limit, -1 above.
     event : str
-        What happens there, "the piston reached the front end stop".
+        The event as a clause, "the load reached the front end stop".
     meaning : str
-        What the response is from there on, "the response is the stop's".
+        What holds from there on, as a clause, "the response is the stop's".
     """
 
     state: str
@@ -106,7 +106,7 @@ class ValidityLimit:
 
 @dataclass(frozen=True)
 class Contact:
-    """A guard that a response has run into; printed, it is the sentence that a user reads.
+    """A validity limit that a response has reached; printed, it is the sentence that a user reads.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Contact:
     value, rate : float
         The state there and its rate [its unit, and that over s].
     state : Quantity
-    validity_limit : Guard
+    validity_limit : ValidityLimit
     """
 
     t: float
@@ -129,3 +129,22 @@ class Contact:
         speed = f" with {self.rate:.3g} m/s" if self.state.unit == "m" else ""
         limit = self.validity_limit
         return f"{limit.event} ({where}) at t = {self.t:.4g} s{speed}; from there {limit.meaning}"
+
+
+class Axis(NamedTuple):
+    """The body that a plant moves against friction: the names of its states and of its mass.
+
+    Attributes
+    ----------
+    position, speed : str
+        States.
+    inertia : str
+        The parameter that multiplies the speed's rate: a mass, or a moment of inertia.
+    force : str
+        The unit of what pushes the body.
+    """
+
+    position: str = "position"
+    speed: str = "speed"
+    inertia: str = "load.mass"
+    force: str = "N"

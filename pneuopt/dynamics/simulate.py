@@ -24,7 +24,7 @@ from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, r
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
-REST_COORDINATE = "position"  # where a plant can be asked to rest
+REST_COORDINATE = "position"  # the state that `initial` may give alone: the plant then rests there
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class StickSlipResult:
     Attributes
     ----------
     trajectory : Trajectory
-        States and outputs, and "stuck", 1 where the piston sticks.
+        States and outputs, and "stuck", 1 where the moving mass sticks.
     events : tuple of Event
         Break-aways, standstills and reversals, in order; none for how the run begins.
     """
@@ -90,7 +90,7 @@ def simulate(
     Warns
     -----
     PhysicsWarning
-        If the piston reaches an end stop, or a chamber is emptied: when, where, and what the response is from there.
+        If the plant reaches a validity limit, such as an end stop: when, where, and what the response is from there.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def simulate_stick_slip(
 
 
 def contacts(trajectory: Trajectory, model: Runnable | HasSystem, parameters: ParameterSet) -> tuple[Contact, ...]:
-    """Where a response runs into an end stop or empties a chamber: what `simulate` warns of, seen at the instants.
+    """The validity limits that a response reaches, such as an end stop, found between the trajectory's instants.
 
     Parameters
     ----------
@@ -239,12 +239,12 @@ def _report_times(t_out: ArrayLike | None, t: Array) -> Array:
 
 
 def _time_tolerance(t: Array) -> float:
-    """Instants closer than this are one [s]."""
+    """Time difference below which two instants count as one [s]."""
     return float(max(1e-6 * np.min(np.diff(t), initial=1.0), 4 * np.spacing(np.abs(t).max())))
 
 
 def _restart_times(t: Array, u: Array, sample_time: float | None, slack: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Where the integration restarts (at the start, where an input changes, at each sample), and which are samples."""
+    """Instants at which the integration restarts: the start, changes of an input, samples; and which are samples."""
     changes = t[np.append(True, np.any(u[1:] != u[:-1], axis=1))]
     if sample_time is None:
         return changes, np.zeros(len(changes), dtype=bool)
@@ -256,7 +256,7 @@ def _restart_times(t: Array, u: Array, sample_time: float | None, slack: float) 
 
 
 def initial_state(model: Runnable, parameters: ParameterSet, initial: Mapping[str, float] | ArrayLike | None) -> Array:
-    """The state from which `simulate` starts; one where the plant cannot be is an error."""
+    """The state from which `simulate` starts; `InputError` where the plant cannot be there."""
     states, plant = model.states, model.plant
     if initial is None:
         x = model.rest_state(parameters)

@@ -1,4 +1,7 @@
-"""How `simulate` integrates a smooth plant, watches and keeps it; `stick_slip` holds the other integrator."""
+"""`SmoothIntegration`: a smooth plant integrated by LSODA; `LimitMonitor` watches its validity limits.
+
+`stick_slip` holds the integrator for Karnopp's friction.
+"""
 
 import math
 import warnings
@@ -17,8 +20,10 @@ from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-MAX_INTERNAL_STEPS = 200_000
-LIMIT_CHECK_PERIOD = 1e-3  # [s] between two looks at the guards; a stop holds a piston for longer
+MAX_INTERNAL_STEPS = 200_000  # LSODA steps between two instants; below, stiff plants stop early; above, it hangs long
+# [s] between two checks of the validity limits. Above, a short contact with an end stop is missed; below, simulation is
+# slower.
+LIMIT_CHECK_PERIOD = 1e-3
 
 
 class Integration(Protocol):
@@ -46,28 +51,28 @@ class Integration(Protocol):
 
 
 class LimitMonitor:
-    """Looks at a run between the instants that are asked for, so that none of the plant's guards is passed unseen.
+    """Checks the plant's validity limits along a run, also between the instants that are recorded.
 
-    The states of `plant` come first in the vectors that it sees.
+    The states of `plant` come first in the state vectors.
     """
 
     def __init__(self, plant: System, parameters: ParameterSet, t: float, x: Array) -> None:
         full = plant.parameters | parameters.select(n for n in parameters if n in plant.parameters)
-        self._guards, self._contacts = plant.validity_limits, dict[int, Contact]()
-        self._indices = [names(plant.states).index(g.state) for g in self._guards]
+        self._limited, self._contacts = plant.validity_limits, dict[int, Contact]()
+        self._indices = [names(plant.states).index(limit.state) for limit in self._limited]
         self._states = [plant.states[k] for k in self._indices]
-        self._limits = np.array([g.limit(full) for g in self._guards])
-        self._sides = np.array([g.side for g in self._guards])
+        self._limits = np.array([limit.limit(full) for limit in self._limited])
+        self._sides = np.array([limit.side for limit in self._limited])
         self._t, self._values = t, x[self._indices]
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """Each guard's first, in order of time."""
+        """The first contact with each limit, in order of time."""
         return tuple(sorted(self._contacts.values(), key=lambda contact: contact.t))
 
     @contextmanager
     def report_contacts(self) -> Iterator[None]:
-        """Add what was met to the message of a run that stops."""
+        """Add the contacts so far to the message of a run that stops."""
         try:
             yield
         except ConvergenceError as error:
@@ -77,8 +82,8 @@ class LimitMonitor:
             raise ConvergenceError(f"{error}. Before that, {met}", error.solution) from None
 
     def advance(self, run: Integration, t: float) -> Array:
-        """As ``run.advance(t)``, looking every millisecond on the way."""
-        if len(self._contacts) < len(self._guards):
+        """Advance the run to t, with a check every `LIMIT_CHECK_PERIOD` on the way."""
+        if len(self._contacts) < len(self._limited):
             begin = self._t
             for k in range(1, math.ceil((t - begin) / LIMIT_CHECK_PERIOD)):
                 self.observe(begin + k * LIMIT_CHECK_PERIOD, run.advance(begin + k * LIMIT_CHECK_PERIOD))
@@ -87,19 +92,19 @@ class LimitMonitor:
         return x
 
     def observe(self, t: float, x: Array) -> None:
-        """Compare with what was seen last."""
+        """Note each limit that was crossed since the last call."""
         before, values = self._values, x[self._indices]
         room = self._sides * (self._limits - before)
         for k in np.flatnonzero((room > 0) & (self._sides * (self._limits - values) <= 0)):
             part = (self._limits[k] - before[k]) / (values[k] - before[k])
             at, rate = self._t + part * (t - self._t), (values[k] - before[k]) / (t - self._t)
-            found = Contact(float(at), float(self._limits[k]), float(rate), self._states[k], self._guards[k])
+            found = Contact(float(at), float(self._limits[k]), float(rate), self._states[k], self._limited[k])
             self._contacts.setdefault(int(k), found)
         self._t, self._values = t, values
 
 
 class Recorder:
-    """States and outputs, a row an instant of the grid, and more columns if there are `flags`."""
+    """Collects states, outputs and flags, a row for each instant of the grid."""
 
     def __init__(self, system: System, grid: Array, flags: Sequence[str] = ()) -> None:
         self._system, self._grid, self._rows = system, grid, list[Array]()
@@ -116,7 +121,7 @@ class Recorder:
         return Trajectory(self._grid[:n], dict(zip(self._columns, columns, strict=True)))
 
     def fail(self, t: float, x: Array) -> NoReturn:
-        """Say that the integration stopped at t in state x."""
+        """Raise `ConvergenceError`: the integration stopped at t in state x."""
         state = ", ".join(f"{q.name} {v:.6g} {q.unit}" for q, v in zip(self._system.states, x, strict=True))
         raise ConvergenceError(
             f"the simulation stopped after t = {t:.9g} s, where {state}: the model is not defined there, escapes to "
@@ -126,7 +131,7 @@ class Recorder:
 
 
 class SmoothIntegration:
-    """SciPy's integrator on the compiled right-hand side (it restarts in microseconds), and what it has recorded."""
+    """An integration of a smooth plant by SciPy's LSODA on the compiled right-hand side; restarts take microseconds."""
 
     def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
         self._system, self._p, self._ode = system, p, compile_function(system.ode)

@@ -1,9 +1,9 @@
 """`StickSlipIntegration`: a plant under Karnopp's friction, integrated from event to event; `simulate` chooses it.
 
-While the piston slides, its friction keeps one sign, and the model is smooth: the standstill is a root of the speed on
-the integrator's own interpolant. While it sticks, the speed is exactly 0, the rest of the plant runs on, and what is
-watched is the acceleration that the piston would have if it slid, either way: it stays while that is <= 0 forwards and
->= 0 backwards, which needs to know neither the masses nor the forces of the plant. An end stop is a force of the plant.
+While the moving mass slides, its friction keeps one sign, and the model is smooth: the standstill is a root of the
+speed on the integrator's own interpolant. While it sticks, the speed is exactly 0, and the rest of the plant runs on.
+It stays stuck while the acceleration that it would have if it slid is <= 0 forwards and >= 0 backwards; that test
+needs neither the masses nor the forces of the plant. An end stop is a force of the plant.
 """
 
 import warnings
@@ -24,8 +24,8 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
 
-MAX_EVENTS = 100_000
-ROOT_PROBES_PER_STEP = 4  # a step
+MAX_EVENTS = 100_000  # events of a run; below, long runs are refused; above, a chattering loop runs for hours
+ROOT_PROBES_PER_STEP = 4  # points of a step at which a root is sought; fewer miss short motions, more cost time
 
 
 class EventKind(Enum):
@@ -46,7 +46,7 @@ class Event:
         When [s].
     kind : EventKind
     direction : int
-        Of the motion afterwards: 1, -1, or 0 where the piston sticks.
+        Of the motion afterwards: 1, -1, or 0 where the mass sticks.
     """
 
     t: float
@@ -55,7 +55,7 @@ class Event:
 
 
 class StickSlipIntegration:
-    """An integration (`integration.Run`) that finds its events; records a column "stuck", 0 or 1, too."""
+    """An `Integration` that locates break-aways and standstills; it also records a column "stuck", 0 or 1."""
 
     def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
         message = "Karnopp's friction needs a plant with a state 'speed' and a parameter 'friction.direction'"
@@ -83,11 +83,11 @@ class StickSlipIntegration:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Those up to now."""
+        """The events up to now."""
         return tuple(self._events)
 
     def restart(self, t: float, x: Array, u: Array) -> None:
-        """See `integration.Run`."""
+        """See `Integration`."""
         self._u = u
         if abs(x[self._speed]) > self._standstill_speed:
             self._begin_mode(t - self._origin, x, int(np.sign(x[self._speed])))
@@ -96,7 +96,7 @@ class StickSlipIntegration:
             self._begin_mode(t - self._origin, x, self._breakaway_direction(t - self._origin, x))
 
     def advance(self, t: float) -> Array:
-        """See `integration.Run`."""
+        """See `Integration`."""
         until = t - self._origin
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -109,22 +109,22 @@ class StickSlipIntegration:
         return self._x
 
     def outputs(self) -> Array:
-        """See `integration.Run`."""
+        """See `Integration`."""
         p = self._p[self._mode or 0]
         if self._mode == 0:
             p = self._with_direction(p, self._balance_direction(self._now, self._x))
         return self._ode(self._origin + self._now, self._x, self._u, p)[1]
 
     def record(self) -> None:
-        """See `integration.Run`."""
+        """See `Integration`."""
         self._record.add(self._x, self.outputs(), float(self._mode == 0))
 
     def trajectory(self) -> Trajectory:
-        """See `integration.Run`."""
+        """See `Integration`."""
         return self._record.trajectory()
 
     def _begin_mode(self, t: float, x: Array, mode: int) -> None:
-        """Go on from t in this mode: 0 sticks, 1 and -1 slide."""
+        """Restart the solver at t in this mode: 0 sticks, 1 and -1 slide."""
         before = self._mode if self._mode is not None else mode * int(x[self._speed] != 0)
         if mode != before:
             self._note_event(t, mode, before)
@@ -138,13 +138,13 @@ class StickSlipIntegration:
         self._events.append(Event(float(self._origin + t), kind, mode))
         require(
             len(self._events) <= MAX_EVENTS,
-            f"the piston stuck or slipped {MAX_EVENTS} times by t = {self._origin + t:.9g} s: the loop chatters; "
+            f"{MAX_EVENTS} changes between sticking and sliding by t = {self._origin + t:.9g} s: the loop chatters; "
             "simulate a shorter time, or mend the gains",
             ConvergenceError,
         )
 
     def _rate(self, t: float, x: Array) -> Array:
-        """Of the state; while stuck, the speed's entry is an impulse, so that the step size heeds the driving force."""
+        """Rate of the state; while stuck, the speed's entry is its rate without friction, for the step size to heed."""
         at_rest = x if self._mode else self._with_zero_speed(x)
         return self._ode(self._origin + t, at_rest, self._u, self._p[self._mode or 0])[0]
 
@@ -159,7 +159,7 @@ class StickSlipIntegration:
         )
 
     def _mode_persists(self) -> bool:
-        """Whether the mode surely lasts through the step, by what is cheap to look at."""
+        """Whether the mode certainly lasts through the step, by a cheap test."""
         begin, end = self._solver.t_old, self._solver.t
         before, self._last_indicator = self._last_indicator, self._mode_indicator(end, self._solver.y)
         if self._mode:
@@ -168,7 +168,7 @@ class StickSlipIntegration:
         return 2 * max(values) < min(values)
 
     def _mode_indicator(self, t: float, x: Array) -> float:
-        """What `_mode_persists` compares at a step's ends: sliding, the gain of speed; sticking, the excess force."""
+        """What `_mode_persists` compares at a step's ends: sliding, the gain of speed; stuck, `_event_function`."""
         return float(self._mode * self._rate(t, x)[self._speed]) if self._mode else self._event_function(t)
 
     def _event_function(self, t: float) -> float:
@@ -190,14 +190,14 @@ class StickSlipIntegration:
             self._begin_mode(t, x, 1 if forward > -backward else -1)
 
     def _breakaway_direction(self, t: float, x: Array) -> int:
-        """The direction in which a piston at rest breaks away; 0 if it sticks."""
+        """The direction in which a mass at rest breaks away; 0 if it sticks."""
         forward, backward = self._breakaway_accelerations(t, x)
         message = f"the static friction is negative at t = {self._origin + t:.9g} s; check its pressure coefficients"
         require(forward <= backward, message, ModelError)
         return 1 if forward > 0 else -1 if backward < 0 else 0
 
     def _balance_direction(self, t: float, x: Array) -> float:
-        """The direction, between -1 and 1, at which the friction of a piston at rest balances the rest."""
+        """The direction, between -1 and 1, at which the friction of a mass at rest balances the rest."""
         forward, backward = self._breakaway_accelerations(t, x)
         if not forward < 0 < backward:
             return float(np.sign(forward + backward))
@@ -209,12 +209,12 @@ class StickSlipIntegration:
         return float(optimize.brentq(acceleration, -1.0, 1.0))
 
     def _breakaway_accelerations(self, t: float, x: Array) -> tuple[float, float]:
-        """Accelerations that a piston at rest would have if it slid forwards, and backwards [m/s^2]."""
+        """Accelerations that a mass at rest would have if it slid forwards, and backwards [m/s^2]."""
         forward, backward = self._accelerations(self._origin + t, x, self._u, self._p[0])[0]
         return float(forward), float(backward)
 
     def _state_at(self, t: float) -> Array:
-        """On the last step."""
+        """The state at an instant of the last step."""
         if t >= self._solver.t:
             x = np.array(self._solver.y)
         else:
@@ -247,7 +247,7 @@ def _acceleration_function(system: System, speed: int, direction: int) -> ca.Fun
 def _first_root(f: Callable[[float], float], begin: float, end: float) -> float:
     """Where f first turns positive on a step; infinity if it does not.
 
-    f is looked at a few times; where it has a hump between the looks, its top is found first.
+    f is evaluated at a few points; where it has a maximum between them, that is found first.
     """
     t = np.linspace(begin, end, ROOT_PROBES_PER_STEP + 1)
     values = np.array([f(at) for at in t])

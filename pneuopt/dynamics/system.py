@@ -3,14 +3,22 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.excitation import Excitation
-from pneuopt.dynamics.hooks import HardwareCheckHook, Log, LogWarningHook, RestHook, Start, StartHook, ValidityLimit
+from pneuopt.dynamics.hooks import (
+    Axis,
+    HardwareCheckHook,
+    Log,
+    LogWarningHook,
+    RestHook,
+    Start,
+    StartHook,
+    ValidityLimit,
+)
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, check_names, require
@@ -21,25 +29,6 @@ Symbols = Mapping[str, ca.SX]
 Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
 SymbolicUpdate = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
 FRICTION_DIRECTION = "friction.direction"  # parameter of Karnopp's friction: the sign of the motion, set by `simulate`
-
-
-class Axis(NamedTuple):
-    """A body that a plant moves against friction: what its states and its mass are called.
-
-    Attributes
-    ----------
-    position, speed : str
-        States.
-    inertia : str
-        The parameter that multiplies the speed's rate: a mass, or a moment of inertia.
-    force : str
-        The unit of what pushes the body.
-    """
-
-    position: str = "position"
-    speed: str = "speed"
-    inertia: str = "load.mass"
-    force: str = "N"
 
 
 @dataclass(frozen=True)
@@ -78,13 +67,12 @@ class System:
     log_warning_hook : LogWarningHook, optional
         What is wrong with logs, as far as the model can see it.
     meter : casadi.Function, optional
-        ``(t, x, u, p) -> (...)``: what the plant consumes, an output a channel, named: "air", the mass flow from the
-        supply [kg/s], "spool", its position [half travels], "power", drawn from its source [W]; those that it has.
-        They are no outputs, as no log holds them.
+        ``(t, x, u, p) -> (...)``: what the plant consumes, a named output for each channel, "power" [W] say. They are
+        no outputs of the system, as no log holds them.
     excitation : Excitation
         Which motion a log must show for its parameters to be identifiable.
     axis : Axis, optional
-        What it moves against friction, under the names of its own.
+        The body that it moves against friction.
     """
 
     states: tuple[Quantity, ...]
@@ -105,19 +93,9 @@ class System:
         return describe(self)
 
     def check(self, parameters: ParameterSet, start: Mapping[str, float] | None = None) -> None:
-        """Refuse what this plant cannot be.
+        """Raise `InputError` where no hardware has these parameters, or none can be in the state `start`, by name.
 
-        Parameters
-        ----------
-        parameters : ParameterSet
-            A missing one counts with its default; others are not read.
-        start : mapping of state to value, optional
-            Where a simulation is to begin.
-
-        Raises
-        ------
-        InputError
-            If hardware is impossible or the start lies outside; the message names value, source and remedy.
+        A missing parameter has its default; those of other models are ignored.
         """
         if self.hardware_check_hook is not None:
             self.hardware_check_hook(parameters, start)
@@ -173,7 +151,7 @@ class System:
         return measured.matrix(names(self.inputs))
 
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> None:
-        """See `Fittable`; of a plant every initial state is to be found."""
+        """See `Fittable`; None, as every initial state of a plant is estimated."""
 
     def _states_from_log(self, measured: Trajectory) -> Trajectory:
         logged = [n for n in names(self.states) if n in measured and np.isfinite(measured[n]).any()]
@@ -252,13 +230,13 @@ class System:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How a model moves: as `system` between two samples, after `update` at a sample.
+    """The equations of a model between two samples, and its controller's update at a sample.
 
     Attributes
     ----------
     system : System
     update : casadi.Function, optional
-        ``(t, x, u, p) -> x``: what a sampled controller does at a sample.
+        ``(t, x, u, p) -> x``: the state after a sampled controller has acted.
     sample_time : float, optional
         From one sample to the next [s].
     """
@@ -270,7 +248,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class DiscreteSystem:
-    """What happens from one sample to the next: an optional update at the instant, then `substeps` integration steps.
+    """A sampled model: at each sample an optional update, then `substeps` integration steps to the next sample.
 
     Parameters
     ----------
@@ -300,14 +278,14 @@ class DiscreteSystem:
 
     @property
     def pieces(self) -> Pieces:
-        """The Functions, as compiled runs take them."""
+        """The CasADi Functions that `Rollout` compiles."""
         return Pieces(self.step, self.update, self.ode)
 
     def __repr__(self) -> str:
         return describe(self)
 
     def with_substeps(self, substeps: int) -> "DiscreteSystem":
-        """Refine or coarsen the integration, by copy."""
+        """Change the number of integration steps a sample, by copy."""
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}")
         return replace(self, substeps=substeps)
 
@@ -363,22 +341,9 @@ def define(
 
 
 def discretise(system: System, substeps: int = 1) -> DiscreteSystem:
-    """Classical Runge-Kutta steps of fourth order (RK4); stable for h < 2.78/|lambda|.
+    """The sampled form of a system, by `substeps` classical Runge-Kutta steps (RK4) a sample; `InputError` below 1.
 
-    Parameters
-    ----------
-    system : System
-    substeps : int
-        Steps from one sample to the next.
-
-    Returns
-    -------
-    DiscreteSystem
-
-    Raises
-    ------
-    InputError
-        If there are no steps.
+    A step h is stable for h < 2.78/|lambda|.
     """
     require(substeps >= 1, f"substeps must be at least 1, got {substeps}")
     n = {k: system.ode.size1_in(i) for i, k in enumerate("txup")}

@@ -6,7 +6,8 @@ from typing import ClassVar
 
 import casadi as ca
 
-from pneuopt.dynamics.system import Axis, Symbols, System, define, names
+from pneuopt.dynamics.hooks import Axis
+from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.models.declaration import DriveKind, flag
 from pneuopt.models.friction import FrictionModel, law_inputs
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction

@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import casadi as ca
 
-from pneuopt.dynamics.hooks import Log, Start
-from pneuopt.dynamics.system import Axis, Symbols, System, define
+from pneuopt.dynamics.hooks import Axis, Log, Start
+from pneuopt.dynamics.system import Symbols, System, define
 from pneuopt.models.declaration import DriveKind
 from pneuopt.models.friction import Coulomb, FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.dynamics.system import Axis, System, names, parameter_vector
+from pneuopt.dynamics.hooks import Axis
+from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.identification.propagation import propagate_deviations
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment, differentiate

@@ -1,4 +1,4 @@
-"""C for SIMD lanes from SX Functions: every operation on a vector of lanes, what changes rarely computed rarely.
+"""The C writer: C for SIMD lanes from SX Functions, every operation on a vector of lanes.
 
 Each value is computed at the rarest of three rates that its inputs allow: once a segment (parameters), once a sample
 (held inputs, step size), or at every call. What divides twice, or changes less often than what it divides, does so by a
@@ -35,7 +35,7 @@ DIVISIONS = (ca.OP_DIV, ca.OP_INV)
 
 
 class CFunction(NamedTuple):
-    """One Function to emit.
+    """One CasADi Function to write as C.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class CFunction(NamedTuple):
 
 
 class Instruction(NamedTuple):
-    """One operation of an SX Function: its kind, whence, where to, and the number if it is a constant."""
+    """One operation of an SX Function: its kind, its operands, its result's place, and the number of a constant."""
 
     operation: int
     sources: Sequence[int]
@@ -68,12 +68,12 @@ class CValue(NamedTuple):
     text: str
 
 
-def write_c(kernel: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
+def write_c(c_function: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
     """C functions ``NAME_segment``, ``NAME_sample`` and ``NAME_call`` on a struct ``Segment *s``.
 
     Parameters
     ----------
-    c_function : Kernel
+    c_function : CFunction
     rates : mapping of str to int
         How often each input changes: an index into `RATES`.
 
@@ -86,26 +86,26 @@ def write_c(kernel: CFunction, rates: Mapping[str, int]) -> tuple[str, int]:
     Raises
     ------
     NotImplementedError
-        For an operation that has no form here.
+        For an operation of CasADi that has no C here.
     """
-    writer = _CWriter(kernel, rates)
+    writer = _CWriter(c_function, rates)
     functions = []
     for rate, statements in zip(RATES, writer.statements, strict=True):
         body = "".join(f"  {line}\n" for line in statements)
-        functions.append(f"static void {kernel.name}_{rate}(Segment *s) {{\n{body}}}\n")
+        functions.append(f"static void {c_function.name}_{rate}(Segment *s) {{\n{body}}}\n")
     return "\n".join(functions), len(writer.storage)
 
 
 class _CWriter:
-    """The statements of one kernel."""
+    """The C statements of one Function."""
 
-    def __init__(self, kernel: CFunction, rates: Mapping[str, int]) -> None:
-        self.c_function, self.rates = kernel, rates
+    def __init__(self, c_function: CFunction, rates: Mapping[str, int]) -> None:
+        self.c_function, self.rates = c_function, rates
         self.statements: tuple[list[str], ...] = tuple([] for _ in RATES)
         self.storage: dict[str, str] = {}  # what a rarer rate hands on, and its place
         self.values: dict[int, CValue] = {}
         self.reciprocals: dict[int, CValue] = {}
-        instructions = list(_instructions(kernel.function))
+        instructions = list(_instructions(c_function.function))
         self.divisors = Counter(i.sources[-1] for i in instructions if i.operation in DIVISIONS)
         for instruction in instructions:
             self._add(instruction)

@@ -1,4 +1,4 @@
-"""C source as a loaded library: the compiler of this machine, and a cache of its products by content."""
+"""`compile_library`: C source compiled and loaded as a library, with a cache of binaries by content."""
 
 import contextlib
 import ctypes
@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 COMPILER_FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
-COMPILE_TIMEOUT = 300
+COMPILE_TIMEOUT = 300  # [s]; below, large models on slow machines fall back to the VM; above, a hung compiler blocks
 logger = logging.getLogger("pneuopt")
 
 
@@ -74,7 +74,7 @@ def _temporary_folder(reason: str) -> Path:
 
 
 def _reason(error: OSError | subprocess.SubprocessError) -> str:
-    """What a compiler said; of one that was killed before it could, the signal."""
+    """The compiler's error text, or the signal that killed it."""
     if isinstance(error, subprocess.CalledProcessError) and not error.stderr:
         code = error.returncode
         return f"it was killed by signal {-code}" if code < 0 else f"it ended with exit status {code}"
@@ -97,7 +97,7 @@ def _load_library(cc: str, flags: tuple[str, ...], source: str) -> ctypes.CDLL:
 
 
 def _compile(cc: str, flags: tuple[str, ...], source: str, binary: Path) -> None:
-    """Whole or not at all: another process may be doing the same, or this one may be stopped."""
+    """Compile in a temporary folder, then move the binary: another process may do the same, or this one be killed."""
     with tempfile.TemporaryDirectory(dir=binary.parent) as folder:
         text, product = Path(folder) / "model.c", Path(folder) / binary.name
         text.write_text(source, encoding="utf-8")

@@ -11,7 +11,13 @@ from pneuopt.dynamics.compiled.compiler import warn_once
 from pneuopt.dynamics.runge_kutta import rk4
 
 C_SOURCE_FOLDER = Path(__file__).parent
-INPUT_RATES = {"t": 1, "u": 1, "p": 0, "x": 2, "S": 2}  # how often the inputs of a piece change: see `emission.RATES`
+INPUT_RATES = {
+    "t": 1,
+    "u": 1,
+    "p": 0,
+    "x": 2,
+    "S": 2,
+}  # how often the inputs of a piece change: an index into `c_writer.RATES`
 PIECE_OUTPUTS = {"step": ("x_next", "S_next"), "output": ("y", "dy"), "update": ("x_next", "S_next")}
 STEP_INPUT_RATES = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
 
@@ -19,7 +25,7 @@ STEP_INPUT_RATES = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
 def prepare_rollout(
     step: ca.Function, update: ca.Function | None, ode: ca.Function | None, wrt: Sequence[int], start: bool
 ) -> tuple[dict[str, ca.Function], str]:
-    """The pieces of a sampled system (see `codegen.Pieces`) with their sensitivities, and the C of a run of them.
+    """The pieces of a sampled system (see `rollout.Pieces`) with their sensitivities, and the C of a run of them.
 
     Parameters
     ----------
@@ -44,7 +50,7 @@ def prepare_rollout(
 def prepare_by_content(
     step: str, update: str | None, ode: str | None, wrt: tuple[int, ...], start: bool
 ) -> tuple[dict[str, ca.Function], str]:
-    """The same by content, for the same system is run again and again."""
+    """`prepare_rollout` of serialised Functions, cached by their content."""
     functions = _with_sensitivities(ca.Function.deserialize(step), _deserialize(update), _deserialize(ode), wrt, start)
     try:
         return functions, _rollout_source(functions, len(wrt), start)

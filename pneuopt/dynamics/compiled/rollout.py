@@ -22,7 +22,7 @@ from pneuopt.dynamics.compiled.pieces import prepare_rollout
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 
-VM_BATCH = 1000  # segments that the CasADi VM sums up at a time
+VM_BATCH = 1000  # segments of a batch in the CasADi VM; more take memory for their derivatives, fewer time
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Pieces:
 
 @dataclass(frozen=True, eq=False)
 class RolloutResult:
-    """What `Rollout` returns for m segments of n samples.
+    """The outputs, end states and sensitivities of m segments of n samples.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class RolloutResult:
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The residuals of m segments as `Rollout.gram` sums them up; s sensitivity columns, as for `RolloutResult`.
+    """The normal equations of the residuals of m segments; s sensitivity columns, as for `RolloutResult`.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class Rollout:
     Attributes
     ----------
     lanes : int
-        As they are; 0 where the CasADi VM runs.
+        Lanes in use; 0 where the CasADi VM runs.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class Rollout:
 
         Returns
         -------
-        Run
+        RolloutResult
         """
         return self._run(*self._check_arrays(x0, u, p, t, h, substeps), substeps, states)
 
@@ -346,7 +346,7 @@ def _casadi_source(function: ca.Function) -> str:
 
 
 def _processor_count() -> int:
-    """Those that this process may use."""
+    """Processors that this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)  # Linux only
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 

@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.excitation import Excitation, SeparatingRun
-from pneuopt.dynamics.hooks import Log, LogWarningHook, Rest
-from pneuopt.dynamics.system import Axis, Symbols, System, define, names, parameter_vector, stack, symbols
+from pneuopt.dynamics.hooks import Axis, Log, LogWarningHook, Rest
+from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
 from pneuopt.models.friction import FrictionModel, Stribeck, law_inputs
 from pneuopt.models.linear import VALVE_VOLTAGE
