@@ -1,4 +1,4 @@
-"""Whether logs, a system and parameters fit together: refused here, before anything is solved, with the remedy."""
+"""Checks that logs, a system and parameters fit together, before anything is solved; each refusal names the remedy."""
 
 import math
 import warnings
@@ -21,7 +21,8 @@ SETPOINT_CHANNELS = (
     "speed_reference",
     "position_reference",
 )  # a loop's set-points may stay in a log; no plant reads them
-MAX_PAUSE_STEPS = 50  # usual steps without a sample; the inputs in between are unknown
+# usual steps [1] without a sample: inputs in a longer pause are unknown, a lower limit refuses logs with lost samples
+MAX_PAUSE_STEPS = 50
 
 
 def as_experiments(experiments: Experiment | Iterable[Experiment]) -> tuple[Experiment, ...]:
@@ -32,7 +33,7 @@ def as_experiments(experiments: Experiment | Iterable[Experiment]) -> tuple[Expe
 def check_logs(
     system: Fittable, experiments: Experiment | Iterable[Experiment], parameters: ParameterSet
 ) -> list[Experiment]:
-    """Refuse what does not fit together, before anything is solved; give every log a name of its own."""
+    """Check that logs, system and parameters fit together; give every log a name of its own and noise levels."""
     experiments = as_experiments(experiments)
     check_parameters(parameters)
     require(len(experiments) > 0, "no experiments: give at least one log", LogError)
@@ -54,7 +55,7 @@ def check_logs(
 
 
 def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> None:
-    """Refuse what leaves nothing to estimate."""
+    """Check that a parameter is free, and that no free parameter is known in every log."""
     free = parameters.free_names
     require(len(free) > 0, "no parameter is free; mark what to estimate, as parameters.freed('friction.*')", ModelError)
     for name in free:
@@ -76,9 +77,9 @@ def check_content(system: Fittable, experiments: Sequence[Experiment]) -> None:
 
 
 def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
-    """Warn of what the model finds wrong with logs that `check_logs` has passed, as a gauge pressure read as absolute.
+    """Warn of faults that only the model can find in logs, as a gauge pressure read as absolute.
 
-    The sentences are returned, too.
+    The warnings are returned, too.
     """
     every = system.parameters | parameters
     known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
@@ -97,7 +98,7 @@ def _axis_channels(plant: System) -> AxisChannels:
 
 
 def _check_conditions(system: Fittable, experiment: Experiment, parameters: ParameterSet, name: str) -> None:
-    """The hardware as it is in this log."""
+    """Check the parameters under the conditions of a log."""
     check_names("parameter", experiment.conditions, system.parameters, f"{name}: condition")
     try:
         system.check((system.parameters | parameters).with_values(experiment.conditions))
@@ -134,7 +135,7 @@ def _check_channels(system: Fittable, experiment: Experiment, name: str, known: 
 
 
 def _fill_noise(system: Fittable, experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Where a log declares no noise: the median over all logs of what the channel shows, for sensors are shared."""
+    """Add noise levels where a log declares none: each channel's median over all logs, for they share their sensors."""
     found: dict[str, dict[str, float]] = {}
     for experiment in experiments:
         for channel in outputs_in_log(system, experiment):
@@ -156,6 +157,6 @@ def _fill_noise(system: Fittable, experiments: Sequence[Experiment]) -> list[Exp
 
 
 def outputs_in_log(system: Fittable, experiment: Experiment) -> tuple[str, ...]:
-    """The system's outputs that a log holds, unless they are its inputs, too."""
+    """The names of the system's outputs that a log holds; an output that is an input, too, is left out."""
     inputs = names(system.inputs)
     return tuple(n for n in names(system.outputs) if n in experiment.trajectory and n not in inputs)

@@ -1,4 +1,4 @@
-"""`compare_logs`: whether several logs are of one and the same drive, by fitting each alone."""
+"""`compare_logs`: a test whether several logs are of one drive, from fits of each log alone."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,15 +21,17 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     import pandas as pd
 
-DISAGREEMENT_DEVIATIONS = (
-    4.0  # standard deviations between a log's own estimate and the others' from which they are not one drive's
-)
-MIN_RELATIVE_DIFFERENCE = 0.02  # relative difference likewise, for tiny intervals do not hold the bias of a model
+# standard deviations between a log's own estimate and the others' from which they disagree: lower blames chance, higher
+# misses another load
+DISAGREEMENT_DEVIATIONS = 4.0
+# relative difference [1] that a disagreement must exceed, too: lower takes the bias of a model for another drive, whose
+# intervals do not hold it; higher misses a small change of the drive
+MIN_RELATIVE_DIFFERENCE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class LogComparison:
-    """What `compare_logs` found.
+    """The estimates of several logs, each fitted alone, and whether they agree.
 
     Attributes
     ----------
@@ -59,10 +61,10 @@ def compare_logs(
     *,
     method: LeastSquares | None = None,
 ) -> LogComparison:
-    """Fit every log alone and compare what the parameters that they share come out as.
+    """Fit every log alone and compare the estimates of the parameters that the logs share.
 
-    Worth the time where a joint fit does not explain its logs: one of another drive, another load, or another supply
-    than its conditions say shows as the parameter, and the log, that disagree.
+    This is worth its time where a joint fit does not explain its logs: the parameter and the log that disagree point to
+    another drive, load or supply than the conditions of that log state.
 
     Parameters
     ----------
@@ -83,7 +85,7 @@ def compare_logs(
         If there is one log only, or logs, system and parameters do not fit together.
     """
     experiments = as_experiments(experiments)
-    require(len(experiments) > 1, f"{len(experiments)} log is not to be compared; give at least two", LogError)
+    require(len(experiments) > 1, f"{len(experiments)} log leaves nothing to compare; give at least two", LogError)
     logs = check_logs(as_estimation_model(system), experiments, parameters)
     fits = {}
     for log in logs:
@@ -92,8 +94,8 @@ def compare_logs(
             fits[log.name] = identify(system, [log], own, method=method, throw=False)
     shared = [n for n in parameters.free_names if not parameters[n].per_log]
     table = _comparison_table(shared, fits, parameters)
-    apart = _disagreements(table)
-    return LogComparison(table, not len(apart), _comparison_reason(table, apart, len(fits)), fits)
+    differing = _disagreements(table)
+    return LogComparison(table, not len(differing), _comparison_reason(table, differing, len(fits)), fits)
 
 
 def _comparison_table(
@@ -113,7 +115,7 @@ def _comparison_table(
 
 
 def _estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
-    """Value and deviation; NaN where this log alone does not identify it."""
+    """Value and standard deviation of a parameter; NaN where the log alone does not identify it."""
     if not fit.status.converged or name not in fit.estimates.index:
         return math.nan, math.nan
     value, stderr = (float(fit.estimates[column][name]) for column in ("value", "stderr"))
@@ -121,7 +123,7 @@ def _estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
 
 
 def _inverse_variance_mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Weighted mean of the finite ones, and its deviation."""
+    """Inverse-variance mean of the finite estimates, and its standard deviation."""
     finite = np.array([e for e in estimates if math.isfinite(e[1])]).reshape(-1, 2)
     if not len(finite):
         return math.nan, math.nan
@@ -130,28 +132,28 @@ def _inverse_variance_mean(estimates: Sequence[tuple[float, float]]) -> tuple[fl
 
 
 def _disagreements(table: "pd.DataFrame") -> "pd.DataFrame":
-    """The rows that disagree, the worst first."""
+    """The rows of estimates that disagree, the worst first."""
     far = (table["deviation"].abs() > DISAGREEMENT_DEVIATIONS) & (
         (table["value"] - table["others"]).abs() > MIN_RELATIVE_DIFFERENCE * table["others"].abs()
     )
     return table[far].sort_values("deviation", key=abs, ascending=False)
 
 
-def _comparison_reason(table: "pd.DataFrame", apart: "pd.DataFrame", logs: int) -> str:
+def _comparison_reason(table: "pd.DataFrame", differing: "pd.DataFrame", logs: int) -> str:
+    """The verdict, the largest difference, and the remedy."""
     compared = list(dict.fromkeys(str(n) for n, _ in table.index[np.isfinite(table["deviation"])]))
     if not compared:
         return (
             "nothing could be compared: no parameter is identifiable from two logs alone; fit fewer, or log longer runs"
         )
-    if not len(apart):
+    if not len(differing):
         return f"the {logs} logs agree in {', '.join(compared)}"
-    name, log = apart.index[0]
-    row = apart.iloc[0]
+    name, log = differing.index[0]
+    row = differing.iloc[0]
     others = "the other log" if logs == 2 else "the other logs"
-    message = (
-        f"{name} is {row['value']:.4g} +- {row['stderr']:.2g} {row['unit']} in {log} alone, and {row['others']:.4g} in "
-    )
-    more = [str(n) for n in dict.fromkeys(n for n, _ in apart.index) if n != name]
-    tail = f"; apart are {', '.join(more)}, too" if more else ""
-    ask = "are they of one drive, and their conditions right?"
-    return f"{message}{others}, {abs(row['deviation']):.0f} standard deviations apart{tail}: {ask}"
+    verdict = f"the logs disagree in {name}, by {abs(row['deviation']):.0f} standard deviations"
+    value = f"{row['value']:.4g} +- {row['stderr']:.2g} {row['unit']}"
+    more = [str(n) for n in dict.fromkeys(n for n, _ in differing.index) if n != name]
+    tail = f"; they disagree in {', '.join(more)}, too" if more else ""
+    ask = "check that they are of one drive, and their conditions"
+    return f"{verdict}: it is {value} in {log} alone, and {row['others']:.4g} in {others}{tail}; {ask}"

@@ -1,4 +1,4 @@
-"""What motion a set of logs shows, and for each parameter that it leaves unidentifiable the run that would show it.
+"""The motion that a set of logs shows, what it lacks to identify a parameter, and the run that would identify it.
 
 Which motion a parameter needs is declared by the model (`System.excitation`).
 """
@@ -13,13 +13,15 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
-MOVING_SPEED_SHARE = 0.05  # of the largest speed; slower samples count as standing still
+# share of the largest speed [1] below which a sample counts as standing still: lower takes noise for motion, higher
+# leaves slow motion out
+MOVING_SPEED_SHARE = 0.05
 
 
 def summarise_motion(
     experiments: Sequence[Experiment], states: Mapping[str, Trajectory], values: ParameterSet, given: ParameterSet
 ) -> LoggedMotion | None:
-    """Look at the speeds of all logs.
+    """Summarise the speeds and accelerations of all logs.
 
     Parameters
     ----------
@@ -27,7 +29,7 @@ def summarise_motion(
     states : mapping of str to Trajectory
         Estimated states of each log, whose speed counts where none is logged.
     values, given : ParameterSet
-        As the logs seem to say, and as the user says.
+        As estimated from the logs, and as the user gives them.
 
     Returns
     -------
@@ -56,7 +58,7 @@ def summarise_motion(
 def missing_excitation(
     excitation: Excitation, name: str, free: Sequence[str], seen: LoggedMotion | None
 ) -> Lack | None:
-    """What the logs lack to identify a parameter, and what to log; None where they lack nothing that is known of.
+    """The motion that the logs lack to identify a parameter, and the run to log; None if nothing known is lacking.
 
     Parameters
     ----------
@@ -65,7 +67,7 @@ def missing_excitation(
     name : str
         Of the parameter, "name[log]" for one of a log.
     free : sequence of str
-        All that are to be identified at once.
+        All parameters that are to be identified at once.
     seen : LoggedMotion or None
     """
     need = excitation.needs.get(_base_name(name))
@@ -76,7 +78,7 @@ def missing_excitation(
 
 
 def remedy(excitation: Excitation, names: Sequence[str]) -> str:
-    """What run would separate these parameters, in words."""
+    """The run that would separate these parameters, in words."""
     bases = {_base_name(n) for n in names}
     for run in excitation.runs:
         if bases & run.some and (len(bases) == 1 or bases & run.others):

@@ -1,7 +1,7 @@
 """`identifiability`: which parameters a set of logs can identify, before and after a fit.
 
-Every decision about it stands here, with its thresholds side by side. Only what the data of a running search do not
-determine is found by the search itself (`shooting.convergence`, thresholds in `shooting.scaling`).
+Every decision about it stands here, with its thresholds side by side; only a running search decides by itself which
+parameters its data do not determine (`shooting.convergence`, thresholds in `shooting.scaling`).
 """
 
 import math
@@ -46,16 +46,16 @@ INFORMATION_ROUNDING = 1e-9  # root of information, relative to the largest: sma
 MAX_INVERSE_SINGULAR = 1e9  # inverse singular values, at most: larger are rounding
 
 # Parameters that were held, with a weak prior about their values:
-MAX_PRIOR_VARIANCE_SHARE = (
-    0.1  # of an estimate's variance: with more from the priors, it rests on them, not on the logs
-)
-REFUSAL_CONFIDENCE = (
-    0.95  # of the likelihood ratio at which the logs refuse the held values; higher believes wrong ones
-)
+# share of an estimate's variance [1] that the priors may make up: with more, the estimate rests on them and not on the
+# logs; a lower limit marks estimates that the logs do identify
+MAX_PRIOR_VARIANCE_SHARE = 0.1
+# confidence level [1] of the likelihood-ratio test that rejects held values: higher keeps wrong values, lower rejects
+# right ones by chance
+REJECTION_CONFIDENCE = 0.95
 
 MAX_REDUCTION_SEGMENTS = 2000  # segments whose sensitivities are reduced together: more at once take memory, fewer time
 
-VAGUER_THAN_PRIOR = "they say less of it than a factor of ten about its value would"
+VAGUER_THAN_PRIOR = "its standard deviation is as wide as a factor of ten"
 
 
 def identifiability(
@@ -65,7 +65,7 @@ def identifiability(
     *,
     method: LeastSquares | None = None,
 ) -> Verdict:
-    """Which free parameters the logs can identify, before anything is fitted.
+    """Find which free parameters the logs can identify, before anything is fitted.
 
     Parameters
     ----------
@@ -79,8 +79,8 @@ def identifiability(
     -------
     Verdict
         From the sensitivities of the measured outputs along the model's own first start, at the noise that the logs
-        declare or show (Cramer-Rao: no estimate is better), and from what the motion lacks. A model that is wrong
-        does worse.
+        declare or show (Cramer-Rao: no estimate is better), and from what the motion lacks. The
+        deviations of a wrong model are larger.
 
     Raises
     ------
@@ -97,14 +97,14 @@ def identifiability(
 
 
 def verdict_from_sensitivities(problem: EstimationProblem, start: Start, variance: float = 1.0) -> Verdict:
-    """The verdict at a start, or at a fit.
+    """The verdict from the sensitivities of the outputs at a start, or at a fit.
 
     Parameters
     ----------
-    problem : Problem
+    problem : EstimationProblem
     start : Start
     variance : float
-        Of the residuals, in units of the noise's.
+        Variance of the residuals, in noise variances.
     """
     return _make_verdict(problem, start, _root_information(problem, start) / math.sqrt(variance))
 
@@ -112,16 +112,16 @@ def verdict_from_sensitivities(problem: EstimationProblem, start: Start, varianc
 def verdict_from_covariance(
     problem: EstimationProblem, fit: Start, covariance: "pd.DataFrame", *, trusted: bool
 ) -> Verdict:
-    """The verdict after a fit.
+    """The verdict from the covariance of a fit.
 
     Parameters
     ----------
-    problem : Problem
+    problem : EstimationProblem
     fit : Start
     covariance : DataFrame
         Of the estimates in their own units; NaN at a bound.
     trusted : bool
-        The model explains the logs to their noise, so that its figures stand whatever the motion lacks.
+        Whether the model explains the logs to their noise; its deviations then count whatever motion the logs lack.
     """
     unknowns = problem.unknowns().with_values(fit.parameters)
     chain = np.array([unknowns[str(n)].value if unknowns[str(n)].log else 1.0 for n in covariance.index])
@@ -134,60 +134,60 @@ def verdict_from_covariance(
 
 
 def add_profiles(verdict: Verdict, profiles: Mapping[str, Profile]) -> Verdict:
-    """The verdict with what profiles have found: a parameter with two open ends is unidentifiable."""
+    """The verdict with the intervals of profiles: a parameter with two open ends is unidentifiable."""
     reasons, identifiable = dict(verdict.reasons), verdict.table["identifiable"].copy()
     for name, found in profiles.items():
-        is_blind = math.isinf(found.low) and math.isinf(found.high)
-        identifiable[name] = bool(identifiable[name]) and not is_blind
+        is_unidentifiable = math.isinf(found.low) and math.isinf(found.high)
+        identifiable[name] = bool(identifiable[name]) and not is_unidentifiable
         reasons.pop(name, None)
         if not found.high - found.low < MAX_RELATIVE_INTERVAL * abs(found.estimate):
             reasons[name] = f"{found.sentence}; {remedy(verdict.excitation, [name])}"
     return replace(verdict, table=verdict.table.assign(identifiable=identifiable), reasons=reasons)
 
 
-def add_unidentifiable(verdict: Verdict, names: Sequence[str], seen: Verdict, unchanged: Sequence[str]) -> Verdict:
-    """The verdict with parameters that rest on a prior, as the sensitivities alone have `seen` them."""
+def add_unidentifiable(verdict: Verdict, names: Sequence[str], local: Verdict, unchanged: Sequence[str]) -> Verdict:
+    """The verdict with parameters marked that rest on a prior; their figures come from `local`, by sensitivities."""
     table, own = verdict.table.copy(), list(names)
-    table.loc[own] = seen.table.loc[own]
+    table.loc[own] = local.table.loc[own]
     table.loc[own, "identifiable"] = False
-    together = tuple(group for group in seen.indistinguishable if {*group} & {*names})
-    grouped = {n for group in together for n in group}
+    groups = tuple(group for group in local.indistinguishable if {*group} & {*names})
+    grouped = {n for group in groups for n in group}
     reasons = {n: reason for n, reason in verdict.reasons.items() if n not in names}
     vague = {n: f"{VAGUER_THAN_PRIOR}; {remedy(verdict.excitation, [n])}" for n in names if n not in grouped}
-    reasons |= {**vague, **{n: seen.reasons[n] for n in names if n in seen.reasons}}
-    kept = tuple(str(n) for n in table.index if n in unchanged)
-    return Verdict(table, (*verdict.indistinguishable, *together), reasons, kept, verdict.excitation)
+    reasons |= {**vague, **{n: local.reasons[n] for n in names if n in local.reasons}}
+    ordered = tuple(str(n) for n in table.index if n in unchanged)
+    return Verdict(table, (*verdict.indistinguishable, *groups), reasons, ordered, verdict.excitation)
 
 
-def refuses_held_values(fit: Fit, first: Fit, held: int) -> bool:
-    """Whether the logs refuse the values at which `held` parameters are, by the likelihood ratio.
+def rejects_held_values(fit: Fit, first: Fit, held: int) -> bool:
+    """Whether a likelihood-ratio test rejects the values at which `held` parameters are.
 
     Parameters
     ----------
     fit, first : Fit
-        With the parameters held, and before that.
+        The fits with the parameters held, and before that.
     held : int
 
     Returns
     -------
     bool
-        What only the gaps cost more does not count: finer integration steps show gaps that the first has not seen.
+        A rise of the gaps' cost alone does not count: finer integration steps show gaps that the first fit missed.
     """
     before, after = first.stats["cost"], fit.stats["cost"]
     rise = min(2 * (after - before), fit.chi_square - first.chi_square)
     noise = max(1.0, 2 * before / max(1, first.count))
-    return not rise <= noise * chi2.ppf(REFUSAL_CONFIDENCE, held)
+    return not rise <= noise * chi2.ppf(REJECTION_CONFIDENCE, held)
 
 
 def rests_on_prior(covariance: Array, prior_covariance: Array) -> Mask:
-    """Which estimates owe too much of their variance, both of shape (k, k), to the priors of held parameters."""
+    """The mask of estimates whose variance the priors of held parameters dominate; covariances of shape (k, k)."""
     return np.asarray(np.diag(prior_covariance) > MAX_PRIOR_VARIANCE_SHARE * np.diag(covariance))
 
 
 def _make_verdict(
     problem: EstimationProblem, start: Start, root: Array, inside_bounds: Mask | None = None, *, trusted: bool = False
 ) -> Verdict:
-    """The verdict from a root of the information and from the motion; whatever is not inside its bounds is at one."""
+    """The verdict from a square root of the information matrix and from the logged motion."""
     import pandas as pd
 
     unknowns = problem.unknowns().with_values(start.parameters)
@@ -204,29 +204,29 @@ def _make_verdict(
         unit, size = p.value if p.log else 1.0, 1.0 if p.log else _comparison_size(name, p, problem)
         relative = spread[i] / size if size > 0 else math.nan
         lack = None if trusted else missing_excitation(excitation, name, names, seen)
-        is_blind = (
+        is_unidentifiable = (
             lack is not None
             or math.isinf(spread[i])
             or relative > (MAX_EXPECTED_DEVIATION if inside_bounds is None else UNIDENTIFIABLE_DEVIATION)
         )
-        if is_blind or relative > MAX_RELATIVE_DEVIATION:
+        if is_unidentifiable or relative > MAX_RELATIVE_DEVIATION:
             reasons[name] = _unidentifiable_reason(alone[i], relative, lack, remedy(excitation, [name]))
         inflation = spread[i] / alone[i] if math.isfinite(spread[i]) else spread[i]
-        rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_blind]
+        rows[name] = [p.value, unit * spread[i], relative, unit * alone[i], inflation, not is_unidentifiable]
     columns = ["value", "stderr", "relative", "alone", "inflation", "identifiable"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
     groups = (tuple(names[i] for i in np.flatnonzero(row)) for row in weak)
-    together = tuple(group for group in groups if _matters(table.loc[list(group)]))
-    return Verdict(table, together, reasons, excitation=excitation)
+    harmful = tuple(group for group in groups if _is_harmful(table.loc[list(group)]))
+    return Verdict(table, harmful, reasons, excitation=excitation)
 
 
-def _matters(members: "pd.DataFrame") -> bool:
-    """Whether a weak combination hides anything: parameters known far better than needed need no separation."""
+def _is_harmful(members: "pd.DataFrame") -> bool:
+    """Whether a weak combination leaves a member uncertain; parameters known far better than needed are separate."""
     return bool(members["inflation"].max() > MAX_INFLATION and members["relative"].max() > HARMLESS_DEVIATION)
 
 
 def _comparison_size(name: str, p: Parameter, problem: EstimationProblem) -> float:
-    """The size that a standard deviation is divided by; 0 for an offset, of which nothing says how large it may be."""
+    """The size that a standard deviation is divided by; 0 for an offset, whose usual size is unknown."""
     if p.lower < 0 and p.unit != "1":
         return 0.0
     given = problem.parameters[name.partition("[")[0]].value
@@ -234,7 +234,7 @@ def _comparison_size(name: str, p: Parameter, problem: EstimationProblem) -> flo
 
 
 def _unidentifiable_reason(alone: float, relative: float, lack: Lack | None, usual_remedy: str) -> str:
-    """Why the logs do not identify a parameter, and what to do."""
+    """The reason why the logs do not identify a parameter, and the remedy."""
     if lack is not None:
         return f"{lack.reason}; {lack.remedy}"
     if math.isinf(alone):
@@ -250,14 +250,14 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
     size = np.linalg.norm(root, axis=0)
     if not np.isfinite(root).all():
         return size * np.nan, size * np.nan, np.zeros((0, len(size)), dtype=bool)
-    felt = size > INFORMATION_ROUNDING * float(np.max(size, initial=0.0))
+    informed = size > INFORMATION_ROUNDING * float(np.max(size, initial=0.0))
     with np.errstate(divide="ignore"):
-        alone = np.where(felt, 1 / size, math.inf)
+        alone = np.where(informed, 1 / size, math.inf)
     spread, weak = alone.copy(), np.zeros((0, len(size)), dtype=bool)
-    if felt.any():
-        _, singular, right = np.linalg.svd(root[:, felt] / size[felt])
+    if informed.any():
+        _, singular, right = np.linalg.svd(root[:, informed] / size[informed])
         inverse = 1 / np.maximum(singular, 1 / MAX_INVERSE_SINGULAR)
-        spread[felt] = np.linalg.norm(right * inverse[:, None], axis=0) / size[felt]
+        spread[informed] = np.linalg.norm(right * inverse[:, None], axis=0) / size[informed]
         parts = np.abs(right[inverse > MAX_INFLATION])
         member = (
             parts > MIN_COMBINATION_SHARE * parts.max(axis=1, keepdims=True)
@@ -265,15 +265,15 @@ def _standard_deviations(root: Array) -> tuple[Array, Array, Mask]:
             else np.zeros_like(parts, dtype=bool)
         )
         weak = np.zeros((len(member), len(size)), dtype=bool)
-        weak[:, felt] = member
+        weak[:, informed] = member
     return spread, alone, weak[weak.sum(axis=1) > 1]
 
 
 def _root_information(problem: EstimationProblem, start: Start) -> Array:
-    """A square root of the information about the free parameters, as searched, once the start states are solved for.
+    """A square root of the information about the free parameters, as searched, with the start states eliminated.
 
-    Along the start's states, with no gaps: what a segment begins with is what all before it hand on. NaN where that is
-    not finite, or the start so stiff that integrating it would take hours.
+    It is taken along the start's states and without gaps: a segment begins with the sensitivities of all before it. It
+    is NaN where it is not finite, or the start so stiff that integrating it would take hours.
     """
     segments = segment(problem.transcription(start))
     parameters = segments.transcription.parameters
@@ -286,10 +286,10 @@ def _root_information(problem: EstimationProblem, start: Start) -> Array:
     run = segments.run(nodes, q, substeps, sensitivities=True)
     assert run.dy is not None
     assert run.dx_end is not None
-    seen = np.where(np.isfinite(segments.measured)[..., None], run.dy / segments.noise[..., None], 0.0)
+    weighted = np.where(np.isfinite(segments.measured)[..., None], run.dy / segments.noise[..., None], 0.0)
     roots = [np.zeros((0, len(chain)))]
     for first, last in _log_chains(segments):
-        roots.append(_log_root_information(segments, seen[first:last], run.dx_end[first:last], first, chain))
+        roots.append(_log_root_information(segments, weighted[first:last], run.dx_end[first:last], first, chain))
     return _triangularise(np.concatenate(roots))
 
 
@@ -299,19 +299,21 @@ def _log_chains(segments: Segments) -> list[tuple[int, int]]:
     return list(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True))
 
 
-def _log_root_information(segments: Segments, seen: Array, handed_on: Array, first: int, chain: Array) -> Array:
-    """One log's root of information about the parameters: a QR with its start state in front, which is then cut off."""
-    n, k = handed_on.shape[1], len(chain)
+def _log_root_information(
+    segments: Segments, weighted: Array, end_sensitivities: Array, first: int, chain: Array
+) -> Array:
+    """Square root of one log's information about the parameters; QR eliminates its start state, ordered first."""
+    n, k = end_sensitivities.shape[1], len(chain)
     carried = np.concatenate([np.eye(n), np.zeros((n, k))], axis=1)
     carried[np.isfinite(segments.fixed_start[first])] = 0.0
     root, rows = np.zeros((0, n + k)), []
     chosen = np.concatenate([np.zeros((len(segments.columns), n)), _column_derivatives(segments, first, chain)], axis=1)
-    for i, (y, x) in enumerate(zip(seen, handed_on, strict=True)):
+    for i, (y, x) in enumerate(zip(weighted, end_sensitivities, strict=True)):
         moved = np.concatenate([carried, chosen])
         with np.errstate(over="ignore", invalid="ignore"):
             rows.append(y.reshape(-1, y.shape[-1]) @ moved)
             carried = x @ moved
-        if len(rows) == MAX_REDUCTION_SEGMENTS or i == len(seen) - 1:
+        if len(rows) == MAX_REDUCTION_SEGMENTS or i == len(weighted) - 1:
             root, rows = _triangularise(np.concatenate([root, *rows])), []
     return np.asarray(root[n:, n:])
 
@@ -325,7 +327,7 @@ def _column_derivatives(segments: Segments, first: int, chain: Array) -> Array:
 
 
 def _triangularise(rows: Array) -> Array:
-    """A square upper triangle with the same Gram matrix."""
+    """The square upper triangle (QR) that has the same Gram matrix."""
     width = rows.shape[1]
     padded = np.concatenate([rows, np.zeros((max(0, width - len(rows)), width))])
     finite = bool(np.isfinite(padded).all())

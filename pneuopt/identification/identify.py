@@ -1,6 +1,6 @@
 """`identify`: parameters with confidence intervals, from logs, by lifted multiple shooting; `validate`: held-out runs.
 
-Nothing here knows what the system is: it hands over its starts (`System.starts`) and is otherwise an ODE with names.
+The system is any ODE with named signals that proposes its own starts (`System.starts`).
 """
 
 import math
@@ -76,7 +76,7 @@ def identify(
     ----------
     system : drive, System or ClosedLoop
         A loop with its sampled PID, where the logs hold the reference ("speed_reference") but not the command. Where
-        they hold the command, identify the plant alone: the controller then says nothing more.
+        they hold the command, identify the plant alone: the controller then adds no information.
     experiments : Experiment or sequence of Experiment
         Each with all inputs and at least one output of the system. Missing outputs and samples do not count.
     parameters : ParameterSet
@@ -85,9 +85,9 @@ def identify(
     loss : Loss, optional
         For logs with outliers: `Huber()` or `SoftL1()`; by default every residual counts with its square.
     estimate_noise : bool
-        Take each channel's noise from its residuals, whatever the logs say of it.
+        Take each channel's noise from its residuals, whatever the logs declare.
     throw : bool
-        Raise if the fit did not converge; otherwise the result says so in its status.
+        Raise if the fit did not converge; otherwise its status shows it.
 
     Returns
     -------
@@ -108,12 +108,12 @@ def identify(
     experiments = check_logs(model, experiments, parameters)
     check_free(experiments, parameters)
     check_content(model, experiments)
-    doubted = emit_log_warnings(model, experiments, parameters)
+    log_warnings = emit_log_warnings(model, experiments, parameters)
     problem = EstimationProblem(model, tuple(experiments), model.parameters | parameters, method)
     held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
     result = review_fit(held, *_result(held, fit, label, loss))
-    if doubted:
-        result = replace(result, status=result.status.with_remedies(*doubted))
+    if log_warnings:
+        result = replace(result, status=result.status.with_remedies(*log_warnings))
     if throw and not result.status.converged:
         raise ConvergenceError(f"identification {result.status}", result)
     return result
@@ -128,7 +128,7 @@ def validate(
     ----------
     system : drive, System or ClosedLoop
     experiments : Experiment or sequence of Experiment
-        Best such as no fit has seen.
+        Preferably runs that no fit has seen.
     parameters : ParameterSet
 
     Returns
@@ -153,7 +153,7 @@ def validate(
 
 
 def predict(system: HasSystem | ClosedLoop, experiment: Experiment, parameters: ParameterSet) -> Trajectory:
-    """The free run that `validate` compares with a log.
+    """Simulate a log freely with known parameters, as `validate` does to compare.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) 
 def _result(
     problem: EstimationProblem, fit: Fit, label: str, loss: Loss | None
 ) -> tuple[IdentificationResult, tuple[str, ...]]:
-    """The fit as parameters and tables; and the names of what rests on a prior, not on the logs."""
+    """The result of a fit, and the names of the parameters that rest on a prior, not on the logs."""
     free = fit.parameters.free_names
     estimates = problem.unknowns().with_values({n: fit.parameters.value(n) for n in free}).select(free)
     shared = [n for n in free if n in problem.parameters]
@@ -205,11 +205,13 @@ def _result(
         _residual_correlation_time(problem.system, problem.experiments, runs), _jump_correlation_time(fit.jumps)
     )
     covariance = None if fit.covariance is None else fit.covariance * variance * correlated * fit.variance_inflation
-    leaning = np.zeros(len(free), dtype=bool)
+    prior_dominated = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
-        leaning = rests_on_prior(covariance, fit.prior_covariance)
-    unidentifiable = tuple(n for n, leans in zip(free, leaning, strict=True) if leans or n in problem.held)
+        prior_dominated = rests_on_prior(covariance, fit.prior_covariance)
+    unidentifiable = tuple(
+        n for n, dominated in zip(free, prior_dominated, strict=True) if dominated or n in problem.held
+    )
     status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else fit.status
     result = IdentificationResult(
         problem.parameters.with_values(values),
@@ -246,7 +248,7 @@ def _agreement_rows(system: Fittable, experiment: Experiment, run: Trajectory) -
 
 
 def _residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajectory, channel: str) -> dict[str, object]:
-    """What of the inputs, and of its own past, is left in a channel's residuals."""
+    """Whiteness of a channel's residuals, and their correlation with each input."""
     log = experiment.trajectory
     residuals = log[channel] - run[channel]
     found: dict[str, object] = {"whiteness_p": ljung_box(residuals)[1]}
@@ -259,7 +261,7 @@ def _residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajector
 def _residual_correlation_time(
     system: Fittable, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]
 ) -> float:
-    """By how much correlated residuals (model error, not noise) widen a variance: the mean over logs and channels."""
+    """Mean correlation time of the residuals over logs and channels, by which model error widens a variance."""
     times = [
         correlation_time(e.trajectory[channel] - runs[e.name][channel])
         for e in experiments
@@ -269,7 +271,7 @@ def _residual_correlation_time(
 
 
 def _jump_correlation_time(jumps: Array | None) -> float:
-    """The same for what stands for noise of the states."""
+    """Mean correlation time over the states of gaps that stand for their noise; 1 without such gaps."""
     return 1.0 if jumps is None else float(np.mean([correlation_time(column) for column in jumps.T]))
 
 

@@ -1,7 +1,7 @@
 """`LoggedLoop`: a sampled loop as an identification reads it from a log that holds the reference, but not the command.
 
-The controller is known; run along the logged feedback, it shows what it commanded. With that command the plant finds
-its own start; the fit itself then runs plant and controller together, with the exact sampled update and its clip.
+The controller is known; replayed along the logged feedback, it gives the command. With that command the plant proposes
+its starts; the fit itself then runs plant and controller together, with the exact sampled update and its clip.
 """
 
 import math
@@ -26,8 +26,11 @@ from pneuopt.quantities.trajectories import Trajectory
 
 REFERENCE_CHANNELS = {"speed": "speed_reference", "position": "position_reference"}
 CONTROLLER_ACTS = "controller_acts"  # 1 at the log's samples at which the controller computes, 0 in between
-SAMPLE_TIME_TOLERANCE = 1e-3  # of a sample time, by which a log's time may be off the controller's
-DIFFERENTIATION_WINDOW = 21  # samples over which a position is differentiated where the fed-back speed is not logged
+# difference of a log's time from the controller's, in sample times [1]: smaller refuses rounded times, larger takes
+# samples of another moment
+SAMPLE_TIME_TOLERANCE = 1e-3
+# samples over which a position is differentiated where the fed-back speed is not logged: fewer are noisy, more lag
+DIFFERENTIATION_WINDOW = 21
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +38,8 @@ class LoggedLoop:
     """A loop with a sampled controller, its reference named as logs name it.
 
     A log has a sample wherever the controller acts, from its first one on, and any number in between. The model's
-    controller sees the plant's output without the sensor's noise: what the noise makes a high gain command is left to
-    the residuals, and where it is not small the intervals are too narrow.
+    controller sees the plant's output without the sensor's noise: the noise that a high gain puts into the command is
+    left to the residuals; where it is not small, the intervals are too narrow.
 
     Parameters
     ----------
@@ -58,42 +61,42 @@ class LoggedLoop:
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """The plant's, then the controller's."""
+        """The states of the plant, then those of the controller."""
         return self.loop.states
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """What a log has to hold: "speed_reference" (or what is fed back), and inputs that are not controlled."""
+        """The inputs that a log has to hold: the reference of what is fed back, and inputs not controlled."""
         reference, *others = self.loop.inputs
         fed_back = self.loop.feedback.name
         return (replace(reference, name=REFERENCE_CHANNELS.get(fed_back, f"{fed_back}_reference")), *others)
 
     @property
     def outputs(self) -> tuple[Quantity, ...]:
-        """The plant's, and "control"."""
+        """The outputs of the plant, and "control"."""
         return self.loop.outputs
 
     @property
     def parameters(self) -> ParameterSet:
-        """The loop's."""
+        """The parameters of the loop."""
         return self.loop.parameters
 
     @property
     def plant(self) -> System:
-        """The loop's."""
+        """The plant of the loop."""
         return self.loop.plant
 
     def motion(self) -> Motion:
-        """The loop's, its reference named as in a log."""
+        """The motion of the loop, its reference named as in a log."""
         motion = self.loop.motion()
         return replace(motion, system=replace(motion.system, inputs=self.inputs))
 
     def rest_state(self, parameters: ParameterSet, outputs: Mapping[str, float] | None = None) -> Array:
-        """The loop's."""
+        """The state of the loop at rest, as `ClosedLoop.rest_state`."""
         return self.loop.rest_state(parameters, outputs)
 
     def check(self, parameters: ParameterSet) -> None:
-        """As `ClosedLoop.check`."""
+        """Check the parameters, as `ClosedLoop.check`."""
         self.loop.check(parameters)
 
     def check_log(self, measured: Trajectory, name: str) -> None:
@@ -105,7 +108,7 @@ class LoggedLoop:
         _acting_samples(measured.t, self._sample_time, name)
 
     def discrete(self, substeps: int = 1) -> DiscreteSystem:
-        """The loop's sampled step; its last input says at which samples the controller acts."""
+        """The loop's sampled step; its last input is 1 at samples at which the controller acts."""
         return _add_acting_input(self.loop.discrete(substeps), self.inputs)
 
     def input_matrix(self, measured: Trajectory, name: str) -> Array:
@@ -114,7 +117,7 @@ class LoggedLoop:
         return np.column_stack([own, _acting_samples(measured.t, self._sample_time, name)])
 
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
-        """What of a log's start state no measured output feels, taken from the candidate; NaN where it is to be found.
+        """The start states on which no measured output depends, from a candidate; NaN for those that are estimated.
 
         The command is computed anew at the first sample; of previous error and derivative only a sum counts.
         """
@@ -128,9 +131,9 @@ class LoggedLoop:
         return np.array([states[n][0] if n in held else np.nan for n in names(self.states)])
 
     def starts(self, logs: Mapping[str, Log]) -> Sequence[Start]:
-        """The plant's own candidates under the command that the controller must have given; the log began at rest.
+        """The plant's candidates under the replayed command, for a log that began at rest.
 
-        One more believes that the controller was just switched on, its integral empty.
+        One more candidate assumes that the controller was just switched on, its integral empty.
         """
         out: list[Start] = []
         for was_at_rest in (True, False):
@@ -143,7 +146,7 @@ class LoggedLoop:
         return out
 
     def log_warnings(self, logs: Mapping[str, Log]) -> Sequence[str]:  # noqa: ARG002 - as `Fittable`
-        """None: the log lacks the command, without which the plant cannot examine it."""
+        """No warnings: the log lacks the command, without which the plant cannot examine it."""
         return ()
 
     @property
@@ -152,7 +155,7 @@ class LoggedLoop:
 
     @cached_property
     def _controller(self) -> tuple[DiscreteSystem, Rollout, ClosedLoop]:
-        """The loop's controller alone: its measured signal is an input."""
+        """The controller alone, with the logged feedback as an input."""
         seen, plant = self.loop.feedback, self.loop.plant
         logged = replace(seen, name="logged")
 
@@ -195,7 +198,7 @@ def _controller_states(replayed: Trajectory) -> dict[str, Array]:
 
 
 def _add_acting_input(discrete: DiscreteSystem, inputs: Sequence[Quantity]) -> DiscreteSystem:
-    """The same, with one more input that lets the controller act (1) or rest (0)."""
+    """The loop's step with one more input that lets the controller act (1) or rest (0)."""
     assert discrete.update is not None
     assert discrete.ode is not None
     n = {k: discrete.step.size1_in(i) for i, k in enumerate(("t", "h", "x", "u", "p"))}
@@ -235,7 +238,7 @@ def _feedback_along_log(measured: Trajectory, wanted: str, reference: str, name:
     if wanted == "speed" and "position" in measured:
         window = min(DIFFERENTIATION_WINDOW, (len(t) - 1) // 2 * 2 + 1)
         return np.asarray(savgol_filter(measured.fill_gaps("position"), window, 2, deriv=1, delta=step))
-    message = f"{name}: the loop feeds back {wanted!r}; without it, or the motion it follows from, there is no start"
+    message = f"{name}: the loop feeds back {wanted!r}; log it, or the motion it follows from"
     require(wanted == "position" and "speed" in measured, message, LogError)
     speed = measured.fill_gaps("speed")
     travel = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))

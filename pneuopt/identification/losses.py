@@ -23,22 +23,24 @@ from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.shooting.solution import Fit
 
-MAX_REFITS = 12
-ESTIMATE_CHANGE_TOLERANCE = 0.05  # standard deviations that an estimate may still move from refit to refit
-NOISE_CHANGE_TOLERANCE = 0.02  # relative change of a noise level, likewise
-MIN_WEIGHT = 1e-8
-OUTLIER_THRESHOLD = 4.0  # of a channel's own scale: one in 16 000 samples of normal noise
+MAX_REFITS = 12  # refits with new weights, at most: fewer leave the weights unsettled, more cost time
+# standard deviations that an estimate may still move from refit to refit: smaller takes more refits, larger stops early
+ESTIMATE_CHANGE_TOLERANCE = 0.05
+NOISE_CHANGE_TOLERANCE = 0.02  # relative change of a noise level [1] from refit to refit, likewise
+MIN_WEIGHT = 1e-8  # least weight of a sample [1]: zero would divide its noise by zero, a larger one lets outliers count
+# residual over its channel's scale [1] of an outlier: one in 16 000 samples of normal noise; lower counts noise
+OUTLIER_THRESHOLD = 4.0
 
 
 class Loss(Protocol):
-    """How much a residual counts beyond the noise."""
+    """A robust loss: the weight of a residual falls with its size."""
 
     def weight(self, r: Array) -> Array:
-        """psi(r)/r: 1 for small residuals; r in standard deviations."""
+        """The weight psi(r)/r of residuals r in standard deviations; 1 for small ones."""
         ...
 
     def slope(self, r: Array) -> Array:
-        """psi'(r)."""
+        """The derivative psi'(r) for residuals r in standard deviations."""
         ...
 
 
@@ -63,11 +65,11 @@ class Huber:
         require(self.threshold > 0, f"Huber: the threshold must be positive, got {self.threshold:g}")
 
     def weight(self, r: Array) -> Array:
-        """psi(r)/r."""
+        """The weight psi(r)/r of residuals r in standard deviations."""
         return np.asarray(self.threshold / np.maximum(np.abs(r), self.threshold))
 
     def slope(self, r: Array) -> Array:
-        """psi'(r)."""
+        """The derivative psi'(r) for residuals r in standard deviations."""
         return np.asarray(np.abs(r) <= self.threshold, dtype=float)
 
 
@@ -92,11 +94,11 @@ class SoftL1:
         require(self.threshold > 0, f"SoftL1: the threshold must be positive, got {self.threshold:g}")
 
     def weight(self, r: Array) -> Array:
-        """psi(r)/r."""
+        """The weight psi(r)/r of residuals r in standard deviations."""
         return np.asarray(1 / np.sqrt(1 + (r / self.threshold) ** 2))
 
     def slope(self, r: Array) -> Array:
-        """psi'(r)."""
+        """The derivative psi'(r) for residuals r in standard deviations."""
         return np.asarray((1 + (r / self.threshold) ** 2) ** -1.5)
 
 
@@ -109,11 +111,11 @@ def fit_robustly(
     ----------
     problem : EstimationProblem
     fit : Fit
-        Of that problem.
+        A fit of that problem.
     loss : Loss, optional
     estimate_noise : bool
-        Each channel's noise becomes the white part of its residuals (`noise_level`): what a wrong model leaves in them
-        varies slowly, does not count, and so stays visible.
+        Each channel's noise becomes the white part of its residuals (`noise_level`): the error of a wrong model varies
+        slowly, does not count as noise, and so stays visible.
 
     Returns
     -------
@@ -126,22 +128,22 @@ def fit_robustly(
     if loss is None and not estimate_noise:
         return problem, fit
     warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
-    posed, fits = problem, [fit]
+    current, fits = problem, [fit]
     for _ in range(MAX_REFITS):
         if fit.status.code in (Code.DIVERGED, Code.INTERRUPTED):
             break
-        before, (posed, fit) = (posed, fit), _refit(posed, fit, loss, warm, estimate_noise=estimate_noise)
+        before, (current, fit) = (current, fit), _refit(current, fit, loss, warm, estimate_noise=estimate_noise)
         fits.append(fit)
-        if _is_stationary(before, (posed, fit)):
+        if _is_stationary(before, (current, fit)):
             break
-    posed = replace(posed, method=problem.method)
-    return posed, _summarise(posed, fits, loss)
+    current = replace(current, method=problem.method)
+    return current, _summarise(current, fits, loss)
 
 
 def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
-    """What the squared residuals of a fit would sum up to, in noise variances, were they white at their own level.
+    """Sum of squares of the white part of a fit's residuals, in noise variances; 0 with the weights of a robust loss.
 
-    A wrong basin leaves more, for what varies slowly does not count (`noise_level`). With weights of a loss, nothing.
+    A fit in a wrong basin has a larger sum of squares, for slow residuals do not count here (`noise_level`).
     """
     total = 0.0
     if problem.weights:
@@ -155,7 +157,7 @@ def white_chi_square(problem: EstimationProblem, fit: Fit) -> float:
 
 
 def _summarise(problem: EstimationProblem, fits: Sequence[Fit], loss: Loss | None) -> Fit:
-    """The last fit with the effort of all, and a status that counts the bulk of the samples, not the outliers."""
+    """The last fit with the effort of all, and a status without the outliers' residuals."""
     fit = fits[-1].with_effort_of(*fits[:-1])
     status = fit.status
     if loss is not None and status.converged and fit.jumps is None:
@@ -164,7 +166,7 @@ def _summarise(problem: EstimationProblem, fits: Sequence[Fit], loss: Loss | Non
 
 
 def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> tuple[str, ...]:
-    """Sentences on the outliers, and on what the model leaves beyond the noise in the other samples."""
+    """Sentences on the outliers, and on the misfit in the other samples."""
     worst, level, beyond, count = "", 1.0, 0, 0
     for e, run in zip(problem.experiments, fit.trajectories, strict=True):
         residuals = _residuals_in_noise(problem, e, run)
@@ -185,7 +187,7 @@ def _describe_outliers(problem: EstimationProblem, fit: Fit, fits: int) -> tuple
 def _refit(
     problem: EstimationProblem, fit: Fit, loss: Loss | None, method: LeastSquares, *, estimate_noise: bool
 ) -> tuple[EstimationProblem, Fit]:
-    """The next fit, from where the last one ended, with the weights and noise levels that its residuals ask for."""
+    """The next fit, from the last one, with weights and noise levels from its residuals."""
     runs = dict(zip((e.name for e in problem.experiments), fit.trajectories, strict=True))
     if estimate_noise:
         logs = tuple(_estimate_noise(problem, e, runs[e.name]) for e in problem.experiments)
@@ -200,14 +202,14 @@ def _refit(
 
 
 def _residuals_in_noise(problem: EstimationProblem, experiment: Experiment, run: Trajectory) -> Array:
-    """In noise standard deviations, shape (n, n_measured)."""
+    """The residuals in noise standard deviations, shape (n, n_measured)."""
     outputs = outputs_in_log(problem.system, experiment)
     noise = np.array([experiment.noise[o] for o in outputs])
     return np.asarray((experiment.trajectory.matrix(outputs) - run.matrix(outputs)) / noise)
 
 
 def _channel_scales(residuals: Array) -> Array:
-    """Each channel's own: 1.4826 MAD, or the noise where more than half of the residuals vanish."""
+    """The scale of each channel's residuals: 1.4826 MAD, or the noise where more than half of them vanish."""
     scales = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
     return np.where(scales > 0, scales, 1.0)
 
@@ -223,7 +225,7 @@ def _estimate_noise(problem: EstimationProblem, experiment: Experiment, run: Tra
 def _sandwich_factor(
     loss: Loss, residuals: Mapping[str, Array], scales: Mapping[str, Array], weights: Mapping[str, Array]
 ) -> float:
-    """Huber's sandwich at the scale of each channel, over the variance that a weighted least squares takes."""
+    """Variance by Huber's sandwich, at the scale of each channel, over that of a weighted least squares."""
     parts = [(r, np.broadcast_to(scales[n], r.shape), weights[n]) for n, r in residuals.items()]
     r, s, w = (np.concatenate([part[i].ravel() for part in parts]) for i in range(3))
     known = np.isfinite(r)
@@ -232,7 +234,7 @@ def _sandwich_factor(
 
 
 def _is_stationary(before: tuple[EstimationProblem, Fit], after: tuple[EstimationProblem, Fit]) -> bool:
-    """Whether a refit has moved neither an estimate nor a noise level."""
+    """Whether a refit has hardly moved an estimate or a noise level."""
     (old_problem, old), (problem, fit) = before, after
     if fit.covariance is None:
         return False

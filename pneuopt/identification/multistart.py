@@ -1,8 +1,8 @@
-"""`fit_from_starts`: the best fit that the model's own starts lead to; what the logs cannot identify is held meanwhile.
+"""`fit_from_starts`: the best fit from the model's own starts, with the parameters held that the logs cannot identify.
 
-The first start is tried alone. Where it fails, every guess that a start finder could only make (`trial_parameters`, as
-the Stribeck velocity) is held for a few iterations, until the states and the other parameters have settled to it; the
-starts then follow by the cost they reached.
+The first start is tried alone. Where it fails, the guessed parameters of each other start (`trial_parameters`, as the
+Stribeck velocity) are held for a few iterations, until the states and the other parameters have settled to them; the
+starts are then tried by the cost they reached.
 
 A parameter that the data do not determine is held at its given value. A weak prior (a decade about that value) would
 leave it there, too; holding it needs no weight for the prior beside that of the data, and the prior's spread is counted
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.identification.identifiability import refuses_held_values
+from pneuopt.identification.identifiability import rejects_held_values
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
@@ -21,7 +21,7 @@ from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import solve_least_squares
 from pneuopt.shooting.solution import Fit
 
-GUESS_STAGES = 3  # stages of a search with guesses held; tighter gaps would force a wrong guess on the log
+GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
 # relative width of the bounds that hold a guess; equal bounds would compile other equations than those of the search
 GUESS_BOUND_WIDTH = 1e-9
 # squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
@@ -49,7 +49,7 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
         A wrong basin can converge, too, but leaves residuals above the noise; so more starts are tried until two of
         them agree on the least cost.
     label : str
-        Of its start.
+        The label of its start.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
         status = Status(Code.INTERRUPTED, (f"the best of {starts} starts so far", "run again for an answer"))
     elif not status.converged and starts > 1:
         in_the_best = (f"in the best, {status.verdict}", *status.sentences[1:])
-        status = Status(status.code, (f"none of {starts} starts will do", *in_the_best))
+        status = Status(status.code, (f"none of {starts} starts converged", *in_the_best))
     if len(problem.experiments) > 1:
         status = status.with_remedies("compare_logs shows whether the logs are of one drive")
     return status
@@ -97,8 +97,8 @@ def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = la
     ----------
     problem : EstimationProblem
     confirms : callable
-        Asked after the first start: whether it led to an optimum that only needs confirmation (of a model that misses
-        the log, say). The others are then taken as they are; settling all would cost more.
+        Called after the first start: whether it led to an optimum that only needs confirmation, as that of a model that
+        does not explain the log. The other starts are then taken as they are; settling all would cost more.
 
     Yields
     ------
@@ -118,7 +118,7 @@ def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = la
 
 
 def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[float, Start]:
-    """The cost that a start reaches with its guesses held, and where."""
+    """The cost that a start reaches with its guesses held, and the start from there."""
     transcription = problem.transcription(candidate)
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
     bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
@@ -141,7 +141,7 @@ def fit_holding_unidentifiable(problem: EstimationProblem, start: Start) -> tupl
     Returns
     -------
     problem : EstimationProblem
-        With what is held: at the given values, or, if the logs refuse those, where the search had left them.
+        With what is held: at the given values, or, if the logs reject those, where the search had left them.
     fit : Fit
         The first one, where holding does not converge, or would leave no parameter to estimate.
     """
@@ -151,7 +151,7 @@ def fit_holding_unidentifiable(problem: EstimationProblem, start: Start) -> tupl
     for is_given in (True, False) if not first.status.converged else (True,):
         held, fit = _hold_unidentifiable(problem, start.label, first, is_given=is_given)
         is_settled = fit.status.converged and not fit.unidentifiable
-        if fit.status.code is Code.INTERRUPTED or (is_settled and not refuses_held_values(fit, first, len(held.held))):
+        if fit.status.code is Code.INTERRUPTED or (is_settled and not rejects_held_values(fit, first, len(held.held))):
             return held, fit
     return problem, first
 
@@ -173,9 +173,9 @@ def _hold_unidentifiable(
 
 
 def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
-    """Whether no other start can do better.
+    """Whether a fit explains the logs to their noise, so that no other start can do better.
 
-    Where the log states too little noise, the white part of the residuals is what is left of it.
+    Where a log declares too little noise, the white part of the residuals counts in its place.
     """
     if not fit.status.converged or fit.jumps is not None:
         return False
@@ -186,14 +186,15 @@ def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
 
 
 def _has_state_noise(fit: Fit) -> bool:
-    """Whether it is the optimum of a model that the log's states do not quite follow."""
+    """Whether a fit converged with gaps that stand for noise of the states."""
     return fit.status.converged and fit.jumps is not None
 
 
 def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
-    """The order of fits: by cost, but noise of the states explains too much to be compared with a fit without.
+    """The order of fits: by cost among fits of one kind.
 
-    And so do the loose gaps, wider than the last stage's, in which an interruption may leave a search.
+    Noise of the states, or the wide gaps in which an interruption leaves a search, lower the cost of any model; such
+    fits come after those that explain the log without.
     """
     cost = fit.stats["cost"]
     if fit.status.code is Code.INTERRUPTED and fit.stats["gap_deviation"] > tightest:

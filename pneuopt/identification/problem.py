@@ -1,4 +1,4 @@
-"""An identification posed as multiple shooting: logs, conditions and own parameters become a `Transcription`."""
+"""`EstimationProblem`: logs, conditions and parameters of an identification, as a multiple-shooting `Transcription`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,12 +22,12 @@ from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
-REFIT_STAGES = 3  # last stages of a method: a refit starts near its answer; more cost time, fewer may not converge
+REFIT_STAGES = 3  # last stages of a method that a refit runs, near its answer: more cost time, fewer may not converge
 
 
 @dataclass(frozen=True, eq=False)
 class EstimationProblem:
-    """What is to be identified, and its translation to a transcription and back.
+    """An estimation problem: a system, logs and parameters; its transcription, and starts from its fits.
 
     Parameters
     ----------
@@ -36,9 +36,9 @@ class EstimationProblem:
     parameters : ParameterSet
     method : LeastSquares
     weights : mapping of str to ndarray, each of shape (n, n_measured_outputs)
-        By log: of each sample's squared residual; absent ones are 1.
+        By log, the weight of each sample's squared residual; 1 for logs that are absent.
     held : mapping of str to float
-        Free parameters that the logs cannot identify, and where they stay.
+        Values of free parameters that are held, for the logs cannot identify them.
     """
 
     system: Fittable
@@ -54,7 +54,7 @@ class EstimationProblem:
         return self.system.starts(logs)
 
     def start_from(self, fit: Fit | IdentificationResult, label: str = "fit") -> Start:
-        """The start that goes on where a fit of these logs ended; what it leaves open begins at its given value."""
+        """The start from a fit of these logs; parameters without an estimate begin at their given values."""
         if isinstance(fit, IdentificationResult):
             runs, found = (
                 tuple(fit.trajectories.values()),
@@ -81,7 +81,7 @@ class EstimationProblem:
         return ParameterSet({**shared, **own})
 
     def transcription(self, candidate: Start) -> Transcription:
-        """Pose the problem as multiple shooting, started from a candidate."""
+        """The problem as multiple shooting, started from a candidate."""
         phases = tuple(self._phase(e, candidate.states[e.name]) for e in self.experiments)
         residuals = tuple(self._residuals(i, e) for i, e in enumerate(self.experiments))
         parameters = self.unknowns().with_values(candidate.parameters)
@@ -119,7 +119,7 @@ def as_estimation_model(model: HasSystem | ClosedLoop | Fittable) -> Fittable:
 
 
 def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:
-    """The parameters as they are in one log, where its conditions are known and so not free."""
+    """The parameters of one log: its conditions replace values, and are known, not free."""
     try:
         return parameters.with_values(experiment.conditions).fixed(*experiment.conditions)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Profile likelihood: how far a parameter can move while the others make up for it."""
+"""`profile`: the profile-likelihood interval of a parameter, with the others fitted again at each of its values."""
 
 import itertools
 import math
@@ -22,16 +22,18 @@ from pneuopt.shooting.solution import Fit
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_REFITS_A_SIDE = 14  # refits on one side
-ROOT_TOLERANCE = 0.003  # of the level's root, to which an end is located
-MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits
-MAX_LOG_PROBE = 0.3  # e-folds, at most, over which the curvature at the estimate is measured
-REFIT_ITERATIONS = 40  # of a refit
+MAX_REFITS_A_SIDE = 14  # refits on one side of the estimate: more cost time, fewer leave an end open that is not
+ROOT_TOLERANCE = (
+    0.003  # relative error of the deviance's root at an end: smaller takes more refits, larger blurs the end
+)
+MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits: larger steps lose the optimum of the others
+MAX_LOG_PROBE = 0.3  # e-folds over which the curvature at the estimate is measured: farther off it is another curvature
+REFIT_ITERATIONS = 40  # iterations of a refit, at most: fewer leave its cost too high, and the interval too narrow
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """What the logs say of one parameter when all others are free to follow.
+    """The profile likelihood of one parameter, with all others fitted again at each of its values.
 
     Attributes
     ----------
@@ -63,7 +65,7 @@ class Profile:
 
     @property
     def threshold(self) -> float:
-        """The deviance up to which a value is believed."""
+        """The deviance up to which a value lies within the interval."""
         return float(chi2.ppf(self.level, 1))
 
     @property
@@ -130,9 +132,9 @@ def profile(
 
 
 def trace_profile(problem: EstimationProblem, result: IdentificationResult, name: str, level: float = 0.95) -> Profile:
-    """`profile`, of a problem already posed."""
+    """The profile of a parameter of an estimation problem."""
     if problem.method.progress is not None:
-        problem.method.progress(f"how far {name} can move")
+        problem.method.progress(f"profile of {name}")
     refits = _Refits(problem, result, name)
     target = math.sqrt(float(chi2.ppf(level, 1)))
     for side in (-1, 1):
@@ -143,7 +145,7 @@ def trace_profile(problem: EstimationProblem, result: IdentificationResult, name
 
 
 class _ProfilePoint(NamedTuple):
-    """A refit."""
+    """A refit: the searched value at which the parameter is held, and the fit."""
 
     z: float
     fit: Fit
@@ -173,7 +175,7 @@ class _Refits:
         return self.to_search(self.parameter.value)
 
     def to_search(self, value: float) -> float:
-        """A value as it is searched; a bound that is not positive is none for a logarithm."""
+        """A value as it is searched; minus infinity for the logarithm of a bound that is not positive."""
         if self.parameter.log:
             return math.log(value) if value > 0 else -math.inf
         return value
@@ -187,10 +189,10 @@ class _Refits:
         start = self.start
         if self.points:
             start = self.problem.start_from(min(self.points, key=lambda known: abs(known.z - z)).fit)
-        posed = self.problem.transcription(start)
+        transcription = self.problem.transcription(start)
         held = replace(self.parameter, value=self.value(z), lower=self.value(z), upper=self.value(z))
-        posed = replace(posed, parameters=posed.parameters | ParameterSet({self.name: held}))
-        point = _ProfilePoint(z, solve_least_squares(posed, self.method))
+        transcription = replace(transcription, parameters=transcription.parameters | ParameterSet({self.name: held}))
+        point = _ProfilePoint(z, solve_least_squares(transcription, self.method))
         self.points.append(point)
         return point
 
@@ -213,7 +215,7 @@ class _Refits:
         return stderr / self.parameter.value if self.parameter.log else stderr
 
     def _scale(self, noise: float) -> float:
-        """Cost that is worth one variance: soft gaps rise less than the likelihood, which the standard error knows."""
+        """The cost that counts as one variance, from the curvature: weighted gaps rise less than the likelihood."""
         if not (math.isfinite(self.spread) and self.spread > 0):
             return noise
         step = min(self.spread, MAX_LOG_PROBE) if self.parameter.log else self.spread
@@ -228,7 +230,7 @@ class _Refits:
 
 
 def _bracket(refits: _Refits, side: int, target: float) -> None:
-    """Refit on one side until the profile has left the level, then closely around that; or to the bound."""
+    """Refit on one side until the deviance exceeds the level, then closely around that point; or to the bound."""
     p = refits.parameter
     bound = refits.to_search(p.lower if side < 0 else p.upper)
     inside, step = refits.points[0], _first_step(refits, target)
@@ -246,7 +248,7 @@ def _bracket(refits: _Refits, side: int, target: float) -> None:
 
 
 def _interval_end(refits: _Refits, side: int, target: float) -> float:
-    """The outermost crossing of the level on one side; infinite where the outermost refit is still believed."""
+    """The outermost crossing of the level on one side; infinite where the outermost refit lies within."""
     points = sorted(refits.points, key=lambda known: -side * known.z)
     for outside, inside in itertools.pairwise(points):
         a, b = refits.deviance_root(inside), refits.deviance_root(outside)
@@ -259,7 +261,7 @@ def _interval_end(refits: _Refits, side: int, target: float) -> float:
 
 
 def _first_step(refits: _Refits, target: float) -> float:
-    """To where the linear interval ends, as searched, and a little further."""
+    """The first step from the estimate, as searched: a little beyond the end of the linear interval."""
     p, linear = refits.parameter, 1.05 * target * refits.spread
     if p.log:
         return min(linear, MAX_LOG_STEP) if math.isfinite(linear) else MAX_LOG_STEP
@@ -267,7 +269,7 @@ def _first_step(refits: _Refits, target: float) -> float:
 
 
 def _locate_crossing(refits: _Refits, inside: _ProfilePoint, outside: _ProfilePoint, target: float) -> None:
-    """Refit ever nearer to the crossing, by false position on the root of the deviance, which is nearly linear."""
+    """Locate a crossing of the level by false position on the root of the deviance, which is nearly linear."""
     for _ in range(MAX_REFITS_A_SIDE):
         a, b = refits.deviance_root(inside), refits.deviance_root(outside)
         if not a < target <= b:  # a refit has found a better fit, from which all are counted now

@@ -12,7 +12,8 @@ from pneuopt.identification.statistics import confidence_interval
 from pneuopt.quantities.arrays import Array
 
 ParameterValues = Mapping[str, float]
-DELTA_METHOD_STEP = 1e-3  # standard deviations over which a slope is taken
+# standard deviations over which a slope is taken: larger steps see curvature, smaller ones rounding
+DELTA_METHOD_STEP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class PropagatedValue:
     Attributes
     ----------
     value, stderr, ci_low, ci_high : float
-        NaN but for the value where the figure hangs on a parameter that has no interval.
+        All but the value are NaN where the figure depends on a parameter without an interval.
     """
 
     value: float
@@ -32,7 +33,7 @@ class PropagatedValue:
 
 
 def propagate_error(result: IdentificationResult, function: Callable[[ParameterValues], float]) -> PropagatedValue:
-    """A function of the parameters, with its interval by the delta method.
+    """Compute a function of the parameters, with its confidence interval by the delta method.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def propagate_error(result: IdentificationResult, function: Callable[[ParameterV
 def propagate_deviations(
     result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]
 ) -> tuple[Array, Array]:
-    """Several figures at once, and the standard deviation of each; a curve over a grid, say.
+    """Compute several figures at once with their standard deviations, as a curve over a grid.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def propagate_deviations(
     ]
     value = np.asarray(function(at), dtype=float)
     J = np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
-    used = np.any(J != 0, axis=0)  # of a parameter without an interval, only one that does not count is harmless
+    used = np.any(J != 0, axis=0)  # parameters without an interval do no harm where no figure depends on them
     variance = np.einsum("ni,ij,nj->n", J[:, used], covariance[np.ix_(used, used)], J[:, used])
     return value, np.sqrt(variance)
 

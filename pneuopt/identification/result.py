@@ -1,4 +1,4 @@
-"""`IdentificationResult`: estimates with their intervals, and its `Verdict`: what the logs cannot identify."""
+"""`IdentificationResult`: estimates with intervals; `Verdict`: which parameters the logs identify, and how well."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "unidentifiable"
-INFINITE_INFLATION = (
-    1e5  # times that a standard deviation shrinks if the others were known, that are as good as infinite
-)
+# inflation of a standard deviation [1] from which "nothing separates them" is shown: lower hides useful figures, higher
+# shows rounding
+INFINITE_INFLATION = 1e5
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,20 +56,20 @@ class Verdict:
         for name, reason in self.reasons.items():
             by_reason.setdefault((name in self.unidentifiable, reason), []).append(name)
         single = [
-            f"the logs {'do not identify' if is_blind else 'identify only roughly'} {join_names(names)}: {reason}"
-            for (is_blind, reason), names in by_reason.items()
+            f"the logs {'do not identify' if is_unknown else 'identify only roughly'} {join_names(names)}: {reason}"
+            for (is_unknown, reason), names in by_reason.items()
         ]
         groups = [_describe_group(group, self.table["inflation"], self.excitation) for group in self.indistinguishable]
         return (*single, *groups, *([self._describe_unchanged()] if self.unchanged else []))
 
     def _describe_unchanged(self) -> str:
-        """The values at which a fit has held parameters."""
+        """A sentence on the values at which a fit has held parameters."""
         values = join_names([f"{n} ({self.table['value'][n]:.4g})" for n in self.unchanged])
         verb = "keep their given values" if len(self.unchanged) > 1 else "keeps its given value"
         return f"{values} {verb}, on which the other intervals do not rest"
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the table, for a file."""
+        """The verdict without its table, for a file."""
         return {
             "sentences": list(self.sentences),
             "unidentifiable": list(self.unidentifiable),
@@ -84,7 +84,7 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class IdentificationResult:
-    """What `identify` found.
+    """The result of `identify`: estimates, intervals, fitted trajectories and status.
 
     Attributes
     ----------
@@ -125,7 +125,9 @@ class IdentificationResult:
 def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:
     times = float(inflation[list(group)].max())
     message = (
-        f"known {times:.0f} times better if the others were" if times < INFINITE_INFLATION else "nothing separates them"
+        f"each {times:.0f} times better known if the others are fixed"
+        if times < INFINITE_INFLATION
+        else "nothing separates them"
     )
     return f"{join_names(group)} act only together ({message}): {remedy(excitation, group)}"
 

@@ -1,4 +1,4 @@
-"""`review_fit`: which intervals of a fit are wrong, what its logs do not identify, and where a failed fit is worst."""
+"""`review_fit`: corrected intervals of a fit, its unidentifiable parameters, and the worst place of a failed fit."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -35,12 +35,14 @@ from pneuopt.shooting.segments import segment, start_nodes
 if TYPE_CHECKING:
     import pandas as pd
 
-PROFILE_DRAG_DEVIATIONS = (
-    3.0  # standard deviations that another parameter moves along a profile, beyond which it is profiled, too
+# standard deviations that another parameter moves along a profile, beyond which it is profiled, too: lower costs time,
+# higher leaves wrong linear intervals
+PROFILE_DRAG_DEVIATIONS = 3.0
+RESIDUAL_BLOCK_SAMPLES = 50  # samples of a block of residuals: fewer show single outliers, more blur the time span
+GAP_SUBSTEPS = (
+    20  # integration steps a sample for the gaps that are shown: fewer add integration errors, more cost time
 )
-RESIDUAL_BLOCK_SAMPLES = 50  # samples over which residuals are compared
-GAP_SUBSTEPS = 20  # of a sample, at which gaps are shown
-MIN_REPORTED_GAP = 1e-4  # of a nominal size
+MIN_REPORTED_GAP = 1e-4  # of a state's nominal size: smaller gaps are integration errors, larger ones point to a fault
 SMOOTHING_REDUCTION = 0.1  # of the width [1] in one advice; smaller takes finer steps, larger leaves the model creeping
 MIN_SMOOTHING_SHARE = 0.1  # of the model's default width [1]; a narrower width takes ever finer integration steps
 
@@ -52,18 +54,19 @@ def review_fit(
 
     Parameters
     ----------
-    problem : Problem
+    problem : EstimationProblem
     result : IdentificationResult
-        As the search left it.
+        The result of the search, with linear intervals.
     unidentifiable : sequence of str
-        Free parameters that rest on a prior: those held, and those that hang on them.
+        Free parameters that rest on a prior: those held, and those whose variance the priors dominate.
 
     Returns
     -------
     IdentificationResult
-        With its verdict; where the search did not converge, without any interval, and with the worst place in its
-        status. Doubtful intervals are replaced by those of the profile likelihood; a parameter that has an open end
-        there, or that the motion cannot show, has no standard deviation. Ctrl-C leaves the rest unchecked.
+        The result with its verdict; where the search did not converge, without any interval, and with the worst place
+        in its status. Doubtful intervals are replaced by those of the profile likelihood; a parameter with an open
+        interval, or one that the logged motion does not excite, has no standard deviation. Ctrl-C leaves the other
+        intervals as they are.
     """
     start = problem.start_from(result)
     if not result.status.converged:
@@ -89,8 +92,8 @@ def review_fit(
     )
     verdict = add_profiles(verdict, profiles)
     if unidentifiable:
-        seen = _verdict_at(problem, start, result)
-        verdict = add_unidentifiable(verdict, unidentifiable, seen, _names_at_given_value(problem))
+        local = _verdict_at(problem, start, result)
+        verdict = add_unidentifiable(verdict, unidentifiable, local, _names_at_given_value(problem))
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
     status = result.status.with_details(_name_unidentifiable(verdict))
@@ -98,35 +101,35 @@ def review_fit(
 
 
 def _blank_covariance(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
-    """NaN for these."""
-    out, gone = covariance.copy(), list(names)
-    out.loc[gone] = math.nan
-    out[gone] = math.nan
+    """The covariance with NaN for the named parameters."""
+    out, own = covariance.copy(), list(names)
+    out.loc[own] = math.nan
+    out[own] = math.nan
     return out
 
 
 def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
-    """No interval for these."""
+    """The estimates without intervals for the named parameters."""
     out = estimates.copy()
     out.loc[list(names), ["stderr", "ci_low", "ci_high"]] = math.nan
     return out
 
 
 def _names_at_given_value(problem: EstimationProblem) -> tuple[str, ...]:
-    """Of what is held, that which stays at its given value."""
+    """The parameters that are held at their given values."""
     given = problem.unknowns()
     return tuple(n for n, v in problem.held.items() if v == given.value(n))
 
 
 def _verdict_at(problem: EstimationProblem, start: Start, result: IdentificationResult) -> Verdict:
-    """The verdict where a search gave up, from the sensitivities there."""
+    """The verdict from the sensitivities at a start, with the residuals of a result."""
     return verdict_from_sensitivities(
         problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["correlation_time"])
     )
 
 
 def _profiles(problem: EstimationProblem, result: IdentificationResult) -> dict[str, Profile]:
-    """Profiles of what is doubtful, and of what that drags along."""
+    """Profiles of parameters with doubtful linear intervals, and of those that move far along an open profile."""
     found: dict[str, Profile] = {}
     rows = result.estimates
     known = rows.index[np.isfinite(rows["stderr"])]
@@ -148,16 +151,16 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> dict[
 
 
 def _parameters_outside_interval(profile: Profile, estimates: "pd.DataFrame") -> Iterator[str]:
-    """Other parameters that leave their linear interval while the profiled one is still believed."""
-    believed = profile.curve[profile.curve["deviance"] <= profile.threshold]
+    """Other parameters that leave their linear interval within the interval of the profiled one."""
+    inside = profile.curve[profile.curve["deviance"] <= profile.threshold]
     for name in estimates.index.drop(profile.name):
-        moved = (believed[name] - estimates["value"][name]).abs().max()
+        moved = (inside[name] - estimates["value"][name]).abs().max()
         if moved > PROFILE_DRAG_DEVIATIONS * estimates["stderr"][name]:
             yield str(name)
 
 
 def _replace_intervals(estimates: "pd.DataFrame", profiles: Mapping[str, Profile], verdict: Verdict) -> "pd.DataFrame":
-    """The profiles' intervals in place of the linear ones; no standard deviation where there is no closed interval."""
+    """The estimates with the profiles' intervals; no standard deviation where an interval is open."""
     out = _blank_intervals(estimates, verdict.unidentifiable)
     for name, found in profiles.items():
         out.loc[name, ["ci_low", "ci_high"]] = [found.low, found.high]
@@ -168,14 +171,14 @@ def _replace_intervals(estimates: "pd.DataFrame", profiles: Mapping[str, Profile
 
 def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
     """A note on each estimate at a bound or unidentifiable; NaN for the value of the latter."""
-    blind, bound = set(verdict.unidentifiable), estimates["at_bound"]
-    notes = [AT_BOUND_NOTE if bound[n] else UNIDENTIFIABLE_NOTE if n in blind else "" for n in estimates.index]
+    unidentifiable, bound = set(verdict.unidentifiable), estimates["at_bound"]
+    notes = [AT_BOUND_NOTE if bound[n] else UNIDENTIFIABLE_NOTE if n in unidentifiable else "" for n in estimates.index]
     out = estimates.assign(note=notes)
     return out.assign(value=out["value"].where(out["note"] != UNIDENTIFIABLE_NOTE))
 
 
 def _locate_failure(problem: EstimationProblem, start: Start, status: Status, verdict: Verdict) -> Status:
-    """A failure with the place where it is worst."""
+    """The status of a failure with its worst place and the remedies."""
     status = status.with_details(_worst_residual(problem, start), _worst_gap(problem, start))
     if verdict.unidentifiable:
         status = status.with_remedies(
@@ -205,14 +208,14 @@ def smoothing_advice(plant: System, parameters: ParameterSet) -> str:
 
 
 def _worst_residual(problem: EstimationProblem, start: Start) -> str:
-    """Log, channel and time span of the largest residuals."""
+    """A sentence on the log, channel and time span of the largest residuals; empty if all are near the noise."""
     worst, message = MAX_CHI_SQUARE_RATIO, ""
     for log in problem.experiments:
         t, run = log.trajectory.t, start.states[log.name]
         for channel in outputs_in_log(problem.system, log):
-            off = (log.trajectory[channel] - run[channel]) / log.noise[channel]
+            residuals = (log.trajectory[channel] - run[channel]) / log.noise[channel]
             for first in range(0, len(t), RESIDUAL_BLOCK_SAMPLES):
-                part = off[first : first + RESIDUAL_BLOCK_SAMPLES]
+                part = residuals[first : first + RESIDUAL_BLOCK_SAMPLES]
                 size = math.sqrt(float(np.nanmean(part**2))) if np.isfinite(part).any() else 0.0
                 if size > worst:
                     last = min(first + RESIDUAL_BLOCK_SAMPLES, len(t)) - 1
@@ -221,7 +224,7 @@ def _worst_residual(problem: EstimationProblem, start: Start) -> str:
 
 
 def _worst_gap(problem: EstimationProblem, start: Start) -> str:
-    """State, log and time of the largest gap between two segments."""
+    """A sentence on the state, log and time of the largest gap between segments; empty if there is none."""
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     nodes = start_nodes(segments)

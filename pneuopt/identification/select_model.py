@@ -1,4 +1,4 @@
-"""`select_model`: which of several models a set of logs supports, by likelihood, by parsimony, by held-out runs."""
+"""`select_model`: the model that a set of logs supports, by likelihood-ratio tests, BIC and held-out runs."""
 
 import fnmatch
 import math
@@ -21,13 +21,17 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     import pandas as pd
 
-NESTED_TEST_LEVEL = 0.01  # of a nested test: a simpler model is given up below this probability
-MAX_HELD_OUT_RATIO = 1.02  # held-out NRMSE, relative to a simpler model's, from which the richer one is not believed
+# probability [1] below which a likelihood-ratio test rejects the simpler model: higher keeps terms that are chance,
+# lower drops weak true ones
+NESTED_TEST_LEVEL = 0.01
+# held-out NRMSE over a simpler model's [1] above which the richer one is not recommended: higher recommends models that
+# predict worse, lower lets noise decide
+MAX_HELD_OUT_RATIO = 1.02
 
 
 @dataclass(frozen=True, eq=False)
 class ModelSelection:
-    """What `select_model` found.
+    """The fits of several models to the same logs, ranked, and the recommended one.
 
     Attributes
     ----------
@@ -40,7 +44,7 @@ class ModelSelection:
     reason : str
         One sentence.
     fits : mapping of str to IdentificationResult
-        Of every candidate, whatever its status.
+        The fit of every candidate, whatever its status.
     """
 
     table: "pd.DataFrame"
@@ -114,7 +118,7 @@ def select_model(
 
 @dataclass(frozen=True)
 class _CandidateRow:
-    """A row of the table."""
+    """A row of the table: one candidate."""
 
     converged: bool
     free: int
@@ -162,7 +166,7 @@ def _mean_nrmse(system: System, held_out: Sequence[Experiment], fit: Identificat
 def _candidate_rows(
     candidates: Mapping[str, System], fits: Mapping[str, IdentificationResult], predicted: Mapping[str, float]
 ) -> dict[str, _CandidateRow]:
-    """What the figures say of each candidate, the lowest BIC first, those that did not converge last."""
+    """A row for each candidate, the lowest BIC first, those that did not converge last."""
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
     scale = _variance(fits[best]) * fits[best].stats["correlation_time"]
     count = _residual_count(fits[best]) / fits[best].stats["correlation_time"]
@@ -181,8 +185,8 @@ def _candidate_rows(
 
 
 def _names_with_note(fit: IdentificationResult, note: str) -> str:
-    """The parameters with this note."""
-    return ", ".join(str(n) for n, said in fit.estimates["note"].items() if said == note)
+    """The names of the parameters with a note, in a sentence."""
+    return ", ".join(str(n) for n, own in fit.estimates["note"].items() if own == note)
 
 
 def _largest_submodel(
@@ -200,7 +204,7 @@ def _largest_submodel(
 
 
 def _chi_square(fit: IdentificationResult) -> float:
-    """Squared residuals in the variances of the stated noise."""
+    """The sum of squared residuals, in variances of the declared noise."""
     return float(((fit.fit["rmse"] / fit.fit["noise"]) ** 2 * fit.fit["samples"]).sum())
 
 
@@ -213,7 +217,7 @@ def _residual_count(fit: IdentificationResult) -> float:
 
 
 def _choose(rows: Mapping[str, _CandidateRow]) -> tuple[str, str]:
-    """The lowest BIC that is no chance and predicts as well as what it contains; and what had to be passed over."""
+    """The candidate of lowest BIC that passes its nested test and predicts held-out runs; the first that failed."""
     passed_over, name = "", next(iter(rows))
     while inside := rows[name].contains:
         row = rows[name]
@@ -227,7 +231,7 @@ def _choose(rows: Mapping[str, _CandidateRow]) -> tuple[str, str]:
 
 
 def _selection_reason(rows: Mapping[str, _CandidateRow], chosen: str, passed_over: str) -> str:
-    """One sentence: what speaks for the choice, and what against its neighbours."""
+    """The sentence that justifies the choice."""
     row, good = rows[chosen], [n for n, r in rows.items() if r.converged]
     message = f"{chosen}, of {len(good)} converged candidates"
     if passed_over:
@@ -237,7 +241,7 @@ def _selection_reason(rows: Mapping[str, _CandidateRow], chosen: str, passed_ove
     elif len(good) > 1:
         message += f", has the lowest BIC, {rows[good[1]].bic - row.bic:.4g} below {good[1]}"
     if row.contains:
-        message += f"; {row.contains}, which it contains, is refuted (p = {row.p_value:.2g})"
+        message += f"; the simpler {row.contains} is rejected (p = {row.p_value:.2g})"
     if math.isfinite(row.held_out_nrmse):
         message += f"; it predicts held-out runs with an NRMSE of {row.held_out_nrmse:.2%}"
     if row.unidentifiable:

@@ -1,4 +1,4 @@
-"""What a fit is worth: confidence intervals, agreement of a prediction with a measurement."""
+"""Statistics of a fit: agreement, confidence intervals, information criteria, tests of the residuals."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from pneuopt.quantities.arrays import Array
 
 
 def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
-    """How well a prediction follows a measurement; missing samples (NaN) do not count.
+    """Agreement of a prediction with a measurement; missing samples (NaN) do not count.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
 
 
 def correlation_time(residuals: ArrayLike) -> float:
-    """Samples that count as one where residuals are correlated: 1 + 2 (rho_1 + rho_2 + ...), up to the first rho <= 0.
+    """Correlation time of residuals in samples: 1 + 2 (rho_1 + rho_2 + ...), up to the first rho <= 0.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def correlation_time(residuals: ArrayLike) -> float:
 
 
 def confidence_interval(value: float, stderr: float, *, log: bool, level: float = 0.95) -> tuple[float, float]:
-    """Normal confidence interval; symmetric in the logarithm where the parameter was searched so.
+    """Normal confidence interval; symmetric in the logarithm where the parameter is searched as one.
 
     Examples
     --------
@@ -105,7 +105,7 @@ def bayes_information(deviance: float, parameters: int, samples: float) -> float
 
 
 def likelihood_ratio_p(drop: float, extra: int) -> float:
-    """Probability that `extra` idle parameters lower a deviance by `drop` or more: chi-square (Wilks 1938).
+    """Probability that `extra` parameters without effect lower a deviance by `drop` or more: chi-square (Wilks 1938).
 
     Examples
     --------
@@ -116,12 +116,12 @@ def likelihood_ratio_p(drop: float, extra: int) -> float:
 
 
 def ljung_box(residuals: ArrayLike, lags: int = 20) -> tuple[float, float]:
-    """Whether residuals are white: Q = n (n + 2) sum of rho_k^2 / (n - k), chi-square with `lags` degrees of freedom.
+    """Ljung-Box test of whiteness: Q = n (n + 2) sum of rho_k^2 / (n - k), chi-square with `lags` degrees of freedom.
 
     Parameters
     ----------
     residuals : array_like, shape (n,)
-        NaN where a sample is missing; those are left out.
+        NaN where a sample is missing; such samples are left out.
     lags : int
 
     Returns
@@ -147,19 +147,19 @@ def ljung_box(residuals: ArrayLike, lags: int = 20) -> tuple[float, float]:
 
 
 def cross_correlation(residuals: ArrayLike, command: ArrayLike, lags: int = 20) -> tuple[float, int]:
-    """How much of an input is left in the residuals: the largest correlation over the lags 0 to `lags`, and its lag.
+    """Largest correlation of residuals with an earlier input, over the lags 0 to `lags`, and its lag.
 
     Parameters
     ----------
     residuals, command : array_like, shape (n,)
     lags : int
-        Of the input, in samples.
+        Largest delay of the residuals behind the input, in samples.
 
     Returns
     -------
     (float, int)
-        In units of its own standard deviation if there is no relation, ``1 / sqrt(n)`` for white residuals: beyond
-        about 3 the model leaves out something that the input does.
+        The correlation over its standard deviation without a relation, ``1 / sqrt(n)`` for white residuals, and its
+        lag: beyond about 3 the model lacks an effect of the input.
 
     Examples
     --------

@@ -32,7 +32,7 @@ def test_the_parameter_and_the_log_that_disagree_are_named() -> None:
     assert "compare_logs shows whether the logs are of one drive" in joint.status.message
     found = compare_logs(DRIVE, logs, FREE)
     assert not found.agree
-    assert found.reason.startswith("friction.coulomb is 36")
+    assert found.reason.startswith("the logs disagree in friction.coulomb, by ")
     assert "in other alone, and 30" in found.reason
     deviation = found.table["deviation"].abs()
     assert deviation["friction.coulomb"]["other"] > 20

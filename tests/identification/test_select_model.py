@@ -62,12 +62,12 @@ def test_the_model_that_made_the_log_is_recommended(truth: str, values: dict[str
     assert columns["deviance"][truth] == pytest.approx(3000, rel=0.1)
 
 
-def test_what_is_left_out_is_refuted_in_numbers() -> None:
+def test_what_is_left_out_is_rejected_in_numbers() -> None:
     found = chosen(STATIC["stribeck"])
     columns = found.table.to_dict()
     assert columns["contains"]["stribeck"] == "coulomb"
     assert columns["p_value"]["stribeck"] < 1e-6
-    assert "coulomb, which it contains, is refuted" in found.reason
+    assert "the simpler coulomb is rejected" in found.reason
     assert columns["deviance"]["coulomb"] > 2 * columns["deviance"]["stribeck"]
 
 
