@@ -83,6 +83,8 @@ class LimitMonitor:
 
     def advance(self, run: Integration, t: float) -> Array:
         """Advance the run to t, with a check every `LIMIT_CHECK_PERIOD` on the way."""
+        if not self._limited:
+            return run.advance(t)
         if len(self._contacts) < len(self._limited):
             begin = self._t
             for k in range(1, math.ceil((t - begin) / LIMIT_CHECK_PERIOD)):
@@ -94,8 +96,8 @@ class LimitMonitor:
     def observe(self, t: float, x: Array) -> None:
         """Note each limit that was crossed since the last call."""
         before, values = self._values, x[self._indices]
-        room = self._sides * (self._limits - before)
-        for k in np.flatnonzero((room > 0) & (self._sides * (self._limits - values) <= 0)):
+        crossed = (self._sides * (self._limits - before) > 0) & (self._sides * (self._limits - values) <= 0)
+        for k in np.flatnonzero(crossed) if crossed.any() else ():
             part = (self._limits[k] - before[k]) / (values[k] - before[k])
             at, rate = self._t + part * (t - self._t), (values[k] - before[k]) / (t - self._t)
             found = Contact(float(at), float(self._limits[k]), float(rate), self._states[k], self._limited[k])

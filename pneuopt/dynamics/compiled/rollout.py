@@ -328,7 +328,7 @@ def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
 
     def call_machine_code(*inputs: ArrayLike) -> tuple[Array, ...]:
         for i, (buffer, value) in enumerate(zip(buffers, inputs, strict=True)):
-            size = value.size if isinstance(value, np.ndarray) else np.size(value)
+            size = value.size if isinstance(value, np.ndarray) else 1 if isinstance(value, float) else np.size(value)
             if size != buffer.size:
                 raise ModelError(f"argument {i} has {size} numbers, expected {buffer.size}")
             buffer[...] = value
