@@ -217,13 +217,21 @@ def shaken(size: float, seed: int = 0) -> Transcription:
 
 
 def ahead(stiffness: float, damping: float, x: Array, u: Array, steps: int = 2) -> Array:
-    """The state after the last sample: RK4 as a matrix."""
+    """The state after the last sample."""
+    return march(stiffness, damping, x, u, steps)[-1]
+
+
+def march(stiffness: float, damping: float, x: Array, u: Array, steps: int = 2) -> list[Array]:
+    """The state before each sample and after the last: RK4 as a matrix."""
     A, h = np.array([[0, 1], [-stiffness, -damping]]), H / steps
     powers = np.array([np.linalg.matrix_power(h * A, i) / math.factorial(i) for i in range(5)])
     M, b = powers.sum(axis=0), h * sum(p[:, 1] / (i + 1) for i, p in enumerate(powers[:4]))
-    for force in np.repeat(u, steps):
-        x = M @ x + b * force
-    return x
+    states = [x]
+    for force in u:
+        for _ in range(steps):
+            x = M @ x + b * force
+        states.append(x)
+    return states
 
 
 def all_residuals(problem: Transcription, fit: Fit, unknowns: Array) -> Array:
@@ -234,9 +242,7 @@ def all_residuals(problem: Transcription, fit: Fit, unknowns: Array) -> Array:
         nodes = unknowns[at : at + 2 * len(phase.nodes)].reshape(-1, 2)
         force, at = phase.inputs[:, 0] + unknowns[2 + i], at + nodes.size
         for number, rows in enumerate(np.split(np.arange(phase.n), phase.nodes[1:])):
-            states = [
-                ahead(unknowns[0], unknowns[1], nodes[number], force[rows[:k]], steps) for k in range(len(rows) + 1)
-            ]
+            states = march(unknowns[0], unknowns[1], nodes[number], force[rows], steps)
             pieces.append((np.array(states)[:-1, 0] - residual.measured[rows, 0]) / residual.noise[0])
             if rows[-1] < phase.n - 1:
                 pieces.append((states[-1] - nodes[number + 1]) / sigma)

@@ -165,7 +165,7 @@ def on_corners(limits: list[Requirement], method: Condensed | None = None) -> Tu
     scenarios = corners(given, spreads)
     return tune(
         loop,
-        Step(0.1, horizon=0.4),
+        Step(0.1, horizon=0.3),
         given,
         minimise=SettlingTime(),
         subject_to=limits,

@@ -44,13 +44,13 @@ from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 FAST = Screening(members=10, generations=4, bands=(0.1,), refinements=50)
-STEP, SETTLING = Step(1.0, horizon=1.5), SettlingTime()
+STEP, SETTLING = Step(1.0, horizon=1.0), SettlingTime()
 TUBE = ((0.0, -0.1, 1.1), (0.3, 0.8, 1.05), (0.8, 0.97, 1.03))
 FREE = {"pid.Kp": (0.02, 1.0), "pid.Ki": (0.1, 20.0)}
 
 
 def speed_loop() -> tuple[ClosedLoop, ParameterSet]:
-    loop = ClosedLoop(SecondOrder().system(), PID(sample_time=2e-3))
+    loop = ClosedLoop(SecondOrder().system(), PID(sample_time=5e-3))
     return loop, loop.parameters.with_values({"pid.Kp": 0.1, "pid.Ki": 1.0}).with_bounds(FREE).freed(*FREE)
 
 
@@ -75,7 +75,7 @@ def column(table: pd.DataFrame, case: str = "0 to 1") -> dict[str, float]:
         StepEnvelope(TUBE),
         ControlRate(6.0),
         MaxComplementarySensitivity(1.01),
-        GainMargin(60.0),
+        GainMargin(45.0),
         PhaseMargin(66.0),
         NoiseGain(1.05),
     ],
@@ -102,7 +102,7 @@ def test_a_limit_changes_the_answer() -> None:
 def test_what_cannot_be_kept_is_said_as_it_was_asked() -> None:
     found = tuned(PhaseMargin(179.0))
     assert found.status.code is Code.INFEASIBLE
-    assert "(179 asked); this would do: PhaseMargin relaxed to 9" in found.status.message
+    assert "(179 asked); this would do: PhaseMargin relaxed to 8" in found.status.message
 
 
 @pytest.mark.parametrize("kind", [IAE, ISE, ITAE, GainMargin, PhaseMargin, NoiseGain, MaxComplementarySensitivity])
@@ -174,7 +174,7 @@ def test_margins_hold_on_every_scenarios_plant() -> None:
 
 def least_peak(time_constant: float, overshoot: float, settled: float) -> float:
     """Of a lag of gain one under PI control, by stepping its exact discretisation over a fine grid of both gains."""
-    Kp, Ki = (g.ravel() for g in np.meshgrid(np.linspace(0.5, 3.0, 101), np.linspace(5.0, 30.0, 101)))
+    Kp, Ki = (g.ravel() for g in np.meshgrid(np.linspace(0.5, 3.0, 51), np.linspace(5.0, 30.0, 51)))
     h, n, A = 1e-3, 500, np.zeros((len(Kp), 3, 3))
     A[:, 0] = np.stack([-(1 + Kp), Ki, Kp], axis=1) / time_constant
     A[:, 1] = [-1.0, 0.0, 1.0]
