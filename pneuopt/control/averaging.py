@@ -1,4 +1,4 @@
-"""`average_dither`: what a fast dither makes of a plant, without the dither's own oscillation.
+"""`average_dither`: the mean motion of a plant under a fast dither, without the dither's own oscillation.
 
 Every state swings about its mean, ``x = m + X(theta)``; the means obey ``dm/dt = mean over theta of f(m + X, u + A sin
 theta)``, or with a triangle in place of the sine. That smooths at once what the spool's ripple does to the openings and

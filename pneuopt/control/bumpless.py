@@ -1,4 +1,4 @@
-"""Bumpless change of gains: the integral with which new gains take over where the old ones are."""
+"""`bumpless_transfer`: new gains on a running loop, its integral set so that the command does not jump."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Dither: a fast small oscillation added to the command, so that spool and piston do not stick."""
+"""Dither: a fast small oscillation added to the command, so that moving parts do not stick."""
 
 from dataclasses import dataclass
 from enum import Enum

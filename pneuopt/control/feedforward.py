@@ -10,7 +10,7 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import unit_ratio
 
-MIN_FEEDFORWARD_TIME = 1e-6  # [s]
+MIN_FEEDFORWARD_TIME = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast leads are refused
 
 
 @dataclass(frozen=True)

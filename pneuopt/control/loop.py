@@ -152,7 +152,9 @@ class ClosedLoop:
         """
         h = self.pid.sample_time
         require(
-            h is None, f"a loop sampled every {h} s is no ODE; use discrete(), or held() between samples", ModelError
+            h is None,
+            f"a loop sampled every {h} s is no ODE; use discrete(), or hold_system() between samples",
+            ModelError,
         )
         return define(self.states, self.inputs, self.outputs, self.parameters, self._continuous_rhs)
 

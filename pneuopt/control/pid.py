@@ -34,7 +34,7 @@ class PID:
 
     With a dead band, what is integrated is ``e - min(max(e, -dead_band), dead_band)`` instead of e = r - y: nothing
     while |e| < dead_band, and beyond it what exceeds it, so that nothing jumps at its edge. That is against windup by
-    stiction: a piston that sticks within the band is left there, instead of being pushed off by a growing integral,
+    stiction: a mass that sticks within the band is left there, instead of being pushed off by a growing integral,
     over and over. Back-calculation goes on inside the band: a clipped command still unwinds the integral.
 
     Parameters
@@ -146,7 +146,7 @@ class PID:
             require(Tt > 0 and Tt >= least, f"pid.Tt = {Tt:g} s: {told}")
 
     def states(self, measured: Quantity, command: Quantity) -> tuple[Quantity, ...]:
-        """What the controller remembers: integral and filter, or with sampling also what it holds, and has computed."""
+        """The controller's states: integral and filter; sampled, also the held command and, delayed, the next one."""
         integral = Quantity("integral", command.unit, command.nominal)
         if self.sample_time is None:
             return integral, Quantity("filter", measured.unit, measured.nominal)
@@ -160,7 +160,7 @@ class PID:
         )
 
     def start(self, r: float, y: float, command: float, p: Mapping[str, float]) -> list[float]:
-        """The states with which it takes over a command without a bump.
+        """The states with which the controller goes on from a command without a bump.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What stands between the measured signal and the controller."""
+"""`SensorLag` and `Encoder`: sensors through which the controller sees the measured signal."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,12 +12,12 @@ from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.units import unit_ratio
 
-MIN_SENSOR_LAG = 1e-6  # [s]
+MIN_SENSOR_LAG = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast sensors are refused
 
 
 @dataclass(frozen=True)
 class SensedSignal:
-    """What a sensor is put on.
+    """The signal that a sensor reads, and the controller's sample time.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How a plant and its controller are put together: which signals meet, and whether they can."""
+"""The connection of a plant and its controller: which signals are joined, and checks that they can be."""
 
 from collections.abc import Mapping, Sequence
 from math import inf

@@ -285,7 +285,7 @@ def test_a_continuous_derivative_needs_its_filter(second_order: System) -> None:
 
 
 def test_sampled_and_continuous_loops_are_asked_the_right_thing(second_order: System) -> None:
-    with pytest.raises(ModelError, match=r"use discrete\(\), or held\(\)"):
+    with pytest.raises(ModelError, match=r"use discrete\(\), or hold_system\(\)"):
         ClosedLoop(second_order, PID(sample_time=1e-3)).system()
     with pytest.raises(ModelError, match=r"use system\(\)"):
         ClosedLoop(second_order, PID()).hold_system()
