@@ -12,11 +12,15 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, c
 
 from pneuopt.quantities.arrays import Array, Indices, Mask
 
-RANK_TOLERANCE = 1e-12  # of the eigenvalues of a matrix of unit diagonal
-SCHUR_ROUNDING = 1e-14  # relative errors of a Schur complement, from long chains of tight gaps: 1 to 5e-16 measured
-STATE_REGULARISATION = (
-    1e-6  # on D's diagonal (scaled states): a state that no data reach stays put, the optimum does not move
-)
+# smallest eigenvalue [1] of a matrix of unit diagonal that counts: lower takes rounding for information, higher calls
+# separable parameters indistinguishable
+RANK_TOLERANCE = 1e-12
+# relative rounding error of a Schur complement from long chains of tight gaps (1 to 5e-16 measured): lower trusts lost
+# digits, higher gives up parameters that the data determine
+SCHUR_ROUNDING = 1e-14
+# added to D's diagonal (scaled states): a state that no data depend on stays in place, and the optimum does not move;
+# lower leaves D singular, higher slows the other states
+STATE_REGULARISATION = 1e-6
 
 
 class GaussNewtonStep(NamedTuple):
@@ -33,12 +37,12 @@ class ReducedEquations:
     Attributes
     ----------
     nodes : ndarray, shape (m, n)
-        The nodes' own step, with the parameters at rest: - D^-1 g_s.
+        The nodes' step with the parameters fixed: - D^-1 g_s.
     node_sensitivity : ndarray, shape (m, n, k)
-        D^-1 B: what the nodes do when the parameters move, with the opposite sign.
+        D^-1 B: the negative derivative of the nodes' step by the parameters' step.
     schur : ndarray, shape (k, k)
     gradient : ndarray, shape (k,)
-        Of the parameters, with the nodes following.
+        The gradient by the parameters, with the nodes following them.
     """
 
     nodes: Array
@@ -47,7 +51,7 @@ class ReducedEquations:
     gradient: Array
 
     def step(self, keep: Mask) -> GaussNewtonStep | None:
-        """Gauss-Newton step of the parameters that may move, shape (k,); None if those are not positive definite."""
+        """Gauss-Newton step with the parameters of mask `keep` free, shape (k,); None if not positive definite."""
         moved = np.zeros(len(keep))
         try:
             if keep.any():
@@ -84,7 +88,7 @@ class ArrowEquations:
     gradient: Array
 
     def eliminate(self, damping: float) -> ReducedEquations | None:
-        """Solve for the nodes, with Marquardt's multiplicative damping of the diagonal.
+        """Eliminate the nodes, with Marquardt's multiplicative damping of the diagonal.
 
         Parameters
         ----------
@@ -92,7 +96,7 @@ class ArrowEquations:
 
         Returns
         -------
-        Reduced or None
+        ReducedEquations or None
             None where the nodes' matrix is not positive definite.
         """
         m, n, k = self.border.shape
@@ -152,12 +156,12 @@ def indistinguishable_parameters(schur: Array, corner: Array) -> Indices:
     Parameters
     ----------
     schur, corner : ndarray, shape (k, k)
-        The corner's diagonal, of which the Schur complement is what is left, says how many digits that has.
+        The diagonal of the Schur complement over the corner's gives the number of digits that elimination left.
 
     Returns
     -------
     ndarray of int
-        Empty if each parameter counts; what takes the largest part, or has lost the most digits, comes last.
+        Empty if all are separable; the one with the largest part, or with the most digits lost, comes last.
     """
     if not schur.size:
         return np.arange(0)
@@ -170,12 +174,12 @@ def indistinguishable_parameters(schur: Array, corner: Array) -> Indices:
         return np.arange(0)
     weakest = np.abs(vectors[:, 0])
     members = np.flatnonzero(weakest > 0.1 * weakest.max())
-    blame = weakest.round(6) if values[0] <= RANK_TOLERANCE else 1 / left
-    return members[np.argsort(blame[members], kind="stable")]
+    severity = weakest.round(6) if values[0] <= RANK_TOLERANCE else 1 / left
+    return members[np.argsort(severity[members], kind="stable")]
 
 
 def _unit_diagonal(matrix: Array) -> tuple[Array, Array]:
-    """The matrix scaled so that units do not decide its rank, and the scales."""
+    """The matrix scaled to unit diagonal, so that units do not decide its rank, and the scales."""
     with np.errstate(over="ignore", invalid="ignore"):
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         return np.asarray(matrix * np.outer(scale, scale)), scale

@@ -1,4 +1,4 @@
-"""The convergence test of a lifted least squares, and which parameter its data do not determine."""
+"""The convergence test of a lifted least squares, and the parameters that its data do not determine."""
 
 import math
 from typing import NamedTuple
@@ -11,15 +11,16 @@ from pneuopt.shooting.arrow import ReducedEquations, positive_definite_inverse
 from pneuopt.shooting.equations import NormalEquations, describe_misfit
 from pneuopt.shooting.scaling import UNIDENTIFIABLE_PRIOR_RATIO, ParameterScaling
 
-MAX_GAP_SHARE = 0.05  # of the cost: the gaps' residuals above it mean that they take up what the model cannot
-MAX_CHI_SQUARE_RATIO = (
-    1.2  # squared residuals a sample, in noise variances, up to which a fit is as good as the noise allows
-)
+# share of the cost [1] that the gaps may carry: above it they absorb the misfit of a model; lower refuses good fits
+MAX_GAP_SHARE = 0.05
+# squared residuals a sample, in noise variances [1], up to which a fit explains the log to its noise: lower takes
+# chance for misfit, higher passes a wrong model
+MAX_CHI_SQUARE_RATIO = 1.2
 NO_POSITIONS = np.zeros(0, dtype=np.intp)
 
 
 class ConvergenceTest(NamedTuple):
-    """How a search stands, and the positions of free parameters that its data do not determine there."""
+    """The status of an iterate, and the positions of free parameters that the data do not determine there."""
 
     status: Status
     unidentifiable: Indices = NO_POSITIONS
@@ -37,21 +38,21 @@ def assess_convergence(
     z : ndarray, shape (k,)
         The free parameters as searched.
     tolerance : float
-        Of the step, in standard deviations.
+        Largest step of a converged iterate, in standard deviations.
     message : str
-        How a success describes the search.
+        The first sentence of a converged status.
     noisy_gaps : bool
-        The gaps stand for noise of the states.
+        Whether the gaps stand for noise of the states.
 
     Returns
     -------
     ConvergenceTest
     """
     names = np.array(equations.segments.transcription.parameters.free_names, dtype=object)
-    nothing = np.diag(equations.arrow.corner) == 0  # even at a bound
-    idle = ~space.held & ~space.has_effect(equations) & (nothing | ~space.at_bound(z))
+    no_sensitivity = np.diag(equations.arrow.corner) == 0  # even at a bound
+    idle = ~space.held & ~space.has_effect(equations) & (no_sensitivity | ~space.at_bound(z))
     if idle.any():
-        sentences = f"the data do not feel {' and '.join(names[idle])}", "fix it, or log a run that does"
+        sentences = f"the data do not depend on {' and '.join(names[idle])}", "fix it, or log a run that does"
         return ConvergenceTest(Status(Code.NOT_CONVERGED, sentences), np.flatnonzero(idle))
     reduced = equations.arrow.eliminate(0.0)
     if reduced is None:
@@ -65,8 +66,8 @@ def assess_convergence(
     if alike.size or solved is None:
         verdict = f"the data do not determine {' and '.join(names[np.sort(alike)])}"
         status = Status(Code.NOT_CONVERGED, (verdict, "fix one, or log a run that separates them"))
-        blind = _least_sensitive(own, space, reduced, noise)
-        return ConvergenceTest(status, blind if blind.size else alike[-1:])
+        weakest = _least_sensitive(own, space, reduced, noise)
+        return ConvergenceTest(status, weakest if weakest.size else alike[-1:])
     spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
     step = np.abs(solved.parameters[keep]) / spread
     if np.max(step, initial=0.0) > tolerance * noise:
@@ -75,14 +76,14 @@ def assess_convergence(
         remedy = "try more iterations, other start values, or fix a parameter"
         status = Status(Code.NOT_CONVERGED, (verdict, remedy))
         return ConvergenceTest(status, _least_certain(own, noise * spread, space))
-    pressed = np.flatnonzero(space.at_bound(z) & ~space.held)
+    bounded = np.flatnonzero(space.at_bound(z) & ~space.held)
     return ConvergenceTest(
-        _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(pressed, space, reduced, noise)
+        _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(bounded, space, reduced, noise)
     )
 
 
 def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: bool) -> Status:
-    """The status of an optimum: converged, unless its gaps take up what the model cannot."""
+    """The status of an optimum: converged, unless its gaps absorb the misfit of the model."""
     gap, misfit = equations.largest_gap, 2 * equations.cost / max(1, equations.count)
     if equations.gap_share > MAX_GAP_SHARE and not (noisy_gaps and misfit <= MAX_CHI_SQUARE_RATIO):
         verdict = f"the gaps between segments carry {equations.gap_share:.0%} of the cost"
@@ -94,12 +95,12 @@ def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: boo
 
 
 def _least_sensitive(positions: Indices, space: ParameterScaling, reduced: ReducedEquations, noise: float) -> Indices:
-    """Of these the one that the data hardly feel, were even the others known."""
+    """The position of the parameter with the least effect on the data, the others known; none if a prior is vaguer."""
     return _least_certain(positions, noise / np.sqrt(np.maximum(np.diag(reduced.schur)[positions], 1e-300)), space)
 
 
 def _least_certain(positions: Indices, spread: Array, space: ParameterScaling) -> Indices:
-    """Of these the one that is known least, if a weak prior about its start would know it better."""
+    """The position of the least certain parameter, if a weak prior about its start would be more certain; or none."""
     share = spread / space.weak_prior(space.start)[positions]
     if not share.size or not share.max() > UNIDENTIFIABLE_PRIOR_RATIO:
         return NO_POSITIONS

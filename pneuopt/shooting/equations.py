@@ -16,12 +16,14 @@ from pneuopt.shooting.arrow import (
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
 
-FLAT_PRIOR_WIDTH = 1e3  # standard deviations of the data, were all else known
+# width of a flat prior, in standard deviations by the data with all else known: lower lets the prior narrow intervals,
+# higher loses digits
+FLAT_PRIOR_WIDTH = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentLinearisation:
-    """Data and gaps at an iterate with their derivatives, before anything says how much a gap weighs.
+    """Data and gaps at an iterate with their derivatives, before the gaps are weighed.
 
     Attributes
     ----------
@@ -36,7 +38,7 @@ class SegmentLinearisation:
         The outputs, without the correction.
     x_end : ndarray, shape (m, n)
         Where each segment ends, likewise.
-    gaps, off : ndarray, shape (m, n)
+    gaps, start_errors : ndarray, shape (m, n)
         Gap behind each segment, zero where nothing follows; distance from a known start; in nominal sizes.
     chain : ndarray, shape (k,)
         d(parameter)/d(searched parameter).
@@ -59,9 +61,9 @@ class NormalEquations:
     Attributes
     ----------
     segments : Segments
-    linearisation : Slopes
-    arrow : Arrow
-        Of data and gaps together.
+    linearisation : SegmentLinearisation
+    arrow : ArrowEquations
+        The equations of data and gaps together.
     chi_square, cost : float
         Squared data residuals; half the sum of all squares.
     """
@@ -79,12 +81,12 @@ class NormalEquations:
 
     @property
     def largest_gap(self) -> float:
-        """In nominal sizes."""
+        """The largest gap, in nominal sizes."""
         return float(np.max(np.abs(self.gaps), initial=0.0))
 
     @property
     def gap_share(self) -> float:
-        """Part of the cost that the gaps carry, 0 to 1."""
+        """The share of the cost that the gaps carry, 0 to 1."""
         return 1 - self.chi_square / (2 * self.cost) if 0 < self.cost < math.inf else 0.0
 
     @property
@@ -126,7 +128,7 @@ class NormalEquations:
         ----------
         keep, held : ndarray of bool, shape (k,)
         prior : ndarray, shape (k,)
-            Standard deviation, as searched; infinite: a thousand times that of the data, were all else known.
+            Standard deviation, as searched; an infinite one counts as `FLAT_PRIOR_WIDTH`.
 
         Returns
         -------
@@ -178,16 +180,16 @@ def normal_equations(
     sigma : ndarray, shape (n,)
         Standard deviation of a gap, in nominal sizes.
     substeps : int
-    correction : Correction, optional
-        What finer steps add to the outputs and ends.
+    correction : IntegrationCorrection, optional
+        The change of outputs and ends by finer steps.
     """
     run = segments.gram(nodes, q, substeps, correction)
     scale = np.concatenate([segments.nominal, np.ones(run.grams.shape[1] - nodes.shape[1])])
     ends = run.dx_end * (scale[:-1] / segments.nominal[:, None])
-    off = np.where(np.isfinite(segments.fixed_start), nodes - segments.fixed_start, 0.0) / segments.nominal
+    start_errors = np.where(np.isfinite(segments.fixed_start), nodes - segments.fixed_start, 0.0) / segments.nominal
     gaps = segment_gaps(segments, nodes, run.x_end if correction is None else run.x_end + correction.x_end)
     slopes = SegmentLinearisation(
-        run.grams * np.outer(scale, scale), run.squares, ends, run.y, run.x_end, gaps, off, chain
+        run.grams * np.outer(scale, scale), run.squares, ends, run.y, run.x_end, gaps, start_errors, chain
     )
     return weigh_gaps(segments, slopes, sigma)
 
@@ -214,7 +216,7 @@ def second_order_correction(equations: NormalEquations, step: Array, moved: Arra
 
     Parameters
     ----------
-    equations : Equations
+    equations : NormalEquations
         Where the step (nodes `step`, shape (m, n) in nominal sizes; parameters `moved`, shape (k,)) was computed.
     step, moved : ndarray
     nodes, gaps : ndarray, shape (m, n)
@@ -237,7 +239,7 @@ def second_order_correction(equations: NormalEquations, step: Array, moved: Arra
 
 
 def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: bool) -> tuple[str, ...]:
-    """Sentences on what the model leaves beyond `level` (squared residuals, in noise variances); none if nothing.
+    """Sentences on residuals beyond `level` (mean squares, in noise variances); none if there are none.
 
     With `noisy_gaps` the gaps stand for noise of the states.
     """

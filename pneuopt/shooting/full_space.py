@@ -32,11 +32,14 @@ from pneuopt.shooting.graph import (
 from pneuopt.shooting.solution import Solution
 from pneuopt.shooting.transcription import Transcription
 
-MAX_EXPANDED_OPERATIONS = 200_000  # scalar operations up to which flattening the whole graph to scalars pays
-WARM_START_BARRIER = (
-    1e-5  # barrier and distances from bounds with which a solution's neighbour is begun: 9 iterations where 18 were
-)
-MAX_EXTRAPOLATION = 1.5  # of a path's last step, how far its direction is trusted
+# scalar operations up to which the whole graph is flattened to scalars: higher takes long to flatten, lower evaluates
+# slowly
+MAX_EXPANDED_OPERATIONS = 200_000
+# barrier and distances from bounds [1] with which a solution's neighbour starts, in 9 iterations instead of 18: higher
+# forgets the solution, lower starts on the bounds
+WARM_START_BARRIER = 1e-5
+# extrapolation along a path, in its last steps [1]: higher overshoots where the path bends, lower takes more iterations
+MAX_EXTRAPOLATION = 1.5
 _PUSH_OPTIONS = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 
 
@@ -72,7 +75,7 @@ class FullSpace:
 
 @dataclass(frozen=True, eq=False)
 class FullSpaceProblem:
-    """A graph and the solver made from it; another that starts from a neighbour's solution, where it was asked for."""
+    """A graph, its solver, and on request a second solver that starts from a neighbour's solution."""
 
     graph: Graph
     solver: ca.Function
@@ -100,7 +103,7 @@ def solve_full_space(transcription: Transcription, method: FullSpace | None = No
 def prepare_full_space(
     transcription: Transcription, method: FullSpace | None = None, *, warm_start: bool = False
 ) -> FullSpaceProblem:
-    """Flatten a problem and differentiate it, once for any number of starts; `follows`: for `follow_path`, too."""
+    """Flatten and differentiate a problem once for any number of starts; with `warm_start` for `follow_path`, too."""
     graph, method = flatten(transcription), method or FullSpace()
     cold = _ipopt_solver(graph, method, {"mu_init": method.first_barrier})
     pushes = {f"warm_start_{n}": WARM_START_BARRIER for n in _PUSH_OPTIONS}
@@ -133,7 +136,7 @@ def solve_from(problem: FullSpaceProblem, start: ParameterSet, guesses: Sequence
 
     Parameters
     ----------
-    problem : Problem
+    problem : FullSpaceProblem
     start : ParameterSet
         Names as in the problem; the values may differ, those of the fixed ones too.
     guesses : sequence of ndarray, shape (n, n_states), optional
@@ -160,10 +163,10 @@ def follow_path(problem: FullSpaceProblem, start: ParameterSet, path: Sequence[M
 
     Parameters
     ----------
-    problem : Problem
-        Of ``prepare(..., follows=True)``.
+    problem : FullSpaceProblem
+        One made by ``prepare_full_space(..., warm_start=True)``.
     start : ParameterSet
-        From which the first of them is solved; names as in the problem.
+        Parameters that start the first problem; names as in the problem.
     path : sequence of mapping of str to float
         Values of fixed parameters.
 
@@ -173,7 +176,7 @@ def follow_path(problem: FullSpaceProblem, start: ParameterSet, path: Sequence[M
         One a step; a step that fails starts the next one from the last that did not.
     """
     if problem.warm_solver is None:
-        raise ModelError("the problem was not prepared to be followed: prepare(..., follows=True)")
+        raise ModelError("the problem has no warm-start solver: prepare_full_space(..., warm_start=True)")
     transcription, warm = problem.graph.transcription, replace(problem, solver=problem.warm_solver)
     (low, up), found, done = variable_bounds(transcription), list[Solution](), list[tuple[Array, dict[str, Array]]]()
     for step in path:
@@ -191,7 +194,7 @@ def follow_path(problem: FullSpaceProblem, start: ParameterSet, path: Sequence[M
 
 
 def _extrapolate(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) -> Array:
-    """The unknowns at q from up to two solutions: the last one, carried on as far as q is along their difference."""
+    """The unknowns at q, extrapolated from the last two solutions along the difference of their parameters."""
     (before, x), (last, y) = ((known, raw["x"]) for known, raw in (done[0], done[-1]))
     step = last - before
     length = float(step @ step)
@@ -202,7 +205,7 @@ def _extrapolate(done: Sequence[tuple[Array, Mapping[str, Array]]], q: Array) ->
 def _run_solver(
     problem: FullSpaceProblem, w: Array, q: Array, multipliers: Mapping[str, Array] | None = None
 ) -> tuple[Solution, dict[str, Array]]:
-    """The solution, and what the solver returned."""
+    """Run the solver: the solution, and the solver's raw output."""
     begun, (low, up) = time.perf_counter(), variable_bounds(problem.graph.transcription)
     low_g, up_g = (
         np.concatenate([np.zeros(0), *(getattr(r, s) for r in problem.graph.constraint_rows)])
@@ -223,12 +226,12 @@ def _run_solver(
 
 
 def _operation_count(transcription: Transcription) -> int:
-    """About how many scalar operations one evaluation takes."""
+    """Estimated scalar operations of one evaluation."""
     samples = sum(phase.n for phase in transcription.phases)
     return int(samples * transcription.system.substeps * transcription.system.step.n_instructions())
 
 
-# What the solver found, in words.
+# The solver's outcome as a status.
 
 
 def _solver_status(
@@ -248,7 +251,7 @@ def _solver_status(
         return Status(Code.DIVERGED, (taken, fault, "bound the parameters or refine the integration"))
     if ended == "User_Requested_Stop":
         return Status(Code.INTERRUPTED, (taken,))
-    return Status(Code.NOT_CONVERGED, (f"IPOPT says {ended} {taken}", worst, "rescale or start elsewhere"))
+    return Status(Code.NOT_CONVERGED, (f"IPOPT ended with {ended} {taken}", worst, "rescale or start elsewhere"))
 
 
 def _row_violation(rows: ConstraintRows, g: Array) -> Array:
@@ -266,7 +269,7 @@ def _largest_violation(problem: FullSpaceProblem, g: Array, continuity: bool) ->
 
 
 def _describe_worst_row(problem: FullSpaceProblem, g: Array) -> str:
-    """The piece that is violated most, relative to the size of its bound."""
+    """A sentence on the constraint that is violated most, relative to the size of its bound."""
     table = [r for r in problem.graph.constraint_rows if r.rows.stop > r.rows.start]
     if not table:
         return "there are no limits"
@@ -296,7 +299,7 @@ def _row_title(problem: FullSpaceProblem, rows: ConstraintRows, k: int) -> str:
 
 
 def _find_nan(problem: FullSpaceProblem, w: Array, q: Array) -> str:
-    """Name the equation that is not a number; empty if all are finite."""
+    """A sentence on the first equation that is not a number; empty if all are finite."""
     f, g = (np.array(v).ravel() for v in problem.graph.evaluate(w, q))
     for name, value in zip(problem.graph.term_names, f, strict=False):
         if not math.isfinite(value):
@@ -310,7 +313,7 @@ def _find_nan(problem: FullSpaceProblem, w: Array, q: Array) -> str:
 
 
 def _multipliers(problem: FullSpaceProblem, found: Mapping[str, Array], low: Array, up: Array) -> dict[str, float]:
-    """Of what is active: its multiplier exceeds its slack."""
+    """Multipliers of active limits and bounds: those that exceed their slack."""
     transcription, active = problem.graph.transcription, dict[str, float]()
 
     def keep_active(name: str, multiplier: Array, slack: Array, unit: float = 1.0) -> None:

@@ -1,4 +1,4 @@
-"""A `Transcription` as one graph in MX, for solvers that take all of it: unknowns, objective, constraints.
+"""A `Transcription` as one MX graph of unknowns, objective and constraints, for full-space solvers.
 
 The unknowns are the free parameters, in units of their range or as logarithms, and the states at the nodes, in units
 of their nominal size.
@@ -20,7 +20,8 @@ from pneuopt.quantities.parameters import Parameter
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, phases_of
 
 ArrayOrMX = TypeVar("ArrayOrMX", NDArray[np.float64], ca.MX)
-MAX_EXPANDED_STEPS = 400  # integration steps up to which a segment is flattened to scalars, which evaluate faster
+# integration steps up to which a segment is flattened to scalars, which evaluate faster: higher takes long to flatten
+MAX_EXPANDED_STEPS = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +43,15 @@ class Graph:
     Attributes
     ----------
     transcription : Transcription
-    w, q, parts, g : casadi.MX
+    w, q, terms, g : casadi.MX
         Unknowns, given parameter values, pieces of the objective, constraints.
     evaluate : casadi.Function
-        ``(w, q) -> (parts, g)``.
+        ``(w, q) -> (terms, g)``.
     rollouts : tuple of casadi.Function
         ``(w, q) -> (t, states, outputs)`` at the samples, one a phase.
-    constraint_rows : tuple of Rows
+    constraint_rows : tuple of ConstraintRows
     term_names : tuple of str
-        What each of the parts is.
+        The name of each term.
     """
 
     transcription: Transcription
@@ -100,7 +101,7 @@ def flatten(transcription: Transcription) -> Graph:
 
 
 def parameter_scale(parameter: Parameter) -> float:
-    """The unit in which the solver counts a parameter: its range, or its size."""
+    """The unit in which the solver measures a parameter: its range, or its size."""
     span = parameter.upper - parameter.lower
     return span if 0 < span < math.inf else abs(parameter.value) or 1.0
 
@@ -114,7 +115,7 @@ def _physical_values(transcription: Transcription, given: ca.MX, theta: ca.MX) -
 
 
 def to_unknowns(transcription: Transcription, q: Array) -> Array:
-    """The free parameters as the solver sees them."""
+    """The free parameters in the solver's units."""
     parameters = list(transcription.parameters.values())
     return np.array([_to_unknown(parameters[i], q[i]) for i in transcription.free])
 

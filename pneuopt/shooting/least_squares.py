@@ -24,31 +24,38 @@ from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scale
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
-INITIAL_DAMPING = 1e-3  # with loose gaps
-MIN_GAIN_RATIO = 0.5  # of the promised decrease, below which a step is corrected
-STAGE_COST_TOLERANCE = 1e-3  # a stage ends where the promised decrease is this part of the cost
-FINAL_COST_TOLERANCE = 5e-7  # likewise the last, in noise variances: half of (0.1 % of a standard deviation)^2
-MIN_DAMPING = 1e-15  # relative to the diagonal, in which the gaps weigh up to 1e14
-MAX_STEP_HALVINGS = 3  # halvings of the integration steps, at most, in search of an answer that does not depend on them
-STALL_COST_DECREASE = 2e-3  # of the cost an iteration, below which a search that goes on gets nowhere
-GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments take up what the model cannot",))
-STIFFNESS_UPDATE_CHANGE = 0.03  # a parameter's relative change that has the stiffness judged anew
-MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample beyond which a search would take hours
-MAX_STAGE_REFINEMENT = 8  # how far a stage may refine the start's integration steps
+# Marquardt's damping over the diagonal [1] with loose gaps: lower takes wild first steps, higher small ones
+INITIAL_DAMPING = 1e-3
+# actual over promised decrease [1] below which a step is corrected: higher costs evaluations, lower crawls in valleys
+MIN_GAIN_RATIO = 0.5
+# promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
+STAGE_COST_TOLERANCE = 1e-3
+# promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
+FINAL_COST_TOLERANCE = 5e-7
+# least damping over the diagonal [1], in which the gaps weigh up to 1e14: higher slows parameters, lower is rounding
+MIN_DAMPING = 1e-15
+MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
+# relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
+STALL_COST_DECREASE = 2e-3
+GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
+# relative change of a parameter [1] after which the stiffness is computed anew: higher risks unstable steps
+STIFFNESS_UPDATE_CHANGE = 0.03
+MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample: a search with more would take hours, fewer refuse stiff models
+MAX_STAGE_REFINEMENT = 8  # factor on the start's integration steps in a stage: higher takes long, lower may be unstable
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One tightness of the gaps.
+    """A stage of the search: how tight the gaps are, and how long it runs.
 
     Parameters
     ----------
     gap : float
         Standard deviation of a gap, as a fraction of the state's nominal size.
     iterations : int
-        At most.
+        Largest number of iterations.
     refine : int
-        Integration steps on which the answer stands, as a multiple of the search's.
+        Integration steps of the answer, as a multiple of the search's.
     """
 
     gap: float
@@ -58,7 +65,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """How to solve by lifted least squares.
+    """Lifted least squares by Levenberg-Marquardt: a method and its options.
 
     Parameters
     ----------
@@ -70,7 +77,7 @@ class LeastSquares:
         Integration steps a sample; default: from the stiffness at the start of each stage, h |lambda| <= 2 a step;
         the last stage adds what finer steps change, halved until that moves no estimate.
     tolerance : float
-        Of the last undamped parameter step, in the parameter's standard deviations.
+        Largest last undamped step of a parameter, in its standard deviations.
     kinematic : float
         States whose rate holds no free parameter keep their gaps this much smaller.
     progress : callable, optional
@@ -111,7 +118,7 @@ def solve_least_squares(transcription: Transcription, method: LeastSquares | Non
 
 @dataclass(frozen=True, eq=False)
 class _Iterate:
-    """The unknowns (nodes in SI, z as searched), and what the equations say there."""
+    """The unknowns (nodes in SI, z as searched), and the equations linearised there."""
 
     nodes: Array
     z: Array
@@ -174,34 +181,34 @@ class _LevenbergMarquardt:
             self.has_stalled = self._run_stage()
             self.stage_ends.append(_StageEnd(self.current.nodes, self.current.z, self.current.cost))
         status = self._convergence_status(self.current)
-        # gaps that take up what the model cannot: the answer hangs on their weight
-        is_torn = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
-        return self._refine_steps(self._allow_state_noise(status) if is_torn else status)
+        # gaps that absorb the misfit of the model: the answer depends on their weight
+        gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
+        return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
 
     def _gaps_absorb_misfit(self) -> bool:
-        """Whether the gaps take up what the model cannot, in an optimum beyond the noise: tighter ones cost more."""
-        torn, equations = self.current.equations.gap_share > MAX_GAP_SHARE, self.current.equations
-        return self.has_stalled and torn and 2 * self.current.cost > MAX_CHI_SQUARE_RATIO * equations.count
+        """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""
+        absorbing, equations = self.current.equations.gap_share > MAX_GAP_SHARE, self.current.equations
+        return self.has_stalled and absorbing and 2 * self.current.cost > MAX_CHI_SQUARE_RATIO * equations.count
 
     def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
-        """Allow what a wrong model leaves as noise of its states: the tightest gaps with which all residuals agree."""
+        """Let the gaps stand for noise of the states of a wrong model: the tightest with which all residuals agree."""
         last = self.method.stages[-1]
         for stage, end in reversed(list(zip(self.method.stages[:-1], self.stage_ends, strict=False))):
             if 2 * end.cost <= MAX_CHI_SQUARE_RATIO * self.current.equations.count:
-                tight = self.stage, self.current, self.correction, self.substeps, self.output_substeps
+                snapshot = self.stage, self.current, self.correction, self.substeps, self.output_substeps
                 self.noisy_gaps = True
                 self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), end.nodes, end.z)
                 self._run_stage()
                 found = self._convergence_status(self.current)
                 if found.converged:
                     return found
-                self.stage, self.current, self.correction, self.substeps, self.output_substeps = tight
+                self.stage, self.current, self.correction, self.substeps, self.output_substeps = snapshot
                 self.noisy_gaps = False
                 break
         return status
 
     def _enter_stage(self, stage: Stage, nodes: Array, z: Array) -> None:
-        """Weigh the gaps as the stage does, with steps from the stiffness there, for the start may mislead."""
+        """Weigh the gaps as in a stage, with integration steps from the stiffness at these nodes."""
         steps, q = self.substeps, self.scaling.values(z)
         if not self.method.substeps and not np.allclose(q, self.stiffness_parameters, rtol=STIFFNESS_UPDATE_CHANGE):
             needed, self.stiffness_parameters = stable_substeps(self.segments, nodes, q, RK4_MAX_H_LAMBDA), q
@@ -217,9 +224,9 @@ class _LevenbergMarquardt:
             self._apply_finer_steps(stage.refine * steps)
 
     def _apply_finer_steps(self, steps: int) -> float:
-        """Let the current outputs and ends be those of finer steps; by how much that moves y, at most [deviations].
+        """Integrate the current outputs and ends by finer steps; return the largest change of y [standard deviations].
 
-        Derivatives need no finer steps but where residuals exceed the noise: their product with those then counts.
+        Derivatives need finer steps only where residuals exceed the noise, with which they are multiplied.
         """
         nodes, z, before = self.current.nodes, self.current.z, self._outputs()
         if self.noisy_gaps or 2 * self.current.cost > MAX_CHI_SQUARE_RATIO * self.current.equations.count:
@@ -234,12 +241,12 @@ class _LevenbergMarquardt:
         return self._largest_change(self._outputs() - before)
 
     def _outputs(self) -> Array:
-        """The model's outputs as the search sees them, shape (m, n, n_outputs)."""
+        """The model's outputs with the correction of finer steps, shape (m, n, n_outputs)."""
         y = self.current.equations.linearisation.y
         return y if self.correction is None else y + self.correction.y
 
     def _refine_steps(self, status: Status) -> Status:
-        """Halve the integration steps until that moves no estimate; steps that were given stay."""
+        """Halve the integration steps until no estimate moves; steps that the user gave stay."""
         for _ in range(MAX_STEP_HALVINGS):
             if not status.converged:
                 break
@@ -258,7 +265,7 @@ class _LevenbergMarquardt:
         return status
 
     def _run_stage(self) -> bool:
-        """Whether it came to rest, or was only crawling when its iterations were used up."""
+        """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         for _ in range(self.stage.iterations):
             trial, damping = self._step(self.current, damping)
@@ -270,7 +277,7 @@ class _LevenbergMarquardt:
         return before - self.current.cost < STALL_COST_DECREASE * before
 
     def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
-        """Shorten the step until the cost falls; None where ten tries do not help, or it would hardly fall."""
+        """Raise the damping until a step lowers the cost; None if ten tries do not, or it would hardly fall."""
         raise_by = 10.0
         for k in range(10):
             reduced = current.equations.arrow.eliminate(damping)
@@ -287,7 +294,7 @@ class _LevenbergMarquardt:
         return None, damping
 
     def _is_negligible_step(self, current: _Iterate, step: GaussNewtonStep) -> bool:
-        """Whether a step promises next to nothing: in the last stage, no direction moves by 0.1 % of its deviation."""
+        """Whether a step promises a negligible decrease: in the last stage, 0.1 % of a deviation in any direction."""
         if self.noisy_gaps or self.stage is self.method.stages[-1]:
             enough = FINAL_COST_TOLERANCE * max(1.0, 2 * current.cost / max(1, current.equations.count))
         else:
@@ -295,7 +302,7 @@ class _LevenbergMarquardt:
         return 0.5 * current.equations.arrow.descent_rate(step) < enough
 
     def _trial(self, current: _Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> _Iterate:
-        """The step as it is; where it disappoints, also with its gaps corrected to second order (curved valleys)."""
+        """The iterate after a step; where the cost falls too little, with its gaps corrected to second order."""
         z = self.scaling.project_to_bounds(current.z + step.parameters)
         moved = z - current.z
         shift = reduced.back_substitute(moved)  # a bound may have cut the parameters' step short

@@ -1,4 +1,4 @@
-"""The free parameters as a search moves them: logarithms where that is asked for, and within their bounds."""
+"""`ParameterScaling`: the free parameters in the units of a search, logarithms or values, within their bounds."""
 
 import math
 
@@ -28,7 +28,7 @@ class ParameterScaling:
     lower, upper : ndarray, shape (k,)
         As searched.
     held : ndarray of bool, shape (k,)
-        Bounds that leave no room.
+        Which parameters have equal bounds.
     start : ndarray, shape (k,)
         The given values, within the bounds.
     """
@@ -63,24 +63,24 @@ class ParameterScaling:
         return np.where(self.log, np.exp(np.where(self.log, z, 0.0)), 1.0)
 
     def at_bound(self, z: Array) -> Mask:
-        """Which lie on a bound."""
+        """The mask of parameters on a bound."""
         return np.asarray((z <= self.lower) | (z >= self.upper))
 
     def weak_prior(self, z: Array) -> Array:
-        """Standard deviation of a prior that hardly says anything: a factor, or for linear ones a multiple, of ten."""
+        """Standard deviation of a weak prior: a factor of ten, or for linear parameters ten times their size."""
         size = np.abs(np.where(self.log, 0.0, z))
         return np.where(self.log, WEAK_PRIOR_DEVIATION, np.where(size > 0, 10 * size, np.inf))
 
     def has_effect(self, equations: NormalEquations) -> Mask:
-        """Which have an effect on the residuals here."""
+        """The mask of parameters that have an effect on the residuals here."""
         return np.asarray(np.diag(equations.arrow.corner) > np.where(self.log, MIN_LOG_INFORMATION, 0.0))
 
     def movable(self, z: Array, equations: NormalEquations, reduced: ReducedEquations) -> Mask:
-        """Which are neither pressed against a bound nor without any effect on the residuals here."""
+        """The mask of parameters with an effect on the residuals that are not pressed against a bound."""
         below, above = (z <= self.lower) & (reduced.gradient > 0), (z >= self.upper) & (reduced.gradient < 0)
         return self.has_effect(equations) & ~(below | above)
 
     def _to_search_units(self, values: Array) -> Array:
-        """Logarithms where the parameter asks for it; a bound that is not positive is no bound there."""
+        """Logarithms of log parameters; a bound that is not positive is minus infinity there."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.log, np.where(values > 0, np.log(values), -np.inf), values)

@@ -1,4 +1,4 @@
-"""A transcription as batched, compiled segments: every segment of every phase side by side, with its sensitivities."""
+"""`Segments`: a transcription as one batch of compiled segments of all phases, with sensitivities."""
 
 import itertools
 import math
@@ -17,8 +17,8 @@ from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription
 
-SUBSTEPS_CAP = 1000
-MAX_STIFFNESS_NODES = 100  # nodes whose stiffness is judged
+SUBSTEPS_CAP = 1000  # integration steps a sample, at most: more take hours, fewer hide how stiff an absurd start is
+MAX_STIFFNESS_NODES = 100  # nodes at which the stiffness is computed: more cost time, fewer miss the stiffest
 
 
 class Block(NamedTuple):
@@ -31,13 +31,13 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class IntegrationCorrection:
-    """What finer integration steps add to a run.
+    """The change of a run by finer integration steps.
 
     Attributes
     ----------
     y : ndarray, shape (m, n, n_outputs)
     x_end : ndarray, shape (m, n_states)
-    fine_run : Run
+    fine_run : RolloutResult
         The run with the finer steps.
     """
 
@@ -62,8 +62,8 @@ class Segments:
     linked : ndarray of bool, shape (m,)
         Whether the next segment continues this one.
     fixed_start : ndarray, shape (m, n_states)
-        The known start state; NaN where the node is an unknown. A state that no measured output feels (the position
-        under a logged speed) is held to its guess there, for it could be anything.
+        The known start state; NaN where the node is an unknown. A state on which no measured output depends (the
+        position under a logged speed) is held at its guess there.
     phase, lengths : ndarray of int, shape (m,)
         The phase of each segment, and its samples without padding.
     """
@@ -125,12 +125,12 @@ class Segments:
 
     @cached_property
     def counts(self) -> Indices:
-        """How many samples of each output were measured, shape (n_outputs,)."""
+        """Number of measured samples of each output, shape (n_outputs,)."""
         return np.asarray(np.isfinite(self.measured).sum(axis=(0, 1)))
 
     @cached_property
     def jacobian(self) -> ca.Function:
-        """Of the states' rates: ``(t, x, u, p) -> d(xdot)/dx``, shape (n_states, n_states)."""
+        """The Jacobian of the states' rates: ``(t, x, u, p) -> d(xdot)/dx``, shape (n_states, n_states)."""
         slope, s = _state_rate(self.system)
         return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
 
@@ -154,7 +154,7 @@ class Segments:
         )
 
     def gram(self, nodes: Array, q: Array, substeps: int, correction: IntegrationCorrection | None = None) -> Gram:
-        """The same with sensitivities, and the Gram matrices of the residuals, which alone are corrected."""
+        """Integrate with sensitivities, and form the Gram matrices of the residuals, which alone are corrected."""
         measured = self.measured if correction is None else self.measured - correction.y
         given = (nodes, self.inputs, q[self.parameter_positions], self.t, self.h, measured, self.weights)
         return self.sensitivities.gram(*given, substeps=substeps)
@@ -210,7 +210,7 @@ def start_nodes(segments: Segments) -> Array:
 
 
 def gap_scales(segments: Segments, kinematic: float) -> Array:
-    """How much tighter each state's gaps are kept: `kinematic` where its rate holds no free parameter, else 1."""
+    """Factor on each state's gaps: `kinematic` where its rate holds no free parameter, else 1."""
     slope, symbols = _state_rate(segments.system)
     free = symbols["p"][segments.columns.tolist()]
     depends = [any(ca.which_depends(slope[i], free, 1, True)) for i in range(slope.numel())]
@@ -220,8 +220,8 @@ def gap_scales(segments: Segments, kinematic: float) -> Array:
 def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.4) -> int:
     """Integration steps a sample that keep ``h |lambda| <= step`` along the start; RK4 is stable below 2.78.
 
-    Judged at nodes all along it and at the extremes of every state and input; no more than `SUBSTEPS_CAP`, for a start
-    may be absurd.
+    The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
+    `SUBSTEPS_CAP` at most, for a start may be absurd.
     """
     m, n = nodes.shape
     if not n:
@@ -248,7 +248,7 @@ def _state_rate(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
 
 
 def _fix_unobservable_states(transcription: Transcription, start: Array, heads: Indices, index: Indices) -> None:
-    """Hold what the data do not reach to its guess, at the head of each run of linked segments (changes `start`)."""
+    """Hold unobservable states at their guess, at the head of each run of linked segments (changes `start`)."""
     for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):
         guess = transcription.phases[index[head]].guess
         measured = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
@@ -262,12 +262,12 @@ def _observable_states(system: DiscreteSystem, outputs: set[str]) -> Mask:
         return np.ones(len(system.states), dtype=bool)
     slope, s = _state_rate(system)
     rows = [i for i, name in enumerate(names(system.outputs)) if name in outputs]
-    seen = system.step(*s.values())[1][rows]
-    reads, felt = (np.array(ca.DM(ca.jacobian_sparsity(f, s["x"]), 1)) > 0 for f in (slope, seen))
-    felt = np.asarray(felt.any(axis=0))
+    measured = system.step(*s.values())[1][rows]
+    reads, affected = (np.array(ca.DM(ca.jacobian_sparsity(f, s["x"]), 1)) > 0 for f in (slope, measured))
+    affected = np.asarray(affected.any(axis=0))
     for _ in system.states:
-        felt |= reads[felt].any(axis=0)
-    return np.asarray(felt)
+        affected |= reads[affected].any(axis=0)
+    return np.asarray(affected)
 
 
 def _measurements(residuals: Residuals, system: DiscreteSystem, phase: Phase) -> tuple[Array, Array]:

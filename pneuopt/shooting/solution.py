@@ -1,4 +1,4 @@
-"""What the solvers of `shooting` hand back: a `Solution`, and of a least squares a `Fit`."""
+"""Results of the solvers: `Solution` of a problem with costs and limits, `Fit` of a least squares."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,7 +11,7 @@ from pneuopt.quantities.trajectories import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a solver with costs and limits found.
+    """The solution of a problem with costs and limits.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a least squares found: the states over time, the parameters, and how well the data determine them.
+    """The result of a least squares: states over time, parameters, and how well the data determine them.
 
     Attributes
     ----------
@@ -53,16 +53,16 @@ class Fit:
     count : int
         Number of data residuals.
     at_bound : ndarray of bool, shape (k,)
-        Without those that were held, by equal bounds.
+        Which parameters are at a bound, without those held by equal bounds.
     jumps : ndarray, shape (m, n_states), or None
-        Where the gaps had to stand for noise of the states: the gap behind each linked segment, in nominal sizes.
+        The gap behind each linked segment, in nominal sizes, if the gaps stand for noise of the states.
     unidentifiable : tuple of str
-        The parameters that the data do not determine here; hold them, and fit again.
+        The parameters that the data do not determine here; a caller holds them, and fits again.
     prior_covariance : ndarray, shape (k, k), or None
-        What a weak prior of those held adds to the covariance (`NormalEquations.prior_covariance`); None where nothing
+        The covariance due to a weak prior of held parameters (`NormalEquations.prior_covariance`); None where nothing
         is held.
     variance_inflation : float
-        By how much the estimates' variance exceeds what weighted squares say (robust losses).
+        Factor on the estimates' variance by weighted squares (robust losses).
     """
 
     trajectories: tuple[Trajectory, ...]

@@ -1,7 +1,7 @@
-"""What a multiple-shooting problem is, apart from how it is solved: phases, nodes, residuals, costs, limits.
+"""`Transcription`: a multiple-shooting problem as data: phases, nodes, residuals, costs, limits.
 
-Nothing here is a graph of the whole problem: the pieces are small SX functions of one node, and every solver of `nlp`
-reads them as it needs. All numbers that a problem depends on stand in one `ParameterSet`; ``"name[phase]"`` overrides
+Its pieces are small SX functions of one node, from which each solver of this room builds what it needs.
+All numbers that a problem depends on stand in one `ParameterSet`; ``"name[phase]"`` overrides
 ``"name"`` in that phase, which is how conditions of a log and parameters of its own (`per_log`) are written.
 """
 
@@ -19,7 +19,7 @@ from pneuopt.quantities.parameters import ParameterSet
 
 
 class Where(Enum):
-    """Where a cost or limit holds."""
+    """The nodes at which a cost or limit holds, or the parameters."""
 
     START = "start"
     NODES = "nodes"
@@ -146,7 +146,7 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class Transcription:
-    """A multiple-shooting problem as data; `nlp` holds the methods that solve it.
+    """A multiple-shooting problem as data, apart from the methods that solve it.
 
     Parameters
     ----------

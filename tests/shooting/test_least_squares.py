@@ -177,7 +177,7 @@ def test_a_parameter_without_effect_is_named() -> None:
     parameters = problem.parameters.fixed("factor").freed("idle")
     fit = solve_least_squares(replace(problem, parameters=parameters))
     assert fit.status.code is Code.NOT_CONVERGED
-    assert "do not feel idle" in fit.status.message
+    assert "do not depend on idle" in fit.status.message
     assert fit.covariance is not None
     position = list(fit.parameters.free_names).index("idle")
     assert np.isnan(fit.covariance[position]).all()
