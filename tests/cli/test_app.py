@@ -77,7 +77,7 @@ def test_a_friction_model_is_chosen_and_explained(folder: Path) -> None:
     assert "--select writes neither -o nor --plot" in refused.stderr
 
 
-def test_what_a_log_does_not_tell_is_said_before_and_after(folder: Path) -> None:
+def test_an_unidentifiable_parameter_is_named_before_and_after_the_fit(folder: Path) -> None:
     """A drive that moves one way at one speed: no slope, no curve."""
     t = np.arange(0, 1.0, 2e-3)
     position = 50 * t + 0.02 * np.random.default_rng(0).standard_normal(len(t))
@@ -287,7 +287,7 @@ horizon = "0.4 s"
 """
 
 
-def test_an_end_stop_is_told_in_one_line(folder: Path) -> None:
+def test_an_end_stop_is_reported_in_one_line(folder: Path) -> None:
     """From 160 of 200 mm at 0.2 m/s, for longer than 0.2 s; the command goes on."""
     (folder / "cylinder.toml").write_text(CYLINDER, encoding="utf-8")
     (folder / "speed.toml").write_text(SPEED_LOOP, encoding="utf-8")

@@ -212,7 +212,7 @@ def test_bad_input_gets_one_message_and_writes_nothing(folder: Path, old: str, n
     assert {p: p.read_bytes() for p in folder.iterdir()} == before
 
 
-def test_tuning_ends_with_what_the_dither_is_worth(folder: Path) -> None:
+def test_a_tuning_ends_with_the_dither_verdict(folder: Path) -> None:
     free = 'Kp = { value = "300 N*s/m", lower = "200 N*s/m", upper = "400 N*s/m", free = true }'
     edit("tuning.toml", 'Kp = "300 N*s/m"', free)
     dither = '[dither]\nfrequency = "50 Hz"\namplitude = "0.01 N"\n[minimise]\niae = {}\n[limits]'
@@ -220,9 +220,9 @@ def test_tuning_ends_with_what_the_dither_is_worth(folder: Path) -> None:
     edit("tuning.toml", 'max = "1 s"', 'max = "200 ms"')
     result = run("tune drive.toml tuning.toml --json out.json")
     assert "the dither of 0.01 N at 50 Hz is useless, against the same gains without it" in result.output
-    told = json.loads(Path("out.json").read_text(encoding="utf-8"))["dither"]
-    assert told["usefulness"] == "useless"
-    assert any("price: ripple" in reason for reason in told["reasons"])
+    verdict = json.loads(Path("out.json").read_text(encoding="utf-8"))["dither"]
+    assert verdict["usefulness"] == "useless"
+    assert any("price: ripple" in reason for reason in verdict["reasons"])
 
 
 def test_a_front_is_shown_written_and_drawn(front: Path) -> None:

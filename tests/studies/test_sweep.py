@@ -225,7 +225,7 @@ def test_a_function_that_cannot_travel_is_refused_with_the_remedy(functions: Mod
         sweep(functions.acceleration, RIG, masses(2))
 
 
-def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
+def test_a_script_without_a_main_guard_is_refused_with_the_remedy(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
         "from pneuopt import Parameter, ParameterSet, sweep\n"

@@ -184,7 +184,7 @@ def test_limits_are_kept_in_every_corner() -> None:
     assert best.stats["deviation.SettlingTime"] < 2e-3
 
 
-def test_a_renewal_keeps_what_was_found_before() -> None:
+def test_a_restart_keeps_what_was_found_before() -> None:
     poor = replace(QUICK, members=5, generations=1, keep=1)
     once, again = (on_corners([Overshoot(0.05)], replace(poor, restarts=n)).certified for n in (0, 1))
     assert again.loc["Overshoot"].max() <= 5.0

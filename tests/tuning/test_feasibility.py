@@ -62,9 +62,9 @@ def refusal(
 
 
 def test_a_stroke_too_short_names_the_horizon_that_fits() -> None:
-    told = refusal(cylinder(), Step(0.4, at=0.1, horizon=0.6))
-    assert "reference 0 to 0.4: it leads the piston over 200 mm" in told
-    assert "from position 100 mm to the front end stop there are 99.9 mm; end it by horizon = 0.35 s" in told
+    words = refusal(cylinder(), Step(0.4, at=0.1, horizon=0.6))
+    assert "reference 0 to 0.4: it leads the piston over 200 mm" in words
+    assert "from position 100 mm to the front end stop there are 99.9 mm; end it by horizon = 0.35 s" in words
     assert "rear end stop" in refusal(cylinder(), Step(-0.4, horizon=0.6))
 
 
@@ -76,9 +76,9 @@ def test_what_fits_the_stroke_is_not_refused() -> None:
 def test_a_speed_beyond_the_valve_names_the_fastest() -> None:
     """The fastest that is named can be held, and what is 2 % faster than the band allows cannot."""
     loop, given = cylinder()
-    told = refusal((loop, given), Step(9.0, horizon=0.011))
-    assert "supply.pressure = 701325 Pa(a)" in told
-    fastest = float(told.rpartition("held is ")[2].split()[0])
+    words = refusal((loop, given), Step(9.0, horizon=0.011))
+    assert "supply.pressure = 701325 Pa(a)" in words
+    fastest = float(words.rpartition("held is ")[2].split()[0])
     low, high = (loop.initial(given, reference=v * fastest)[:1] if v < 1 else v for v in (0.99, 1.03))
     assert np.isfinite(low).all()
     with pytest.raises(InputError, match="no steady motion"):
@@ -87,24 +87,24 @@ def test_a_speed_beyond_the_valve_names_the_fastest() -> None:
 
 def test_a_command_beyond_the_clip_or_the_limit_is_named() -> None:
     """A lag of gain 1 needs as much command as it shall show."""
-    told = refusal(lag(), Step(8.0))
-    assert "holding 7.84 m/s takes 7.84 V, the controller's limits are -5 and 5 V" in told
-    assert "the most that can be held is 5 m/s" in told
-    told = refusal(lag(), Step(4.0), [PeakControl(3.0)])
-    assert "holding 3.92 m/s takes 3.92 V, PeakControl allows 3 V; take a smaller step, or raise it" in told
-    assert "the most that can be held is 3 m/s" in told
+    words = refusal(lag(), Step(8.0))
+    assert "holding 7.84 m/s takes 7.84 V, the controller's limits are -5 and 5 V" in words
+    assert "the most that can be held is 5 m/s" in words
+    words = refusal(lag(), Step(4.0), [PeakControl(3.0)])
+    assert "holding 3.92 m/s takes 3.92 V, PeakControl allows 3 V; take a smaller step, or raise it" in words
+    assert "the most that can be held is 3 m/s" in words
 
 
 @pytest.mark.parametrize("gain", [1.0, -1.0])
-def test_gains_of_the_wrong_sign_are_told_whatever_the_plants_sign(gain: float) -> None:
+def test_gains_of_the_wrong_sign_are_named_whatever_the_plants_sign(gain: float) -> None:
     loop, given = lag(gain)
     bounds = {n: (-gain * np.array(ends)) for n, ends in FREE.items()}
     turned = given | ParameterSet(
         {n: replace(given[n], value=float(np.mean(b)), lower=min(b), upper=max(b)) for n, b in bounds.items()}
     )
-    told = refusal((loop, turned), Step(1.0))
-    assert "every gain allowed has the wrong sign" in told
-    assert f"speed {'rises' if gain > 0 else 'falls'} with valve_voltage; turn the sign of the gains' bounds" in told
+    words = refusal((loop, turned), Step(1.0))
+    assert "every gain allowed has the wrong sign" in words
+    assert f"speed {'rises' if gain > 0 else 'falls'} with valve_voltage; turn the sign of the gains' bounds" in words
 
 
 def test_an_integrating_plant_has_a_sign_too() -> None:
@@ -117,8 +117,8 @@ def test_a_dither_above_the_sampling_limit_is_refused_by_its_upper_bound() -> No
     loop, given = cylinder(frequency=100.0)
     wide = given.with_values({"dither.amplitude": 0.5})
     free = wide | ParameterSet({"dither.frequency": replace(wide["dither.frequency"], lower=50.0, upper=900.0)})
-    told = refusal((loop, free.freed("dither.frequency")), Step(0.2, horizon=0.3))
-    assert "900 Hz cannot be sampled every 1 ms: it must lie below the Nyquist frequency 500 Hz" in told
+    words = refusal((loop, free.freed("dither.frequency")), Step(0.2, horizon=0.3))
+    assert "900 Hz cannot be sampled every 1 ms: it must lie below the Nyquist frequency 500 Hz" in words
 
 
 TUBE = ((0.0, -0.1, 1.5), (0.5, 0.7, 0.9))
@@ -140,12 +140,12 @@ CONTRADICTIONS: dict[str, tuple[list[Requirement], str]] = {
 
 
 @pytest.mark.parametrize("case", CONTRADICTIONS)
-def test_contradictory_limits_are_told_with_their_numbers(case: str) -> None:
+def test_contradictory_limits_are_named_with_their_numbers(case: str) -> None:
     limits, message = CONTRADICTIONS[case]
     assert message in refusal(lag(), Step(1.0), limits)
 
 
-def test_a_start_that_never_settles_is_told_and_searched_from() -> None:
+def test_a_start_that_never_settles_is_reported_and_searched_from() -> None:
     """Kp of 40 oscillates at 10 ms of sampling: a lag of 0.1 s allows about 20."""
     loop, given = lag()
     lines = list[str]()

@@ -97,7 +97,7 @@ def few(**options: Any) -> pd.DataFrame:
     return pareto_front(loop, STEP, given, **known | options)
 
 
-def test_a_front_begins_and_ends_where_it_is_told() -> None:
+def test_a_front_begins_and_ends_at_the_given_bounds() -> None:
     found = few(until=1.3, points=2)
     assert (found["error"] == "").all()
     assert 1.3 < found["limit"][0] <= 1.5
