@@ -90,7 +90,7 @@ def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], param
 
 
 def _axis_channels(plant: System) -> AxisChannels:
-    """What a log calls the motion of the plant's axis and what drives it; a piston's names where it declares none."""
+    """The channels of the plant's axis: its motion, and the input that drives it; a piston's if it declares none."""
     if plant.axis is None:
         return PISTON_CHANNELS
     pushes = [q.name for q in plant.inputs if q.unit == plant.axis.force]

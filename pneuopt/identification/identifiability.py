@@ -36,7 +36,7 @@ HARMLESS_DEVIATION = 0.01  # a combination known better does no harm; larger hid
 MAX_LINEAR_DEVIATION = 0.15  # of a log parameter: beyond it the likelihood is no parabola, and the interval is profiled
 MAX_RELATIVE_DEVIATION = 0.3  # beyond it a number is only rough; larger lets it pass unmarked, smaller marks good ones
 MAX_EXPECTED_DEVIATION = 1.0  # before a fit, beyond it a parameter is unidentifiable: a fit need not be tried
-UNIDENTIFIABLE_DEVIATION = 10 / 3  # after a fit: beyond it a factor of ten about the value says more than the logs
+UNIDENTIFIABLE_DEVIATION = 10 / 3  # after a fit: beyond it a factor of ten about the value is as good as the logs
 MAX_RELATIVE_INTERVAL = 4 * MAX_RELATIVE_DEVIATION  # width of a profile's interval over the value: rough beyond it
 
 # Combinations of parameters:
@@ -221,7 +221,7 @@ def _make_verdict(
 
 
 def _is_harmful(members: "pd.DataFrame") -> bool:
-    """Whether a weak combination leaves a member uncertain; parameters known far better than needed are separate."""
+    """Whether a weak combination leaves one of its parameters noticeably uncertain."""
     return bool(members["inflation"].max() > MAX_INFLATION and members["relative"].max() > HARMLESS_DEVIATION)
 
 

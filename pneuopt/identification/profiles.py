@@ -27,7 +27,7 @@ ROOT_TOLERANCE = (
     0.003  # relative error of the deviance's root at an end: smaller takes more refits, larger blurs the end
 )
 MAX_LOG_STEP = 1.5  # e-folds of a log parameter between two refits: larger steps lose the optimum of the others
-MAX_LOG_PROBE = 0.3  # e-folds over which the curvature at the estimate is measured: farther off it is another curvature
+MAX_LOG_PROBE = 0.3  # e-folds over which the curvature at the estimate is measured: farther away it differs
 REFIT_ITERATIONS = 40  # iterations of a refit, at most: fewer leave its cost too high, and the interval too narrow
 
 
@@ -57,7 +57,7 @@ class Profile:
 
     @property
     def is_open(self) -> bool:
-        """Whether an end is missing."""
+        """Whether an end of the interval is infinite."""
         return math.isinf(self.low) or math.isinf(self.high)
 
     def __repr__(self) -> str:

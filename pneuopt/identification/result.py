@@ -21,7 +21,7 @@ INFINITE_INFLATION = 1e5
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Which parameters a set of logs identifies, how well, and which run would identify the others.
+    """The identifiability of the free parameters from a set of logs, and the runs that would identify the others.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class IdentificationResult:
     ----------
     parameters : ParameterSet
         The system's, with the given values and the estimates; a `per_log` parameter keeps its given value here, and so
-        does an unidentifiable one, unless the logs refuse that value or identify it only together with another: then
+        does an unidentifiable one, unless the logs reject that value or identify it only together with another: then
         it has the value that belongs to the other estimates.
     estimates : DataFrame
         A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,

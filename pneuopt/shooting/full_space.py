@@ -95,7 +95,7 @@ def solve_full_space(transcription: Transcription, method: FullSpace | None = No
     Returns
     -------
     Solution
-        Its status says in words whether it converged; where not, it names the limit, the state or the equation.
+        Its status names the limit, state or equation at fault where the solver did not converge.
     """
     return solve_from(prepare_full_space(transcription, method), transcription.parameters)
 

@@ -11,8 +11,8 @@ from pneuopt.shooting.transcription import Transcription
 
 # What the data of a search do not determine; each threshold is in the units in which the search moves.
 WEAK_PRIOR_DEVIATION = math.log(10)  # standard deviation of a weak prior, in e-folds: a factor of ten either way
-# standard deviation over a weak prior's from which a parameter is held: there the prior makes up a tenth of what both
-# say together; smaller holds what the data do determine, larger lets a search crawl along a valley
+# standard deviation over a weak prior's from which a parameter is held: there the prior makes up a tenth of the
+# information of both; smaller holds what the data do determine, larger lets a search crawl along a valley
 UNIDENTIFIABLE_PRIOR_RATIO = 1 / 3
 # squared residuals that an e-fold change of a log parameter has to move, or it has no effect: smaller searches in
 # rounding, larger holds what good data would show
