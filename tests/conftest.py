@@ -23,8 +23,8 @@ from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.linearised import LinearisedProblem
 
 # a run of CI fails for what was changed, not for the examples that chance drew; at a desk each run draws new ones
-hypothesis.settings.register_profile("ci", derandomize=True)
-hypothesis.settings.register_profile("desk")
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
+hypothesis.settings.register_profile("desk", deadline=None)  # no wall-clock assertion: machines are noisy
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "desk")
 
 CACHES = (

@@ -33,7 +33,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.files.loop import construct_at
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
-from pneuopt.files.study import Axis, Pareto, Study, read_axes, read_pareto, read_study
+from pneuopt.files.study import Pareto, Study, SweptAxis, read_axes, read_pareto, read_study
 from pneuopt.files.tuning import Tuning
 from pneuopt.plotting import plot_front, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
@@ -191,7 +191,7 @@ def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
     return f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}", status
 
 
-def _worst_of_references(table: "pd.DataFrame", axes: Sequence[Axis], metrics: Sequence[str]) -> "pd.DataFrame":
+def _worst_of_references(table: "pd.DataFrame", axes: Sequence[SweptAxis], metrics: Sequence[str]) -> "pd.DataFrame":
     """The table that is shown: the axes in the units of the file, each metric's worst over the references."""
     seen = table[["error"]].copy()
     for axis in axes:

@@ -15,11 +15,11 @@ def air_rows(record: StepRecord) -> ValuesAndSlopes:
     A gram a second for two seconds:
 
     >>> import numpy as np
-    >>> from pneuopt.evaluation.meter import metered_record
-    >>> run = metered_record(np.array([0.0, 1.0, 2.0]), {"air": np.full((1, 3), 1e-3)}, 0.0)
+    >>> from pneuopt.evaluation.meter import meter_record
+    >>> run = meter_record(np.array([0.0, 1.0, 2.0]), {"air": np.full((1, 3), 1e-3)}, 0.0)
     >>> round(air_rows(run)[0].item(), 4)
     1.6878
     """
-    mass, slopes = record.metered_integral(AIR_CHANNEL)
+    mass, slopes = record.integrate_meter(AIR_CHANNEL)
     factor = LITRES_PER_CUBIC_METRE / ANR_DENSITY
     return factor * mass, factor * slopes

@@ -10,7 +10,7 @@ POWER_CHANNEL = "power"  # the meter's channel with the power drawn from the pla
 
 def energy_rows(record: StepRecord) -> ValuesAndSlopes:
     """Integral of the power from the step to the end of the record [J]."""
-    return record.metered_integral(POWER_CHANNEL)
+    return record.integrate_meter(POWER_CHANNEL)
 
 
 @final

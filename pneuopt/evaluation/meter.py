@@ -56,7 +56,7 @@ def meter_outputs(
     return [ca.SX(shown[channel]) for channel in channels]
 
 
-def metered_record(t: Array, channels: Mapping[str, Array], start: float) -> StepRecord:
+def meter_record(t: Array, channels: Mapping[str, Array], start: float) -> StepRecord:
     """Record of the meter's channels alone, for many responses on one grid, from `start` on.
 
     Parameters
@@ -95,6 +95,6 @@ def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajecto
     states = response.matrix(names(plant.states)).T
     found = plant.meter.map(len(response))(0, states, inputs, p)
     rows = dict(zip(shown, [found] if len(shown) == 1 else found, strict=True))
-    record = metered_record(response.t, {n: np.array(row) for n, row in rows.items()}, start)
+    record = meter_record(response.t, {n: np.array(row) for n, row in rows.items()}, start)
     readable = (m for m in METRICS.values() if m.channels and set(m.channels) <= set(shown))
     return {metric.name: float(metric.largest(record)[0]) for metric in readable}

@@ -78,7 +78,7 @@ class StepRecord:
         rows = np.arange(len(values))[:, None]
         return np.abs(values[rows, k]), np.sign(values[rows, k])[..., None] * self._to_unknowns(slopes[rows, k])
 
-    def metered_integral(self, channel: str) -> ValuesAndSlopes:
+    def integrate_meter(self, channel: str) -> ValuesAndSlopes:
         """Integral of a channel of the meter over time, a row a response."""
         (values, slopes), weights = self.meter[channel], trapezoidal_weights(self.t)
         by_column = np.einsum("k,mkc->mc", weights, slopes)[:, None]

@@ -55,7 +55,7 @@ class Study:
 
 
 @dataclass(frozen=True)
-class Axis:
+class SweptAxis:
     """A parameter and its values.
 
     Attributes
@@ -132,7 +132,7 @@ def read_study(path: str | Path) -> Study:
     return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), table.get("pareto"))
 
 
-def read_axes(study: Study, parameters: ParameterSet) -> tuple[Axis, ...]:
+def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
     """Read a study's axes in the units of the parameters.
 
     Parameters
@@ -142,7 +142,7 @@ def read_axes(study: Study, parameters: ParameterSet) -> tuple[Axis, ...]:
 
     Returns
     -------
-    tuple of Axis
+    tuple of SweptAxis
 
     Raises
     ------
@@ -205,7 +205,7 @@ def _flatten_axes(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _read_axis(name: str, entry: Any, unit: str, where: str) -> Axis:
+def _read_axis(name: str, entry: Any, unit: str, where: str) -> SweptAxis:
     good = isinstance(entry, list | dict) and len(entry) > 0
     require(good, f"{where}: write a list or a range, {_AXIS_EXAMPLE}")
     if isinstance(entry, list):
@@ -214,7 +214,7 @@ def _read_axis(name: str, entry: Any, unit: str, where: str) -> Axis:
         first, values = entry.get("from"), _read_range(entry, unit, where)
     written = read_unit(first, unit)
     factor, offset = si_conversion(written, unit, where=where)
-    return Axis(name, tuple(values), written, factor, offset)
+    return SweptAxis(name, tuple(values), written, factor, offset)
 
 
 def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:

@@ -27,7 +27,7 @@ ALIKE_AT_EVERY_SPEED = (
 
 def lacks_stribeck_curve(seen: LoggedMotion) -> Lack | None:
     """Lack of the slow and fast speeds that a Stribeck curve needs, if any."""
-    stribeck = _largest("friction.stribeck_velocity", DEFAULT_STRIBECK_VELOCITY, seen.values)
+    stribeck = _largest_known("friction.stribeck_velocity", DEFAULT_STRIBECK_VELOCITY, seen.values)
     speed = np.abs(seen.speed)
     below = int(np.count_nonzero((speed > 0.1 * stribeck) & (speed < stribeck)))
     slowest, fastest = 0.1 * stribeck, VISCOUS_SPEED_RATIO * stribeck
@@ -72,8 +72,8 @@ def lacks_presliding(seen: LoggedMotion) -> Lack | None:
 
 def lacks_acceleration(inertia: str, remedy: str, seen: LoggedMotion) -> Lack | None:
     """Lack of the acceleration that `inertia` needs beside friction, if any; the larger of two known values counts."""
-    force = _largest(inertia, math.nan, seen.values, seen.given) * seen.acceleration
-    friction = _largest("friction.coulomb", math.nan, seen.values)
+    force = _largest_known(inertia, math.nan, seen.values, seen.given) * seen.acceleration
+    friction = _largest_known("friction.coulomb", math.nan, seen.values)
     if force < MIN_INERTIA_SHARE * friction:
         unit = _known_unit(seen, "friction.coulomb")
         return Lack(f"inertia takes {force:.2g} {unit} (rms), nothing beside {friction:.2g} {unit} of friction", remedy)
@@ -158,7 +158,7 @@ LOAD_EXCITATION = load_excitation("load.mass", "load.force", "force", "weigh the
 RIG_EXCITATION = Excitation({"rig.force_offset": Need(lacks_directions, _LEVELS)})
 
 
-def _largest(name: str, default: float, *known: ParameterSet) -> float:
+def _largest_known(name: str, default: float, *known: ParameterSet) -> float:
     return max((values.value(name) for values in known if name in values), default=default)
 
 

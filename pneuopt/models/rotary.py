@@ -22,7 +22,7 @@ from pneuopt.quantities.trajectories import Trajectory
 # with ten times less, a motor's first revolutions count as sliding fast.
 RADIUS = 0.01
 ANGLE = Quantity("angle", "rad", nominal=0.1 / RADIUS)
-SPEED = Quantity("speed", "rad/s", nominal=0.5 / RADIUS)
+ANGULAR_SPEED = Quantity("speed", "rad/s", nominal=0.5 / RADIUS)
 TORQUE = Quantity("torque", "N*m", nominal=100.0 * RADIUS)
 INERTIA = Parameter(5.0 * RADIUS**2, "kg*m^2", lower=1e-9, upper=1e5, log=True)
 LOAD_TORQUE = Parameter(0.0, "N*m", lower=-1e5, upper=1e5)
@@ -70,7 +70,7 @@ class RotaryDrive:
 
     def system(self) -> System:
         """Build the equations; states and outputs as in the class."""
-        states = (ANGLE, SPEED, *(_turning_state(q) for q in self.friction.states))
+        states = (ANGLE, ANGULAR_SPEED, *(_turning_state(q) for q in self.friction.states))
 
         def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:  # noqa: ARG001 - no time in it
             inner, own, load = without_prefix(x, "friction"), without_prefix(p, "friction"), {"force": u["torque"]}
@@ -80,7 +80,7 @@ class RotaryDrive:
             return {"angle": x["speed"], "speed": acceleration, **rates}, {n: x[n] for n in ("angle", "speed")}
 
         starts = _RotaryStarts(self.friction)
-        system = define(states, (TORQUE,), (ANGLE, SPEED), self.parameters, rhs, starts)
+        system = define(states, (TORQUE,), (ANGLE, ANGULAR_SPEED), self.parameters, rhs, starts)
         excitation = self.friction.excitation.with_prefix("friction") | _LOAD_EXCITATION
         return replace(system, axis=Axis("angle", "speed", "load.inertia", "N*m"), excitation=excitation)
 

@@ -148,7 +148,7 @@ def read_metrics(
     settings["sample_time"] = grid.sample_time
     settings["scale"] = None if reference.is_step else reference.nominal_size
     given = (grid.t, signal, reference.final, reference.initial)
-    settings["control"], meter = y[:, :, CONTROL_OUTPUT], metered(y, channels)
+    settings["control"], meter = y[:, :, CONTROL_OUTPUT], meter_values(y, channels)
     found = batch_metrics(*given, band=bands[0], envelope=envelope, only=only, meter=meter, **settings)
     if len(bands) > 1:
         more = (batch_metrics(*given, band=band, only=("SettlingTime",), **settings) for band in bands[1:])
@@ -159,7 +159,7 @@ def read_metrics(
     return {n: found[n] for n in only}
 
 
-def metered(y: Array, channels: Sequence[str]) -> dict[str, Array]:
+def meter_values(y: Array, channels: Sequence[str]) -> dict[str, Array]:
     """The meter's channels by name, from outputs that are the last axis of y."""
     return {channel: y[..., METER_OUTPUT + k] for k, channel in enumerate(channels)}
 

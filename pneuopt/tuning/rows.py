@@ -15,7 +15,7 @@ from pneuopt.evaluation.dither_mean import DitherPeriodMean, end_mean
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.step_record import StepRecord
 from pneuopt.quantities.arrays import Array
-from pneuopt.tuning.readings import CONTROL_OUTPUT, INTEGRAL_OUTPUT, SIGNAL_OUTPUT, ReferenceGrid, metered
+from pneuopt.tuning.readings import CONTROL_OUTPUT, INTEGRAL_OUTPUT, SIGNAL_OUTPUT, ReferenceGrid, meter_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Lanes:
             last_by_column[own, 0] = end_mean(self.t, slopes, period or None).reshape(-1, columns)
         size, since = reference.nominal_size, slice(self.grid.step_index, None)
         y, dy = self.y[:, since], self.dy[:, since]
-        shown = metered(y, self.channels), metered(np.moveaxis(dy, 2, -1), self.channels)
+        shown = meter_values(y, self.channels), meter_values(np.moveaxis(dy, 2, -1), self.channels)
         return StepRecord(
             self.t,
             ((error - reference.final) / size, self._to_gains(np.swapaxes(by_column, 1, 2)) / size),

@@ -68,14 +68,14 @@ class Search:
             if start is None:
                 self._report_start(simulator)
         except KeyboardInterrupt:
-            return self._result_so_far(simulator, _interrupted_at(self.space.start))
+            return self._result_so_far(simulator, _interruption_result(self.space.start))
         result, start, counts = None, self.space.start if start is None else start, dict[str, float]()
         for attempt in range(MARGINS_TO_TRY):
             margin = min(self.method.margin * 2**attempt, 0.5)
             try:
                 found = self.method.find(self.task, simulator, self.tighten(margin), start, attempt, self.progress)
             except KeyboardInterrupt:  # in a method that holds no best point yet
-                found = _interrupted_at(start)
+                found = _interruption_result(start)
             counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
             found = replace(found, stats={**found.stats, **counts, "margin": margin})
             if not found.is_complete:
@@ -173,7 +173,7 @@ class Search:
         yield from points[order or [0]]
 
 
-def _interrupted_at(point: Array) -> SearchResult:
+def _interruption_result(point: Array) -> SearchResult:
     """The result of a search that was interrupted before it had found anything."""
     return SearchResult(point, Status(Code.INTERRUPTED), (), {"simulations": 1.0}, is_complete=False)
 

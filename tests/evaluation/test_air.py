@@ -10,7 +10,7 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.air import ANR_DENSITY
 from pneuopt.evaluation.evaluate import evaluate, respond
-from pneuopt.evaluation.meter import metered_record
+from pneuopt.evaluation.meter import meter_record
 from pneuopt.evaluation.requirements import METRICS, AirUse, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
@@ -24,7 +24,7 @@ from pneuopt.tuning.space import search_space
 
 
 def metered(t: np.ndarray, flow: np.ndarray, spool: np.ndarray, start: float) -> dict[str, float]:
-    record = metered_record(t, {"air": flow, "spool": spool}, start)
+    record = meter_record(t, {"air": flow, "spool": spool}, start)
     return {n: METRICS[n].largest(record).item() for n in ("AirUse", "ValveTravel")}
 
 

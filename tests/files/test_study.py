@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from pneuopt.files.study import Axis, Pareto, read_axes, read_pareto, read_study
+from pneuopt.files.study import Pareto, SweptAxis, read_axes, read_pareto, read_study
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
@@ -40,7 +40,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "study.toml"
 
 
-def axes(file: Path, text: str) -> tuple[Axis, ...]:
+def axes(file: Path, text: str) -> tuple[SweptAxis, ...]:
     file.write_text(text, encoding="utf-8")
     return read_axes(read_study(file), RIG)
 

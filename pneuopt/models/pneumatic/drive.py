@@ -30,7 +30,7 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, wit
 from pneuopt.quantities.trajectories import Trajectory
 
 SIDES = ("a", "b")
-CHAMBER_PRESSURES = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
+PRESSURE_SIGNALS = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
 
 
 @dataclass(frozen=True)
@@ -173,11 +173,11 @@ class PneumaticDrive:
         self.check(parameters)
         used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
         numbers = {n: q.value for n, q in used.items()}
-        return np.asarray(_air_force(numbers, *(measured[q.name] for q in CHAMBER_PRESSURES)))
+        return np.asarray(_air_force(numbers, *(measured[q.name] for q in PRESSURE_SIGNALS)))
 
     @cached_property
     def _system(self) -> System:
-        outputs = (POSITION, SPEED, *CHAMBER_PRESSURES)
+        outputs = (POSITION, SPEED, *PRESSURE_SIGNALS)
         starts = PneumaticStarts(self.system, self.friction, _air_force)
         system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._find_rest)
         warnings = partial(_log_warnings, PressureZeroCheck(starts.prepare_logs))
@@ -202,7 +202,7 @@ class PneumaticDrive:
         rates = {"position": v, "speed": acceleration, **self._chamber_rates(x, u, p)}
         rates |= {f"valve.{n}": rate for n, rate in spool.items()}
         rates |= {f"friction.{n}": rate for n, rate in friction.rates.items()}
-        return rates, {q.name: x[q.name] for q in (POSITION, SPEED, *CHAMBER_PRESSURES)}
+        return rates, {q.name: x[q.name] for q in (POSITION, SPEED, *PRESSURE_SIGNALS)}
 
     def _chamber_rates(self, x: Symbols, u: Symbols, p: Symbols) -> dict[str, ca.SX]:
         """Rates of the chambers' states."""

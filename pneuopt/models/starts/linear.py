@@ -20,7 +20,7 @@ from pneuopt.quantities.trajectories import Trajectory
 Polynomials = tuple[list[float], list[float]]
 # Samples of all logs together in the grid search and in the refinement: fewer hide fast plants, more cost time.
 MAX_GRID_SAMPLES, MAX_REFINEMENT_SAMPLES = 600, 4000
-MIN_SAMPLES = 20  # samples that a log needs: fewer than a few for each parameter fit anything
+MIN_START_SAMPLES = 20  # samples that a log needs: fewer than a few for each parameter fit anything
 MAX_CANDIDATES = 4  # candidates that are refined and returned: fewer miss the right one, each costs a refinement
 DAMPING_GRID = (0.1, 0.3, 0.7, 1.5, 4.0)  # damping ratios of the grid [1], from ringing to two separate lags
 PLANT_DAMPING, PLANT_DEAD_TIME, PLANT_GAIN, COULOMB_LEVEL = (
@@ -155,8 +155,10 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
     measured, gain = log.measured, log.parameters[PLANT_GAIN]
     known = np.isfinite(measured[source]) & np.isfinite(measured[output])
     t, u, y = (a[known] for a in (measured.t, measured[source], measured[output]))
-    few = f"{name}: {len(t)} samples of {source} and {output} are too few to start from; give {MIN_SAMPLES} or more"
-    require(len(t) >= MIN_SAMPLES, few, LogError)
+    few = (
+        f"{name}: {len(t)} samples of {source} and {output} are too few to start from; give {MIN_START_SAMPLES} or more"
+    )
+    require(len(t) >= MIN_START_SAMPLES, few, LogError)
     step = float(np.median(np.diff(t)))
     grid = t[0] + step * np.arange(int((t[-1] - t[0]) / step + 1e-6) + 1)
     held = u[np.searchsorted(t, grid + 1e-3 * step, side="right") - 1]
@@ -167,7 +169,7 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
 
 
 def _thin_log(record: _EvenLog, most: int) -> _EvenLog:
-    every = max(1, len(record.t) // max(most, 5 * MIN_SAMPLES))
+    every = max(1, len(record.t) // max(most, 5 * MIN_START_SAMPLES))
     starts = np.arange(0, len(record.u), every)
     u = np.add.reduceat(record.u, starts) / np.diff(starts, append=len(record.u))
     return _EvenLog(record.t[::every], u, record.y[::every], record.sign[::every], record.gain, record.start_time)
