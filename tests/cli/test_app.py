@@ -265,6 +265,7 @@ def test_ctrl_c_ends_a_real_process_with_130(folder: Path) -> None:
     code = (
         "import os, signal\n"
         "from pneuopt.cli import tune\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a job in the background inherits it as ignored
         "tune.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
         "from pneuopt.cli.app import main\n"
         "main()\n"

@@ -279,8 +279,10 @@ def test_a_function_may_interrupt_the_study(functions: ModuleType) -> None:
 def test_ctrl_c_in_a_terminal_reaches_everybody_and_loses_nothing(functions: ModuleType, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
+        "import signal\n"
         "from pneuopt import Parameter, ParameterSet, sweep\n"
         "from study_functions import hung\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a job in the background inherits it as ignored
         "if __name__ == '__main__':\n"
         "    rig = ParameterSet({'load.mass': Parameter(1.0, 'kg')})\n"
         "    cases = {'quick': {}, 'hung': {'load.mass': 2.0}, 'never': {'load.mass': 3.0}}\n"
