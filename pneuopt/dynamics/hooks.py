@@ -131,6 +131,32 @@ class Contact:
         return f"{limit.event} ({where}) at t = {self.t:.4g} s{speed}; from there {limit.meaning}"
 
 
+class FinalElement(NamedTuple):
+    """The final control element between the command and the body, a valve say: its signals, and words for it.
+
+    Attributes
+    ----------
+    name, moving_part, medium : str
+        Nouns for a sentence: the element, its part that the command moves, the spring through which it pushes the body.
+    limit, dead_zone, bandwidth : str
+        Parameters: the size of the command that moves the part by its half travel; its dead zone [half travels] and,
+        where it lags, its bandwidth [Hz].
+    stroke : str
+        The state of the part [half travels], where it lags.
+    pushing : tuple of str
+        The states whose forces move the body.
+    """
+
+    name: str
+    moving_part: str
+    medium: str
+    limit: str
+    dead_zone: str
+    bandwidth: str
+    stroke: str
+    pushing: tuple[str, ...]
+
+
 class Axis(NamedTuple):
     """The body that a plant moves against friction: the names of its states and of its mass.
 
@@ -142,9 +168,15 @@ class Axis(NamedTuple):
         The parameter that multiplies the speed's rate: a mass, or a moment of inertia.
     force : str
         The unit of what pushes the body.
+    noun : str
+        The body in a sentence.
+    final_element : FinalElement, optional
+        What the command moves first; None where the command is the force itself.
     """
 
     position: str = "position"
     speed: str = "speed"
     inertia: str = "load.mass"
     force: str = "N"
+    noun: str = "mass"
+    final_element: FinalElement | None = None

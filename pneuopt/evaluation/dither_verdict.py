@@ -13,7 +13,7 @@ from pneuopt.control.averaging import ripple
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step, as_steps
-from pneuopt.dynamics.hooks import Rest
+from pneuopt.dynamics.hooks import Axis, FinalElement, Rest
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import METRICS
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 # Amplitude of the loop "without" dither, as a share of the judged one: at zero its means would not be read over the
 # same periods; a much larger one would act as a dither.
 NEGLIGIBLE_AMPLITUDE = 1e-9
-# Share of the static friction below which a dither's force on a piston at rest is said not to loosen it: the working
-# pressure gives the rest of the force, so a dither may loosen with less than all of it; lower promises too much.
+# Share of the static friction below which a dither's force on a body at rest is said not to loosen it: the
+# command gives the rest of the force, so a dither may loosen with less than all of it; lower promises too much.
 MIN_LOOSENING_FORCE = 0.5
 
 
@@ -73,15 +73,15 @@ class DitherEffect:
     amplitude, frequency : float
         [command's unit], [Hz]
     spool : float
-        Amplitude of the spool [half travels].
+        Amplitude of the final element's moving part, a valve's spool [half travels].
     valve_gain : float
         Ratio of the spool's amplitude to the command's, which the valve's lag reduces [1].
     force : float
-        Amplitude of the force on a piston held fast at rest [N].
+        Amplitude of the force on a body held fast at rest [the axis's unit of force].
     speed, travel : float
-        Amplitudes of a piston that moves at the reference's final speed [m/s], [m].
+        Amplitudes of a body that moves at the reference's final speed [its speed's unit], [that times s].
     drive_frequency : float
-        Natural frequency of the load on the air in the chambers, without friction [Hz].
+        Natural frequency of the load on the element's medium, the air in the chambers, without friction [Hz].
     """
 
     amplitude: float
@@ -192,42 +192,30 @@ def judge_dither(
 
 
 def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> DitherEffect:
-    """Amplitudes that the dither causes: force, spool and motion on a `PneumaticDrive`, speed on other plants.
+    """Amplitudes that the dither causes: the motion and, behind a final element, its travel and force.
 
     Parameters
     ----------
     loop : ClosedLoop
     reference : Step
-        The piston moves at its final value, and is held at its start.
+        The body moves at its final value, and is held at its start.
     parameters : ParameterSet
         Values with the dither's amplitude and frequency.
     """
     full = loop.complete(parameters)
     found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
-    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, {"speed": reference.final}))
-    if "speed" in moving:
-        speed = abs(moving["speed"])
+    axis = loop.plant.axis or Axis()
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, {axis.speed: reference.final}))
+    if axis.speed in moving:
+        speed = abs(moving[axis.speed])
         found = replace(found, speed=speed, travel=speed / (2 * pi * found.frequency))
-    if not {"pressure_a", "pressure_b", "speed"} <= set(names(loop.plant.states)) or "valve.span" not in full:
+    if axis.final_element is None:
         return found
-    rest = _try_rest(loop.plant, full, {"speed": reference.initial, **reference.start})
-    held = _state_harmonics(loop, _clamp_piston(loop.plant), full, rest)
-    if rest is None or not held:
-        return found
-    command = found.amplitude / full.value("valve.span")
-    spool = abs(held["valve.spool"]) if "valve.spool" in held else min(1.0, command)
-    linear = loop.plant.linearise(np.array([*rest.states.values()]), rest.inputs, full)
-    row = dict(zip(linear.states, linear.A[linear.states.index("speed")], strict=True))
-    force = full.value("load.mass") * abs(sum(row[n] * held[n] for n in ("pressure_a", "pressure_b")))
-    kept = [linear.states.index(n) for n in ("speed", "pressure_a", "pressure_b")]
-    block = linear.A[np.ix_(kept, kept)]
-    block[0, 0] = 0.0  # without friction
-    rate = float(np.abs(np.linalg.eigvals(block)).max())
-    return replace(found, spool=spool, valve_gain=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
+    return _add_effect_at_rest(found, loop, axis, axis.final_element, reference, full)
 
 
 def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
-    """Sentences on why the dither acts as it does: clipping, valve lag and dead zone, static friction, motion.
+    """Sentences on why the dither acts as it does: clipping, lag and dead zone, static friction, motion.
 
     Parameters
     ----------
@@ -238,27 +226,53 @@ def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: Parameter
     """
     p, e, sentences = parameters, effect, list[str]()
     sentences += _describe_clipping(loop, p)
-    if not isnan(e.valve_gain):
-        dead = p.value("valve.dead_zone")
-        lag = f" at {p.value('valve.bandwidth'):.3g} Hz bandwidth" if "valve.bandwidth" in p else ""
-        zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
-        follows = f"the spool follows {100 * e.valve_gain:.0f} % of the dither{lag}"
-        sentences.append(f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}")
+    axis = loop.plant.axis or Axis()
+    if axis.final_element is not None and not isnan(e.valve_gain):
+        sentences.append(_describe_final_element(axis.final_element, e, p))
     static = next((p.value(f"friction.{n}") for n in ("static", "coulomb") if f"friction.{n}" in p), nan)
     if not isnan(e.force):
-        against = "" if isnan(static) else f" against a static friction of {static:.3g} N"
+        against = "" if isnan(static) else f" against a static friction of {static:.3g} {axis.force}"
         weak = ": too little to loosen it" if e.force < MIN_LOOSENING_FORCE * static else ""
-        sentences.append(
-            f"the force on a piston at rest swings by +-{_format_with_prefix(e.force, 'N')}{against}{weak}"
-        )
+        force = _format_with_prefix(e.force, axis.force)
+        sentences.append(f"the force on a {axis.noun} at rest swings by +-{force}{against}{weak}")
     if not isnan(e.speed):
-        speed, travel = _format_with_prefix(e.speed, "m/s"), _format_with_prefix(e.travel, "m")
-        sentences.append(f"a moving piston swings by +-{speed} and +-{travel}")
-    if not isnan(e.drive_frequency):
+        unit = next(q.unit for q in loop.plant.states if q.name == axis.speed)
+        speed, travel = _format_with_prefix(e.speed, unit), _format_with_prefix(e.travel, unit.removesuffix("/s"))
+        sentences.append(f"a moving {axis.noun} swings by +-{speed} and +-{travel}")
+    if axis.final_element is not None and not isnan(e.drive_frequency):
         ratio = e.frequency / e.drive_frequency
-        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the air"
+        natural = f"the {e.drive_frequency:.3g} Hz at which the load swings on the {axis.final_element.medium}"
         sentences.append(f"the dither's {e.frequency:.3g} Hz are {ratio:.2g} times {natural}")
     return tuple(sentences)
+
+
+def _add_effect_at_rest(
+    found: DitherEffect, loop: ClosedLoop, axis: Axis, element: FinalElement, reference: Step, full: ParameterSet
+) -> DitherEffect:
+    """Add what the dither moves where the body is held at rest: the final element, and the force behind it."""
+    rest = _try_rest(loop.plant, full, {axis.speed: reference.initial, **reference.start})
+    held = _state_harmonics(loop, _clamp_body(loop.plant, axis), full, rest)
+    if rest is None or not held:
+        return found
+    command = found.amplitude / full.value(element.limit)
+    spool = abs(held[element.stroke]) if element.stroke in held else min(1.0, command)
+    linear = loop.plant.linearise(np.array([*rest.states.values()]), rest.inputs, full)
+    row = dict(zip(linear.states, linear.A[linear.states.index(axis.speed)], strict=True))
+    force = full.value(axis.inertia) * abs(sum(row[n] * held[n] for n in element.pushing))
+    kept = [linear.states.index(n) for n in (axis.speed, *element.pushing)]
+    block = linear.A[np.ix_(kept, kept)]
+    block[0, 0] = 0.0  # without friction
+    rate = float(np.abs(np.linalg.eigvals(block)).max())
+    return replace(found, spool=spool, valve_gain=spool / command, force=float(force), drive_frequency=rate / (2 * pi))
+
+
+def _describe_final_element(element: FinalElement, e: DitherEffect, p: ParameterSet) -> str:
+    """Sentence on how far the final element follows the dither, and on its dead zone."""
+    dead = p.value(element.dead_zone)
+    lag = f" at {p.value(element.bandwidth):.3g} Hz bandwidth" if element.bandwidth in p else ""
+    zone = f", {'beyond' if e.spool > dead else 'within'} its dead zone of {dead:.3g}" if dead > 0 else ""
+    follows = f"the {element.moving_part} follows {100 * e.valve_gain:.0f} % of the dither{lag}"
+    return f"{follows} and swings by +-{e.spool:.2g} of its half travel{zone}"
 
 
 def _compare_designs(
@@ -329,8 +343,8 @@ def _format_with_prefix(value: float, unit: str) -> str:
 
 
 def _describe_clipping(loop: ClosedLoop, p: ParameterSet) -> list[str]:
-    """Sentence where offset and amplitude alone exceed the limits of the command or the valve; none otherwise."""
-    low, high, whose = command_range(p)
+    """Sentence where offset and amplitude alone exceed the limits of command or final element; none otherwise."""
+    low, high, whose = command_range(loop, p)
     least, most = (p.value(DITHER_OFFSET) + side * p.value(DITHER_AMPLITUDE) for side in (-1, 1))
     if low <= least and most <= high:
         return []
@@ -361,10 +375,10 @@ def _state_harmonics(loop: ClosedLoop, plant: System, p: ParameterSet, rest: Res
         return {}
 
 
-def _clamp_piston(plant: System) -> System:
-    """The plant with its piston clamped: position, speed and friction states have no rate."""
+def _clamp_body(plant: System, axis: Axis) -> System:
+    """The plant with its body clamped: position, speed and friction states have no rate."""
     t, x, u, p = (ca.SX.sym(n, plant.ode.size1_in(k)) for k, n in enumerate("txup"))
     xdot, y = plant.ode(t, x, u, p)
-    clamped = [n in ("position", "speed") or n.startswith("friction.") for n in names(plant.states)]
+    clamped = [n in (axis.position, axis.speed) or n.startswith("friction.") for n in names(plant.states)]
     rates = ca.vertcat(*(ca.SX(0) if c else xdot[k] for k, c in enumerate(clamped)))
     return replace(plant, ode=ca.Function("ode", [t, x, u, p], [rates, y], ["t", "x", "u", "p"], ["xdot", "y"]))

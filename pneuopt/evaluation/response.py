@@ -104,11 +104,12 @@ def highest_dither_frequency(loop: ClosedLoop, parameters: ParameterSet) -> floa
     return frequency.upper if frequency.free else frequency.value
 
 
-def command_range(p: ParameterSet) -> tuple[float, float, str]:
-    """Lowest and highest command that still acts, and what saturates there: the controller or the valve."""
+def command_range(loop: ClosedLoop, p: ParameterSet) -> tuple[float, float, str]:
+    """Lowest and highest command that still acts, and what saturates there: the controller or the final element."""
     low, high, whose = -math.inf, math.inf, "the command"
     if "pid.lower" in p:
         low, high = p.value("pid.lower"), p.value("pid.upper")
-    if "valve.span" in p and p.value("valve.span") < min(-low, high):
-        low, high, whose = -p.value("valve.span"), p.value("valve.span"), "the valve"
+    element = loop.plant.axis.final_element if loop.plant.axis else None
+    if element is not None and (limit := p.value(element.limit)) < min(-low, high):
+        low, high, whose = -limit, limit, f"the {element.name}"
     return low, high, whose

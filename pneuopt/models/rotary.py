@@ -82,7 +82,7 @@ class RotaryDrive:
         starts = _RotaryStarts(self.friction)
         system = define(states, (TORQUE,), (ANGLE, ANGULAR_SPEED), self.parameters, rhs, starts)
         excitation = self.friction.excitation.with_prefix("friction") | _LOAD_EXCITATION
-        return replace(system, axis=Axis("angle", "speed", "load.inertia", "N*m"), excitation=excitation)
+        return replace(system, axis=Axis("angle", "speed", "load.inertia", "N*m", "axis"), excitation=excitation)
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
         )
         require(n not in divisors or p.lower > 0, f"{n}: its lower bound must be positive, got {p.lower:g} {p.unit}")
         if n == "dither.amplitude":
-            _check_amplitude(full)
+            _check_amplitude(loop, full)
         require(
             not p.log or p.lower > 0, f"{n}: a log parameter needs a positive lower bound, got {p.lower:g} {p.unit}"
         )
@@ -181,9 +181,9 @@ def clip_level(loop: ClosedLoop, p: ParameterSet) -> float:
     return max(abs(p.value("pid.lower")), abs(p.value("pid.upper"))) if loop.pid.limits else float("inf")
 
 
-def _check_amplitude(p: ParameterSet) -> None:
+def _check_amplitude(loop: ClosedLoop, p: ParameterSet) -> None:
     """Refuse an amplitude's bound with which dither alone, around any offset, exceeds the command's range."""
-    (low, high, whose), most = command_range(p), p["dither.amplitude"].upper
+    (low, high, whose), most = command_range(loop, p), p["dither.amplitude"].upper
     unit = p["dither.amplitude"].unit
     require(
         2 * most <= high - low,

@@ -12,6 +12,7 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.dither_verdict import DitherEffect, Usefulness, dither_effect, explain_effect, judge_dither
 from pneuopt.models.catalog import r25, t32
 from pneuopt.models.linear import SecondOrder
+from pneuopt.models.rotary import RotaryDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -132,6 +133,13 @@ def test_another_plant_is_judged_by_its_response_alone() -> None:
     verdict = judge_dither(loop, Step(1.0, horizon=1.0), p)
     assert verdict.usefulness is Usefulness.USELESS
     assert np.isnan(verdict.effect.force)
+
+
+def test_a_rotary_axis_swings_in_radians() -> None:
+    loop = ClosedLoop(RotaryDrive(), PID(), Dither(100.0), measured="speed")
+    p = loop.parameters.with_values({"dither.amplitude": 0.1})
+    text = " ".join(explain_effect(loop, DitherEffect(0.1, 100.0, speed=0.4, travel=0.0006), p))
+    assert "a moving axis swings by +-0.4 rad/s and +-0.6 mrad" in text
 
 
 def test_no_dither_is_nothing_to_judge() -> None:

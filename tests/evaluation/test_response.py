@@ -49,5 +49,5 @@ def test_an_input_that_the_reference_does_not_name_is_zero() -> None:
 
 def test_the_command_ends_at_the_narrower_of_the_controllers_limits_and_the_valves_span() -> None:
     loop, p = axis(None)
-    assert command_range(p) == (-300.0, 200.0, "the command")
-    assert command_range(loop.plant.parameters)[:2] == (-float("inf"), float("inf"))
+    assert command_range(loop, p) == (-300.0, 200.0, "the command")
+    assert command_range(loop, loop.plant.parameters)[:2] == (-float("inf"), float("inf"))

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.excitation import Excitation, SeparatingRun
-from pneuopt.dynamics.hooks import Axis, Log, LogWarningHook, Rest
+from pneuopt.dynamics.hooks import Axis, FinalElement, Log, LogWarningHook, Rest
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
 from pneuopt.models.friction import FrictionModel, Stribeck, law_inputs
@@ -31,6 +31,10 @@ from pneuopt.quantities.trajectories import Trajectory
 
 SIDES = ("a", "b")
 PRESSURE_SIGNALS = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
+_VALVE = FinalElement(
+    "valve", "spool", "air", "valve.span", "valve.dead_zone", "valve.bandwidth", "valve.spool", names(PRESSURE_SIGNALS)
+)
+_AXIS = Axis(noun="piston", final_element=_VALVE)
 
 
 @dataclass(frozen=True)
@@ -187,7 +191,7 @@ class PneumaticDrive:
             validity_limits=cylinder_guards(self.cylinder.stops),
             log_warning_hook=warnings,
             excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION | _FLOW_EXCITATION,
-            axis=Axis(),
+            axis=_AXIS,
         )
         return replace(declared, meter=self._meter_function())
 
