@@ -208,9 +208,9 @@ def _add_dither(
         positive = name in parameters and parameters.value(name) > 0
         require(positive, f"averaging needs a dither: parameters with {name} > 0")
     frequency = parameters.value(DITHER_FREQUENCY)
-    if isinstance(model, ClosedLoop):
-        return _dithered_loop(model, frequency, waveform)
-    return _dithered_plant(model, frequency, actuated, waveform)
+    if model.loop is not None:
+        return _dithered_loop(model.loop, frequency, waveform)
+    return _dithered_plant(model.plant, frequency, actuated, waveform)
 
 
 def _dithered_loop(loop: ClosedLoop, frequency: float, waveform: Waveform | None) -> _DitheredSystem:

@@ -126,6 +126,10 @@ class System:
         """The model itself, as it has no controller."""
         return self
 
+    @property
+    def loop(self) -> None:
+        """None, where `ClosedLoop.loop` is the loop."""
+
     def system(self) -> "System":
         """The system itself, so that a verb takes a drive as well as its system."""
         return self
@@ -380,8 +384,7 @@ def describe(system: System | DiscreteSystem) -> str:
     lines = [type(system).__name__]
     for kind in ("states", "inputs", "outputs"):
         lines += [f"  {kind}: " + (", ".join(f"{q.name} [{q.unit}]" for q in getattr(system, kind)) or "none")]
-    lines += ["  parameters:"] + ["    " + line for line in repr(system.parameters).splitlines()]
-    return "\n".join(lines)
+    return "\n".join([*lines, "  parameters:", *("    " + line for line in repr(system.parameters).splitlines())])
 
 
 def _check_unique_names(kind: str, quantities: Sequence[Quantity]) -> None:

@@ -136,7 +136,7 @@ class Rig:
     @property
     def loop(self) -> ClosedLoop | None:
         """The loop; None where the plant is alone."""
-        return self.model if isinstance(self.model, ClosedLoop) else None
+        return self.model.loop
 
     @property
     def plant(self) -> System:
