@@ -27,7 +27,6 @@ from pneuopt.quantities.trajectories import Trajectory
 
 Symbols = Mapping[str, ca.SX]
 Rhs = Callable[[ca.SX, Symbols, Symbols, Symbols], tuple[Symbols, Symbols]]
-SymbolicUpdate = Callable[[ca.SX, Symbols, Symbols, Symbols], Symbols]
 FRICTION_DIRECTION = "friction.direction"  # parameter of Karnopp's friction: the sign of the motion, set by `simulate`
 
 

@@ -107,3 +107,13 @@ def note_omissions(figure: "Figure", shown: int, available: int, what: str) -> N
     """Write in the corner how many of the available items a figure shows, where it leaves some out."""
     if shown < available:
         figure.text(0.995, 0.005, f"{shown} of {available} {what}", ha="right", fontsize=8, color=GREY)
+
+
+def finish_columns(figure: "Figure", grid: Sequence[Sequence["Axes"]], available: int, what: str) -> "Figure":
+    """Label the first column's axes only, put the legend above, note the columns left out; returns the figure."""
+    for row in grid:
+        for axes in row[1:]:
+            axes.set_ylabel("")
+    legend_above(figure, grid[0][0])
+    note_omissions(figure, len(grid[0]), available, what)
+    return figure

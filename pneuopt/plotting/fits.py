@@ -15,8 +15,7 @@ from pneuopt.plotting.canvas import (
     ORANGE,
     axes_grid,
     common_channels,
-    legend_above,
-    note_omissions,
+    finish_columns,
     plot_unit,
 )
 from pneuopt.quantities.errors import require
@@ -73,12 +72,7 @@ def plot_prediction(runs: Sequence[Trajectory], experiments: Sequence[Experiment
             _draw_comparison(pair, logs[name], channel, label, shown_in)
         grid[0][column].set_title(name, fontsize=9)
         grid[-1][column].set_xlabel("time [s]")
-    for lines in grid:
-        for axes in lines[1:]:
-            axes.set_ylabel("")
-    legend_above(figure, grid[0][0])
-    note_omissions(figure, len(shown), len(logs), "logs")
-    return figure
+    return finish_columns(figure, grid, len(logs), "logs")
 
 
 def _group_by_log(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Mapping[str, Pairs]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.control.reference import Step
-from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_COLUMNS, ORANGE, axes_grid, legend_above, note_omissions
+from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_COLUMNS, ORANGE, axes_grid, finish_columns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -74,12 +74,7 @@ def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure"
             label, factor = DRIVE_SIGNALS[name]
             _draw_signal(axes, response, name, label.format(force=response.force_unit), factor)
         others[-1].set_xlabel("time [s]")
-    for row in grid:
-        for axes in row[1:]:
-            axes.set_ylabel("")
-    legend_above(figure, grid[0][0])
-    note_omissions(figure, len(shown), len(responses), "steps")
-    return figure
+    return finish_columns(figure, grid, len(responses), "steps")
 
 
 def _draw_tracking(axes: "Axes", response: Response, band: float) -> None:
