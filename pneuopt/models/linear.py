@@ -1,4 +1,4 @@
-"""Transfer-function plants with named signals: first order, second order, integrator; dead time; sample delays.
+"""Transfer-function plants with named signals: first order, second order, integrator; dead time.
 
 A dead time is a Padé approximant of order 1 to 5. Its states form a lossless ladder and keep the input's unit and size
 at every dead time, so that the dead time is an ordinary, differentiable parameter. Its fastest pole is at 2, 3.5, 5.1,
@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from pneuopt.dynamics.system import DiscreteSystem, Symbols, System, define, names
+from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.models.declaration import DriveKind, Key, Structure, choice
 from pneuopt.models.drive import FORCE, POSITION, SPEED
@@ -208,57 +208,6 @@ LINEAR_KIND = DriveKind(
     _build_plant,
     any_friction=False,
 )
-
-
-def delay_inputs(system: DiscreteSystem, samples: int, inputs: tuple[str, ...] = ()) -> DiscreteSystem:
-    """Delay inputs by whole samples: a shift register that moves at each sample's update.
-
-    Parameters
-    ----------
-    system : DiscreteSystem
-    samples : int
-        At least 1; the step at sample k then sees the input of sample k - samples, and zero before the first.
-    inputs : tuple of str
-        Which inputs are delayed; empty: all of them.
-
-    Returns
-    -------
-    DiscreteSystem
-        With `samples` + 1 more states for each delayed input, named "valve_voltage_delay_0" (the latest) and so on.
-
-    Raises
-    ------
-    ModelError
-        If `samples` is below 1.
-    UnknownNameError
-        If one of `inputs` is no input of the system.
-    """
-    require(
-        samples >= 1,
-        f"a delay needs at least 1 sample, got {samples}; without a delay use the system itself",
-        ModelError,
-    )
-    check_names("input", inputs, names(system.inputs))
-    chosen = [q for q in system.inputs if not inputs or q.name in inputs]
-    registers = tuple(replace(q, name=f"{q.name}_delay_{k}") for q in chosen for k in range(samples + 1))
-    n, m = len(system.states), samples + 1
-    t, h = ca.SX.sym("t"), ca.SX.sym("h")
-    x, u = ca.SX.sym("x", n + len(registers)), ca.SX.sym("u", len(system.inputs))
-    p = ca.SX.sym("p", len(system.parameters))
-    late, shifted, place = ca.SX(u), ca.SX(x), {q.name: i for i, q in enumerate(system.inputs)}
-    for i, q in enumerate(chosen):
-        first = n + i * m
-        shifted[first : first + m] = ca.vertcat(u[place[q.name]], x[first : first + m - 1])
-        late[place[q.name]] = x[first + m - 1]
-    x_next, y = system.step(t, h, x[:n], late, p)
-    step = ca.Function(
-        "step", [t, h, x, u, p], [ca.vertcat(x_next, x[n:]), y], ["t", "h", "x", "u", "p"], ["x_next", "y"]
-    )
-    if system.update is not None:
-        inputs_after = ca.substitute(late, x, shifted)
-        shifted[:n] = system.update(t, x[:n], inputs_after, p)
-    update = ca.Function("update", [t, x, u, p], [shifted], ["t", "x", "u", "p"], ["x_after"])
-    return replace(system, states=system.states + registers, step=step, update=update)
 
 
 def _assemble_plant(

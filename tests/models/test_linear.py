@@ -6,13 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names, parameter_vector
+from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent
-from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder, delay_inputs
-from pneuopt.quantities.errors import InputError, ModelError, UnknownNameError
+from pneuopt.models.linear import FirstOrder, Integrator, Plant, SecondOrder
+from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -135,45 +133,11 @@ def test_without_friction_force_the_plant_is_linear() -> None:
         )
 
 
-def rolled(system: DiscreteSystem, u: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
-    p = parameter_vector(system.parameters, system.parameters)
-    x, ys, xs = np.zeros(len(system.states)), [], []
-    for k, row in enumerate(u):
-        if system.update is not None:
-            x = np.array(system.update(k * h, x, row, p)).ravel()
-        x_next, y = system.step(k * h, h, x, row, p)
-        xs.append(x)
-        ys.append(np.array(y).ravel())
-        x = np.array(x_next).ravel()
-    return np.array(ys), np.array(xs)
-
-
-@pytest.mark.parametrize("samples", [1, 2, 7])
-def test_a_sampled_delay_shifts_by_whole_samples(samples: int) -> None:
-    rng = np.random.default_rng(1)
-    u = rng.normal(size=(40, 1))
-    plant = discretise(FirstOrder().system())
-    prompt, late = rolled(plant, u, 0.01)[0], rolled(delay_inputs(plant, samples), u, 0.01)[0]
-    assert late[samples:] == pytest.approx(prompt[:-samples], abs=1e-15)
-    assert np.all(late[: samples + 1] == 0.0)
-
-
-def test_a_sampled_delay_reaches_the_controllers_update() -> None:
-    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=0.01)).discrete(2)
-    u = np.sin(np.arange(30.0))[:, None]
-    prompt, late = rolled(loop, u, 0.01)[0], rolled(delay_inputs(loop, 3, ("reference",)), u, 0.01)[0]
-    assert late[3:] == pytest.approx(prompt[:-3], abs=1e-15)
-
-
 def test_bad_input_is_named() -> None:
     with pytest.raises(ModelError, match="pade_order must be 0 to 5, got 6"):
         FirstOrder(pade_order=6).system()
     with pytest.raises(ModelError, match="PressureDependent needs pressures"):
         SecondOrder(friction=PressureDependent(Coulomb()))
-    with pytest.raises(ModelError, match="at least 1 sample, got 0"):
-        delay_inputs(discretise(FirstOrder().system()), 0)
-    with pytest.raises(UnknownNameError, match="did you mean 'valve_voltage'"):
-        delay_inputs(discretise(FirstOrder().system()), 1, ("valve_volt",))
     with pytest.raises(InputError, match=r"plant.dead_time.*outside its bounds"):
         FirstOrder(pade_order=1).system().parameters.with_values({"plant.dead_time": 0.0})
 
