@@ -6,12 +6,12 @@ The concept map, in the order in which data flow:
     read_drive(path)                  -> a drive and its ParameterSet; or build one: ForceDrive(Stribeck())
     identify(drive, logs, freed)      -> IdentificationResult: estimates with confidence intervals
     select_model(drives, logs, ...)   -> which of several models the logs support, and why
-    identifiability(drive, logs, freed) -> Verdict: what the logs can tell, in words, before a fit
+    identifiability(drive, logs, freed) -> Verdict: what the logs can identify, in words, before a fit
     profile, propagate_error(...)     -> an interval where a linear one lies; one of a figure made of estimates
     validate(drive, logs, fitted)     -> how well a held-out log is predicted, and what is left in the residuals
     ClosedLoop(drive, PID, Dither)    -> the loop to be tuned, continuous or sampled
     tune(loop, steps, freed, ...)     -> TuningResult: gains and dither, claimed and certified
-    validate_design(loop, ...)        -> a design on fresh plants: worst, 95th percentile, violations
+    validate_design(loop, ...)        -> a design on new plants: worst, 95th percentile, violations
     judge_dither(loop, steps, tuned)  -> whether the dither is useful, useless or harmful, and why, in numbers
     find_limit_cycle(t, speed)        -> hunting or crawl in a response or a log: amplitude, frequency, stick share
     evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser

@@ -5,8 +5,8 @@
 Data: E. Zillen, "3D-printed-pneumatic-actuator", TU Delft thesis data, 2021, CC0-1.0. A piston of 25 mm is moved to
 and fro at 5-15 mm/s with a constant pressure behind it. The published half-ranges of the O-ring's friction (author's
 method: force less pressure x area) stand beside ours, which share one level and one slope against pressure, with a
-sensor offset a log. Speeds are so few that viscous and Stribeck terms, and a mass, cannot be told; `identifiability`
-refuses them in words, before anything is fitted, and they are left out. The interval
+sensor offset a log. Speeds are so few that viscous and Stribeck terms, and a mass, cannot be identified;
+`identifiability` refuses them in words, before anything is fitted, and they are left out. The interval
 counts correlated residuals as fewer samples; how far the slope moves when one of the four logs is left out stands
 beside it.
 """

@@ -19,7 +19,7 @@ from pneuopt.models.needs import LOAD_EXCITATION
 from pneuopt.models.pneumatic.chamber import ChamberModel, Inflow, Polytropic, Surroundings
 from pneuopt.models.pneumatic.cylinder import Cylinder, areas, piston_leak, volumes
 from pneuopt.models.pneumatic.gas import GAS_CONSTANT
-from pneuopt.models.pneumatic.limits import check_hardware, check_start, cylinder_guards, position_warning
+from pneuopt.models.pneumatic.limits import check_hardware, check_start, cylinder_limits, position_warning
 from pneuopt.models.pneumatic.rest import BALANCE_RATES, MotionBalance, solve_steady_motion
 from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve
 from pneuopt.models.starts.pneumatic import PneumaticStarts
@@ -188,7 +188,7 @@ class PneumaticDrive:
         declared = replace(
             system,
             hardware_check_hook=self.check,
-            validity_limits=cylinder_guards(self.cylinder.stops),
+            validity_limits=cylinder_limits(self.cylinder.stops),
             log_warning_hook=warnings,
             excitation=self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION | _FLOW_EXCITATION,
             axis=_AXIS,

@@ -86,7 +86,7 @@ def position_warning(p: ParameterSet, position: NDArray[np.float64]) -> str:
     return f"{where}, outside the stroke, 0 to {write_value(stroke, 'm')}: {remedy}"
 
 
-def cylinder_guards(stops: bool) -> tuple[ValidityLimit, ...]:
+def cylinder_limits(stops: bool) -> tuple[ValidityLimit, ...]:
     """Validity limits that a simulation of a cylinder watches.
 
     Parameters
@@ -99,17 +99,17 @@ def cylinder_guards(stops: bool) -> tuple[ValidityLimit, ...]:
     tuple of ValidityLimit
         Both ends of the stroke, and both chambers at half the ambient pressure.
     """
-    return (*(_end_guard(side, stops) for side in _END_NAMES), *(_empty_chamber_guard(side) for side in _END_NAMES))
+    return (*(_end_limit(side, stops) for side in _END_NAMES), *(_empty_chamber_limit(side) for side in _END_NAMES))
 
 
-def _end_guard(side: str, stops: bool) -> ValidityLimit:
+def _end_limit(side: str, stops: bool) -> ValidityLimit:
     what = f"reached the {_END_NAMES[side]} end stop" if stops else f"left the stroke at the {_END_NAMES[side]}"
     meaning = "the response is the stop's" if stops else "the model, which has no stops, means nothing"
     limit, margin = (_front_limit if side == "b" else _rear_limit), (STOP_ROUNDING if stops else 0.0)
     return ValidityLimit("position", partial(limit, margin), 1 if side == "b" else -1, f"the piston {what}", meaning)
 
 
-def _empty_chamber_guard(side: str) -> ValidityLimit:
+def _empty_chamber_limit(side: str) -> ValidityLimit:
     meaning = "real seals let air in, the model does not"
     return ValidityLimit(f"pressure_{side}", _empty_chamber_pressure, -1, f"chamber {side} was emptied", meaning)
 
