@@ -258,10 +258,7 @@ class PressureDependent:
     chambers: tuple[str, ...] = CHAMBER_PRESSURES
 
     def __post_init__(self) -> None:
-        message = (
-            f"{self.base} has no Coulomb level that could rise with pressure; take Coulomb(), Stribeck() or LuGre()"
-        )
-        require("coulomb" in self.base.parameters, message, ModelError)
+        check_coulomb_level(self.base, "pressure")
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -270,8 +267,8 @@ class PressureDependent:
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """Gauge pressures of the chambers [Pa(g)]."""
-        return tuple(Quantity(name, "Pa(g)", nominal=1e5) for name in self.chambers)
+        """Inputs of the base model, and gauge pressures of the chambers [Pa(g)]."""
+        return (*self.base.inputs, *(Quantity(name, "Pa(g)", nominal=1e5) for name in self.chambers))
 
     @property
     def parameters(self) -> ParameterSet:
@@ -297,8 +294,7 @@ class PressureDependent:
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """Return the force and the rates of the states; see the class."""
         rise = sum((p[f"coulomb_{name}"] * u[name] for name in self.chambers), start=ca.SX(0))
-        raised = {n: p[n] + rise for n in ("coulomb", "static") if n in p}
-        return self.base.force(v, z, u, {**p, **raised})
+        return self.base.force(v, z, u, raise_levels(p, rise))
 
 
 def law_inputs(law: FrictionModel, signals: Mapping[str, Any], p: Mapping[str, Any]) -> dict[str, Any]:
@@ -306,6 +302,17 @@ def law_inputs(law: FrictionModel, signals: Mapping[str, Any], p: Mapping[str, A
     return {
         q.name: signals[q.name] - p["ambient.pressure"] if q.unit == "Pa(g)" else signals[q.name] for q in law.inputs
     }
+
+
+def check_coulomb_level(base: FrictionModel, cause: str) -> None:
+    """Refuse a base model without the level that rises with `cause`."""
+    message = f"{base} has no Coulomb level that could rise with {cause}; take Coulomb(), Stribeck() or LuGre()"
+    require("coulomb" in base.parameters, message, ModelError)
+
+
+def raise_levels(p: Symbols, rise: ca.SX) -> dict[str, ca.SX]:
+    """Parameters of a law whose Coulomb and static levels are higher by `rise` [N]."""
+    return {**p, **{n: p[n] + rise for n in ("coulomb", "static") if n in p}}
 
 
 def smooth_sign(v: ca.SX, p: Symbols, width: str = "smoothing") -> ca.SX:

@@ -7,11 +7,10 @@ import numpy as np
 
 from pneuopt.dynamics.excitation import Excitation, SeparatingRun
 from pneuopt.dynamics.system import Symbols
-from pneuopt.models.friction import Force, FrictionModel
+from pneuopt.models.friction import Force, FrictionModel, check_coulomb_level, raise_levels
 from pneuopt.models.friction_start import FrictionSamples, FrictionStart
 from pneuopt.models.needs import FRICTION_LEVELS
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
 
@@ -30,8 +29,7 @@ class LoadDependent:
     base: FrictionModel
 
     def __post_init__(self) -> None:
-        message = f"{self.base} has no Coulomb level that could rise with load; take Coulomb(), Stribeck() or LuGre()"
-        require("coulomb" in self.base.parameters, message, ModelError)
+        check_coulomb_level(self.base, "load")
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -74,5 +72,4 @@ class LoadDependent:
     def force(self, v: ca.SX, z: Symbols, u: Symbols, p: Symbols) -> Force:
         """Return the force of the base model with raised levels; see the class."""
         size = ca.sqrt(u["force"] ** 2 + p["load_rounding"] ** 2) - p["load_rounding"]
-        raised = {n: p[n] + p["coulomb_load"] * size for n in ("coulomb", "static") if n in p}
-        return self.base.force(v, z, u, {**p, **raised})
+        return self.base.force(v, z, u, raise_levels(p, p["coulomb_load"] * size))

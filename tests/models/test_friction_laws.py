@@ -4,6 +4,7 @@ import contextlib
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import combinations, product
 from pathlib import Path
 
 import casadi as ca
@@ -47,12 +48,13 @@ SPEEDS = (0.0, 3e-4, -1.5e-3, 0.02, -0.4)
 
 
 def registered() -> dict[str, FrictionModel]:
-    """Every law, and every wrapper around each law that it takes."""
+    """Every law, and every set of wrappers, nested as a file nests them, around each law that takes them."""
     laws = {name: law() for name, law in FRICTION_LAWS.items()}
-    for how, wrapper in FRICTION_WRAPPERS.items():
-        for name, law in FRICTION_LAWS.items():
-            with contextlib.suppress(ModelError):  # a law without the level that the wrapper raises
-                laws[f"{how} {name}"] = wrapper.wrap(law())
+    sets = [chosen for n in range(1, len(FRICTION_WRAPPERS) + 1) for chosen in combinations(FRICTION_WRAPPERS, n)]
+    for chosen, name in product(sets, FRICTION_LAWS):
+        with contextlib.suppress(ModelError):  # a law without the level that the wrapper raises
+            law = functools.reduce(lambda inner, how: FRICTION_WRAPPERS[how].wrap(inner), chosen, FRICTION_LAWS[name]())
+            laws[" ".join((*chosen, name))] = law
     return laws
 
 
@@ -201,7 +203,8 @@ CHECKS: Mapping[str, Callable[[str, FrictionModel], None]] = {
     "passive": check_passive,
     "derivatives": check_derivatives,
 }
-RUNS = [name for name in LAWS if name in FRICTION_LAWS or name.endswith(" coulomb")]  # each law once: they simulate
+ONCE = {*FRICTION_LAWS, *(f"{how} coulomb" for how in FRICTION_WRAPPERS)}
+RUNS = [name for name in LAWS if name in ONCE]  # each law and each wrapper once: they simulate
 
 
 def test_every_registered_law_has_a_row_and_is_run() -> None:
