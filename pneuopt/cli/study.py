@@ -153,7 +153,7 @@ def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, 
     kind: Any = REQUIREMENTS_BY_KEY[key]
     if kind.__name__ in given:
         return given[kind.__name__]
-    require(kind is not StepEnvelope, f"{where}: the tuning says no bounds for step_envelope; add them under [limits]")
+    require(kind is not StepEnvelope, f"{where}: the tuning has no bounds for step_envelope; add them under [limits]")
     plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
     return plain
 

@@ -57,7 +57,7 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     outputs.check([fit, tuning], "bode")
     task, parameters = read_fit_and_tuning(fit, tuning)
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
-    require(bool(task.specification.weights), f"{tuning}: says nothing to minimise; {remedy}")
+    require(bool(task.specification.weights), f"{tuning}: has nothing to minimise; {remedy}")
     require(len(task.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
     with progress("tuning", quiet=quiet) as report_progress:
         result = tune(

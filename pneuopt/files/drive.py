@@ -14,7 +14,7 @@ from pneuopt.dynamics.system import System
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.models.declaration import Alias, Drive, DriveKind, Sections, Structure, choice
 from pneuopt.models.drive_kinds import DRIVE_KINDS
-from pneuopt.quantities.errors import HardwareError, InputError, UnknownNameError, check_names, require
+from pneuopt.quantities.errors import HardwareError, InputError, ModelError, UnknownNameError, check_names, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
@@ -57,8 +57,12 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
         check_names("section", [name], _KNOWN_SECTIONS, places.location(name))
         require(isinstance(section, dict), f"{places.location(name)}: {name} must be a section, [{name}]")
     kind: DriveKind = Structure(sections, _DRIVE_SECTION, places.location).option("drive", "kind")
-    drive = kind.build(Structure(sections, kind.sections, places.location))
-    return drive, _read_parameters(drive.system(), kind, sections, places)
+    try:
+        drive = kind.build(Structure(sections, kind.sections, places.location))
+        system = drive.system()
+    except ModelError as error:  # a law that asks for what its base, or this plant, has not
+        raise ModelError(f"{places.location('friction')}: [friction]: {error}") from None
+    return drive, _read_parameters(system, kind, sections, places)
 
 
 def read_status(path: str | Path) -> Status | None:
@@ -164,7 +168,7 @@ def _check_hardware(system: System, entries: Mapping[str, Any], places: FileLoca
         system.check(system.parameters | ParameterSet({n: Parameter(v, units[n]) for n, v in given.items()}))
     except HardwareError as error:
         if error.parameter not in given:
-            raise InputError(f"{places}: {error} (the model's own value; the file says none)") from None
+            raise InputError(f"{places}: {error} (the model's own value; the file has none)") from None
         written = f"{_parameter_place(error.parameter, places)} = {tomlkit.item(said[error.parameter]).as_string()}"
         raise InputError(f"{written} is impossible; {error.remedy}") from None
 

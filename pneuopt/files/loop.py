@@ -113,7 +113,7 @@ def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
         meant = _GAIN_CORRECTIONS[form].get(key)
         message = f"{key} does not belong to the {form.value} form, which has {', '.join(own)}; say {meant}"
         require(meant is None, f"{where} {message}")
-    require(first in table, f"{where} says no gain; write at least {first}")
+    require(first in table, f"{where} has no gain; write at least {first}")
     require("Tt" not in table or "limits" in table, f"{where} Tt unwinds the integral at limits; write limits, too")
 
 
@@ -121,7 +121,7 @@ def _dither(table: Mapping[str, Any], where: str) -> Dither:
     shape = str(table.get("waveform", "sine"))
     check_names("waveform", [shape], [w.value for w in Waveform], where)
     require(isinstance(table.get("analogue", False), bool), f"{where} analogue must be true or false")
-    require("frequency" in table, f'{where} says no frequency; write frequency = "160 Hz"')
+    require("frequency" in table, f'{where} has no frequency; write frequency = "160 Hz"')
     given = read_parameter(table["frequency"], Parameter(1.0, "Hz"), f"{where} frequency")
     return construct_at(lambda: Dither(given.value, table.get("analogue", False), Waveform(shape)), where)
 
@@ -129,7 +129,7 @@ def _dither(table: Mapping[str, Any], where: str) -> Dither:
 def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | Encoder:
     check_names("key", table, ("lag", "resolution", "filter"), where)
     message = 'write lag = "5 ms", or of an encoder resolution = "10 um" and filter = "5 ms"'
-    require(bool(table), f"{where} says no lag; {message}")
+    require(bool(table), f"{where} has no lag; {message}")
     require("lag" not in table or len(table) == 1, f"{where} has a lag or an encoder, not both; {message}")
     if "lag" in table:
         lag = read_fixed_value(table, "lag", "s", where)
@@ -142,7 +142,7 @@ def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | 
 
 
 def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
-    require("gain" in table, f"{where} says no gain; write gain and time")
+    require("gain" in table, f"{where} has no gain; write gain and time")
     if "time" not in table:
         return Feedforward()
     time = read_parameter(table["time"], Parameter(1.0, "s"), f"{where} time").value

@@ -38,7 +38,7 @@ def read_method(table: Mapping[str, Any], where: str) -> Method | None:
     """
     if not table:
         return None
-    require("kind" in table, f"{where} says no kind; write kind = {' or '.join(map(repr, METHODS))}")
+    require("kind" in table, f"{where} has no kind; write kind = {' or '.join(map(repr, METHODS))}")
     check_names("kind", [str(table["kind"])], METHODS, where)
     kind = METHODS[str(table["kind"])]
     defaults = {f.name: f.default for f in fields(kind) if isinstance(f.default, int | float | tuple)}

@@ -24,7 +24,7 @@ _AXIS_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
 _DEFAULT_METRICS = ("SettlingTime", "Overshoot")
 _BETWEEN_EXAMPLE = 'between = ["settling_time", "peak_control"]'
 _DEFAULT_POINTS = 9
-"""Designs of a front, where the file says none: each is a tuning, so more take long; fewer hide the bend."""
+"""Designs of a front, where the file has none: each is a tuning, so more take long; fewer hide the bend."""
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def _read_axis(name: str, entry: Any, unit: str, where: str) -> SweptAxis:
 def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
     check_names("key", entry, _RANGE_KEYS, where)
     for key in _RANGE_KEYS:
-        require(key in entry, f"{where} says no {key}; write {_AXIS_EXAMPLE}")
+        require(key in entry, f"{where} has no {key}; write {_AXIS_EXAMPLE}")
     steps = entry["steps"]
     counts = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 2
     require(counts, f"{where} steps is the number of values, at least 2, got {steps!r}")
@@ -237,6 +237,6 @@ def _metric_names(metrics: Mapping[str, Any], path: Path) -> tuple[str, ...]:
 
 def _file_path(table: Mapping[str, Any], key: str, path: Path) -> Path:
     if key not in table:
-        raise InputError(f'{path}: [study] says no {key}; write {key} = "{key}.toml"')
+        raise InputError(f'{path}: [study] has no {key}; write {key} = "{key}.toml"')
     require(isinstance(table[key], str), f"{path}: [study] {key} must be a file's name, got {table[key]!r}")
     return path.parent / str(table[key])

@@ -68,7 +68,7 @@ class FileLocations:
         return str(self.path)
 
     def location(self, section: str, key: str = "") -> str:
-        r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it says no such.
+        r"""File and line of a section's head or of one of its keys: "drive.toml:14"; the file where it has no such.
 
         Examples
         --------

@@ -192,7 +192,7 @@ def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
     require(isinstance(start, dict), f'{where} start: write start = {{ position = "250 mm" }}')
     check_names("output", start, outputs, f"{where} start")
     for key in ("horizon",) if "disturbance" in entry else ("step", "horizon"):
-        require(key in entry, f"{where} says no {key}")
+        require(key in entry, f"{where} has no {key}")
     read = {("size" if k == "step" else k): read_fixed_value(entry, k, units[k], where) for k in units if k in entry}
     pushed = _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")
     begun = {n: read_fixed_value(start, n, outputs[n], f"{where} start") for n in start}
@@ -235,7 +235,7 @@ def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path
         bound = REQUIREMENTS_BY_KEY[key].metric.sense.value
         entry = given if isinstance(given, dict) else {bound: given}
         check_names("key", entry, (bound, *_extra_keys(key)), spot)
-        require(bound in entry or key == "step_envelope", f"{spot} says no {bound}")
+        require(bound in entry or key == "step_envelope", f"{spot} has no {bound}")
         at = f"{spot} {bound}" if entry is given else spot
         limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
         found.append(_make_requirement(key, entry, limit, spot))

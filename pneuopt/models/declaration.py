@@ -126,7 +126,7 @@ class Structure:
             if known.required:
                 words = ", ".join(known.choices or ())
                 where = self.location(section, "")
-                raise InputError(f'{where}: [{section}] says no {key}; write {key} = "...", one of: {words}')
+                raise InputError(f'{where}: [{section}] has no {key}; write {key} = "...", one of: {words}')
             return known.usual if known.choices is None else known.choices[known.usual]
         entry = self.written[section][key]
         require(type(entry) in known.types, f"{self.place(section, key)} must be {known.form}, got {entry!r}")

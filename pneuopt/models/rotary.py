@@ -59,7 +59,8 @@ class RotaryDrive:
 
     def __post_init__(self) -> None:
         needed = ", ".join(q.name for q in self.friction.inputs if q.name != "force")
-        require(not needed, f"{type(self.friction).__name__} needs {needed}, which a rotary axis lacks", ModelError)
+        message = f"{type(self.friction).__name__} needs {needed}, which a rotary axis lacks; choose another law"
+        require(not needed, message, ModelError)
 
     @property
     def parameters(self) -> ParameterSet:

@@ -103,7 +103,7 @@ BAD: dict[str, tuple[str, Callable[[Path], None] | None, str]] = {
     "nothing to minimise": (
         TUNE,
         edit("tuning.toml", '[minimise]\nsettling_time = { band = "5 %" }\n', ""),
-        "tuning.toml: says nothing to minimise",
+        "tuning.toml: has nothing to minimise",
     ),
     "limit after the record": (
         TUNE,

@@ -286,7 +286,7 @@ def test_designs_that_fail_are_rows_of_a_front(
         ("peak_control", "peek_control", "[pareto] between: unknown requirement 'peek_control'; did you mean 'peak_"),
         ("80 N", "80 mm", "front.toml: [pareto] lower: unit 'mm' does not measure 'N'"),
         ("80 N", "130 N", "[pareto] lower, 130 N, is not below the 120 N that tuning.toml allows under [limits]"),
-        ('"overshoot"', '"step_envelope"', "[pareto] between: the tuning says no bounds for step_envelope; add them"),
+        ('"overshoot"', '"step_envelope"', "[pareto] between: the tuning has no bounds for step_envelope; add them"),
         ('peak_control"]', 'max_sensitivity"]', "[pareto] lower: unit 'N' does not measure '1'"),
         (
             'peak_control"]\nlower = "80 N"',

@@ -84,7 +84,7 @@ def test_a_front_names_two_requirements_and_the_range_of_the_second(file: Path) 
 BAD = {
     "section": (("[axes]", "[axis]"), "study.toml: unknown section 'axis'; did you mean 'axes'"),
     "key": (("tuning =", "tunning ="), r"\[study\]: unknown key 'tunning'; did you mean 'tuning'"),
-    "no drive": (('drive = "fit.toml"', ""), r'\[study\] says no drive; write drive = "drive.toml"'),
+    "no drive": (('drive = "fit.toml"', ""), r'\[study\] has no drive; write drive = "drive.toml"'),
     "no file": (('"fit.toml"', "3"), r"\[study\] drive must be a file's name, got 3"),
     "no axis": (("[axes]", "[metrics]"), r"\[metrics\]: unknown key"),
     "parameter": (("load.mass", "load.mas"), r"\[axes\]: unknown parameter 'load.mas'; did you mean 'load.mass'"),
@@ -95,7 +95,7 @@ BAD = {
     "unit": (('"2 kg"', '"2 m"'), r"\[axes\] load.mass from: unit 'm' does not measure 'kg'"),
     "one value": (("{ from", '"3 kg"#'), r"\[axes\] load.mass: write a list or a range"),
     "empty": (("{ from", "[]#"), r"\[axes\] load.mass: write a list or a range"),
-    "range": ((", steps = 4", ""), r"\[axes\] load.mass says no steps; write"),
+    "range": ((", steps = 4", ""), r"\[axes\] load.mass has no steps; write"),
     "range's key": (("steps =", "step ="), r"\[axes\] load.mass: unknown key 'step'; did you mean 'steps'"),
     "steps": (("steps = 4", "steps = 1"), "load.mass steps is the number of values, at least 2, got 1"),
     "band": (

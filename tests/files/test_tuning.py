@@ -174,7 +174,7 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
         ('["-5 V", "5 V"]', '["5 V", "-5 V"]', "[pid] limits: 5 V is not below -5 V"),
         ('limits = ["-5 V", "5 V"]', 'Tt = "1 s"', "[pid] Tt unwinds the integral at limits; write limits, too"),
         ('"sine"', '"square"', "[dither]: unknown waveform 'square'"),
-        ('frequency = "160 Hz"', "", '[dither] says no frequency; write frequency = "160 Hz"'),
+        ('frequency = "160 Hz"', "", '[dither] has no frequency; write frequency = "160 Hz"'),
         ('"160 Hz"', '"1000 rad/s"', "[dither] frequency: unit 'rad/s' does not measure 'Hz'; write it in Hz"),
         ("offset = ", "ofset = ", "[dither]: unknown key 'ofset'; did you mean 'offset'?"),
         ('waveform = "sine"', "analogue = 1", "[dither] analogue must be true or false"),
@@ -189,7 +189,7 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
             "[[reference]] 1 start: unknown output 'positon'",
         ),
         ("horizon", "horizn", "[[reference]] 1: unknown key 'horizn'; did you mean 'horizon'?"),
-        ('horizon = "1 s"\n\n[[ref', "\n[[ref", "[[reference]] 1 says no horizon"),
+        ('horizon = "1 s"\n\n[[ref', "\n[[ref", "[[reference]] 1 has no horizon"),
         ('"0.2 m/s"\nhorizon', '"0 m/s"\nhorizon', "[[reference]] 1: Step: size must not be zero"),
         ('step = "-100 mm/s"\ninitial = "0.2 m/s"', 'step = "0.2 m/s"', "two references step between the same values"),
         ("[[reference]]   #", "[reference2]   #", ": unknown section 'reference2'; did you mean 'reference'?"),
@@ -205,7 +205,7 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
         ('"5 %"', '"5 mm"', "[limits] overshoot: unit 'mm' does not measure '1'"),
         ('"5 %"', '"500 %"', "[limits] overshoot: Overshoot: max must be above 0 and below 1, a fraction"),
         ("= 1.6", "= 0.9", "[limits] max_sensitivity: MaxSensitivity: max must be above 1"),
-        ('max = "500 ms", ', "", "[limits] settling_time says no max"),
+        ('max = "500 ms", ', "", "[limits] settling_time has no max"),
         ('"4500 mV"', "4.5", '[limits] peak_control: 4.5 has no unit; write "4.5 V"'),
         ("[limits]\n", "[[limits]]\n", ": limits must be a section, [limits]"),
     ],
@@ -223,7 +223,7 @@ def test_refuses_a_tuning_and_says_where(tmp_path: Path, old: str, new: str, sai
     ("text", "said"),
     [
         ("# nothing\n", "no controller; add a section [pid]"),
-        ('[pid]\nKi = "1 V/m"\n', "[pid] says no gain; write at least Kp"),
+        ('[pid]\nKi = "1 V/m"\n', "[pid] has no gain; write at least Kp"),
         ('[pid]\nKp = "2 V*s/m"\n', "no reference; add [[reference]]"),
         ('[pid]\nKp = "2 V*s/m"\n[reference]\nstep = "1 m/s"\n', "write each reference as a section of its own, [[ref"),
     ],
@@ -298,7 +298,7 @@ def test_a_sensor_lags_what_the_controller_sees(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("[sensor]\n", r'\[sensor\] says no lag; write lag = "5 ms", or of an encoder resolution = "10 um"'),
+        ("[sensor]\n", r'\[sensor\] has no lag; write lag = "5 ms", or of an encoder resolution = "10 um"'),
         ('[sensor]\nlag = "0 ms"\n', r"\[sensor\]: SensorLag: lag must be at least"),
         ('[sensor]\nlag = "5 mm"\n', r"\[sensor\] lag"),
         ('[sensor]\ndelay = "5 ms"\n', r"\[sensor\].*delay"),
@@ -355,7 +355,7 @@ def test_every_kind_of_requirement_has_a_key_and_its_units(tmp_path: Path) -> No
     ("old", "new", "said"),
     [
         ("gain_margin = 2.5", "gain_margin = { max = 2.5 }", "[limits] gain_margin: unknown key 'max'"),
-        ("gain_margin = 2.5", "gain_margin = {}", "[limits] gain_margin says no min"),
+        ("gain_margin = 2.5", "gain_margin = {}", "[limits] gain_margin has no min"),
         ("gain_margin = 2.5", "gain_margin = 0.5", "[limits] gain_margin: GainMargin: min must be above 1"),
         ('"45 deg"', "45", '[limits] phase_margin min: 45 has no unit; write "45 deg"'),
         ('"2 V/ms"', '"2 V"', "[limits] control_rate: unit 'V' does not measure 'V/s'"),
