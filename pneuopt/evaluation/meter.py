@@ -51,8 +51,8 @@ def meter_outputs(
     order, signals = list(loop.parameters), names(loop.inputs)
     inputs = [control if q.name == loop.command.name else u[signals.index(q.name)] for q in plant.inputs]
     plant_parameters = ca.vertcat(*(p[order.index(n)] for n in plant.parameters))
-    found = plant.meter(0, x[: len(plant.states)], ca.vertcat(*inputs), plant_parameters)
-    shown = dict(zip(meter_channels(plant), [found] if plant.meter.n_out() == 1 else found, strict=True))
+    found = plant.meter.call([0, x[: len(plant.states)], ca.vertcat(*inputs), plant_parameters])
+    shown = dict(zip(meter_channels(plant), found, strict=True))
     return [ca.SX(shown[channel]) for channel in channels]
 
 
@@ -93,8 +93,7 @@ def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajecto
     given = {q.name: response[q.name] if q.name in response else np.zeros(len(response)) for q in plant.inputs}
     inputs = np.array([*(given | {loop.command.name: response["control"]}).values()])
     states = response.matrix(names(plant.states)).T
-    found = plant.meter.map(len(response))(0, states, inputs, p)
-    rows = dict(zip(shown, [found] if len(shown) == 1 else found, strict=True))
+    rows = dict(zip(shown, plant.meter.map(len(response)).call([0, states, inputs, p]), strict=True))
     record = meter_record(response.t, {n: np.array(row) for n, row in rows.items()}, start)
     readable = (m for m in METRICS.values() if m.channels and set(m.channels) <= set(shown))
     return {metric.name: float(metric.largest(record)[0]) for metric in readable}
