@@ -1,10 +1,11 @@
 """Whether logs are of one drive."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.identification.compare_logs import compare_logs
+from pneuopt.identification.compare_logs import _disagreements, compare_logs
 from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
@@ -49,7 +50,17 @@ def test_logs_of_one_drive_agree_whatever_is_each_ones_own() -> None:
     assert compare_logs(DRIVE, masses, FREE).agree
 
 
-def test_what_no_two_logs_tell_is_not_compared() -> None:
+@pytest.mark.parametrize(
+    ("deviation", "value", "disagree"), [(3.9, 2.0, 0), (4.1, 2.0, 1), (-4.1, 2.0, 1), (40.0, 1.01, 0)]
+)
+def test_a_disagreement_is_beyond_four_deviations_and_two_percent(
+    deviation: float, value: float, disagree: int
+) -> None:
+    table = pd.DataFrame({"deviation": [deviation], "value": [value], "others": [1.0]})
+    assert len(_disagreements(table)) == disagree
+
+
+def test_what_no_two_logs_identify_is_not_compared() -> None:
     known = FREE.fixed(*TRUTH).freed("load.mass")
     logs = [pushed("a", 1), pushed("b", 2).with_conditions({"load.mass": 3.0})]
     found = compare_logs(DRIVE, logs, known)

@@ -138,7 +138,11 @@ def test_processes_give_what_a_loop_gives_in_the_order_of_the_cases(functions: M
     assert news == [f"{k} of 6 cases" for k in range(1, 7)]
 
 
-def test_whatever_happens_to_a_case_stays_in_its_row(functions: ModuleType) -> None:
+@pytest.mark.parametrize("processes", [1, 2])  # one alone: another has to take the place of one that died
+def test_whatever_happens_to_a_case_stays_in_its_row(
+    functions: ModuleType, processes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: processes)
     table = sweep(functions.troubled, RIG, masses(1, 2, 3, 4, 5, 6, 7, 8)).set_index("case")
     assert table["mass"].dropna().to_dict() == {"1 kg": 1, "6 kg": 6, "7 kg": 7}
     assert (table["process"].dropna() != os.getpid()).all()
