@@ -38,8 +38,9 @@ def driven(amplitude: float = 0.0, sample_time: float | None = 1e-3) -> tuple[Cl
     return loop, (loop.parameters | values).with_values(gains)
 
 
-def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave() -> None:
-    """The valve opens to the front chamber; the air drawn is what that chamber gained, m = p V/(R T) at n = 1."""
+@pytest.mark.parametrize(("side", "volts"), [("a", 1.0), ("b", -1.0)])
+def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave(side: str, volts: float) -> None:
+    """The valve opens to one chamber; the air drawn is what that chamber gained, m = p V/(R T) at n = 1."""
     drive, values = t32()
     plant = drive.system()
     assert plant.meter is not None
@@ -47,15 +48,18 @@ def test_air_that_fills_a_chamber_of_constant_volume_is_what_the_supply_gave() -
     p = values.with_values(held)
     start = drive.rest(p, position=0.25, pressure_b=3.5e5).states
     t = np.linspace(0.0, 0.2, 401)
-    run = simulate(plant, Trajectory(t, {"valve_voltage": np.full(len(t), 1.0)}), p, initial=start)
+    run = simulate(plant, Trajectory(t, {"valve_voltage": np.full(len(t), volts)}), p, initial=start)
     full = (plant.parameters | p).select(plant.parameters)
-    states, u = run.matrix([q.name for q in plant.states]).T, np.full((1, len(t)), 1.0)
+    states, u = run.matrix([q.name for q in plant.states]).T, np.full((1, len(t)), volts)
     flow, spool, _ = (np.array(r) for r in plant.meter.map(len(t))(0, states, u, [full.value(n) for n in full]))
     litres = metered(t, flow, spool, 0.0)["AirUse"]
-    area = np.pi / 4 * p.value("cylinder.bore") ** 2
-    volume = p.value("cylinder.dead_volume_a") + area * run["position"][-1]
-    gained = (run["pressure_a"][-1] - run["pressure_a"][0]) * volume / (287.0 * p.value("ambient.temperature"))
-    assert run["position"][-1] == pytest.approx(0.25, abs=1e-4)
+    bore, rod, stroke = (p.value(f"cylinder.{n}") for n in ("bore", "rod", "stroke"))
+    area = np.pi / 4 * (bore**2 - (rod**2 if side == "b" else 0.0))
+    x = run["position"][-1]
+    volume = p.value(f"cylinder.dead_volume_{side}") + area * (x if side == "a" else stroke - x)
+    pressure = run[f"pressure_{side}"]
+    gained = (pressure[-1] - pressure[0]) * volume / (287.0 * p.value("ambient.temperature"))
+    assert x == pytest.approx(0.25, abs=1e-4)
     assert litres == pytest.approx(1e3 * gained / ANR_DENSITY, rel=2e-3)
     np.testing.assert_allclose(spool[0], run["valve.spool"], atol=1e-12)
 
