@@ -82,7 +82,10 @@ def find_rest(
     plant, measured = loop.plant, loop.feedback.name
     require(measured not in start, f"start: {measured!r} is what the loop controls; give it as initial=")
     if plant.rest_hook is not None:
-        rest = plant.rest_hook(parameters, {measured: reference, **start})
+        try:
+            rest = plant.rest_hook(parameters, {measured: reference, **start})
+        except ConvergenceError as error:
+            raise _no_rest(loop, reference, error) from None
         return np.array([rest.states.get(n, 0.0) for n in names(plant.states)]), rest.inputs.get(loop.command.name, 0.0)
     free = unobservable_states(plant, measured)
     others = ", ".join(sorted(start.keys() - free))
@@ -92,8 +95,7 @@ def find_rest(
     try:
         x = system.equilibrium({"reference": reference}, parameters, guess)
     except ConvergenceError as error:
-        message = f"the loop neither rests nor moves steadily at {measured} {reference:g} {loop.feedback.unit}: {error}"
-        raise ConvergenceError(f"{message}, or give x_plant", error.solution) from None
+        raise _no_rest(loop, reference, error) from None
     found = {**start, **dict(zip(names(system.states), x.tolist(), strict=True))}
     u = [reference] + [0.0] * (len(system.inputs) - 1)
     command = float(system.ode(0, x, u, parameter_vector(system.parameters, parameters))[1][-1])
@@ -123,6 +125,12 @@ def unobservable_states(plant: System, measured: str) -> tuple[str, ...]:
     what = ca.vertcat(xdot, y[names(plant.outputs).index(measured)])
     matters = ca.which_depends(what, x, 1)
     return tuple(n for n, counts in zip(names(plant.states), matters, strict=True) if not counts)
+
+
+def _no_rest(loop: WiredLoop, reference: float, error: ConvergenceError) -> ConvergenceError:
+    where = f"{loop.feedback.name} {reference:g} {loop.feedback.unit}"
+    message = f"the loop neither rests nor moves steadily at {where}: {error}, or give x_plant"
+    return ConvergenceError(message, error.solution)
 
 
 def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSet) -> System:

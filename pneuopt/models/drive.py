@@ -8,6 +8,7 @@ import casadi as ca
 
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, System, define, names
+from pneuopt.models.axis_rest import with_rest
 from pneuopt.models.declaration import DriveKind, flag
 from pneuopt.models.friction import FrictionModel, law_inputs
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
@@ -61,7 +62,7 @@ class ForceDrive:
         starts = partial(force_starts, self.friction)
         system = define((POSITION, SPEED, *inner), inputs, (POSITION, SPEED), self.parameters, rhs, starts)
         excitation = self.friction.excitation.with_prefix("friction") | LOAD_EXCITATION
-        return replace(system, excitation=excitation, axis=Axis(), meter=_power_meter(system))
+        return with_rest(replace(system, excitation=excitation, meter=_power_meter(system)), FORCE, Axis())
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import casadi as ca
 
 from pneuopt.dynamics.hooks import Axis, Log, Start
 from pneuopt.dynamics.system import Symbols, System, define
+from pneuopt.models.axis_rest import with_rest
 from pneuopt.models.declaration import DriveKind
 from pneuopt.models.friction import Coulomb, FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
@@ -83,7 +84,8 @@ class RotaryDrive:
         starts = _RotaryStarts(self.friction)
         system = define(states, (TORQUE,), (ANGLE, ANGULAR_SPEED), self.parameters, rhs, starts)
         excitation = self.friction.excitation.with_prefix("friction") | _LOAD_EXCITATION
-        return replace(system, axis=Axis("angle", "speed", "load.inertia", "N*m", "axis"), excitation=excitation)
+        axis = Axis("angle", "speed", "load.inertia", "N*m", "axis")
+        return with_rest(replace(system, excitation=excitation), TORQUE, axis)
 
 
 @dataclass(frozen=True)
