@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from pneuopt.control.command import added_command
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
@@ -172,7 +173,7 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        (lead, added), seen, y = self._feedforward_terms(x, u, p), Signals(), self._plant_rates(t, x, u, p, ca.SX(0))[1]
+        (moved, added), seen, y = added_command(self, t, x, u, p), Signals(), self._plant_rates(t, x, u, p, ca.SX(0))[1]
         if self.sensor:
             seen = self.sensor.update(
                 without_prefix(x, "sensor"), y, self._sensor_feedback, without_prefix(p, "sensor")
@@ -182,10 +183,10 @@ class ClosedLoop:
             without_prefix(x, "pid"),
             u["reference"],
             measured,
-            self._dither_command(t, p) + added,
+            added,
             without_prefix(p, "pid"),
         )
-        after = stack({**x, **with_prefix(seen, "sensor"), **with_prefix(own, "pid"), **lead})
+        after = stack({**x, **with_prefix(seen, "sensor"), **with_prefix(own, "pid"), **moved})
         return ca.Function("update", [t, *map(stack, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
 
     def discrete(self, substeps: int = 1) -> DiscreteSystem:
@@ -320,17 +321,17 @@ class ClosedLoop:
         return np.concatenate([x, sensor, own, [reference] if self.feedforward else []])
 
     def _continuous_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        lead, added = self._feedforward_terms(x, u, p)
+        moved, added = added_command(self, t, x, u, p)
         seen = x["sensor.reading"] if self.sensor else self._plant_rates(t, x, u, p, ca.SX(0))[1][self.feedback.name]
         rates, command = self.pid.rates(
             without_prefix(x, "pid"),
             u["reference"],
             seen,
-            self._dither_command(t, p) + added,
+            added,
             without_prefix(p, "pid"),
         )
         xdot, y = self._plant_rates(t, x, u, p, command)
-        own = with_prefix(rates, "pid") | lead | self._sensor_rates(x, y, p)
+        own = with_prefix(rates, "pid") | moved | self._sensor_rates(x, y, p)
         return xdot | own, y | {"control": command}
 
     def _hold_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
@@ -342,25 +343,6 @@ class ClosedLoop:
         xdot, y = self._plant_rates(t, x, u, p, command)
         own = {n: ca.SX(0) for n in x if n.startswith(("pid.", "feedforward."))} | self._sensor_rates(x, y, p)
         return xdot | own, y | {"control": command}
-
-    def _dither_command(self, t: ca.SX, p: Symbols) -> ca.SX:
-        """What the controller itself adds."""
-        if self.dither is None:
-            return ca.SX(0)
-        own = without_prefix(p, "dither")
-        sampled_apart = self.dither.analogue and self.pid.sample_time is not None
-        return own["offset"] if sampled_apart else own["offset"] + self.dither.wave(t, own)
-
-    def _feedforward_terms(self, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
-        """The feedforward's state, its rate or with a sampled PID its next value, and what it adds to the command."""
-        if self.feedforward is None:
-            return {}, ca.SX(0)
-        own, h = (
-            (without_prefix(x, "feedforward"), u["reference"], without_prefix(p, "feedforward")),
-            self.pid.sample_time,
-        )
-        moved, added = self.feedforward.rates(*own) if h is None else self.feedforward.update(*own, h)
-        return with_prefix(moved, "feedforward"), added
 
     def _sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
         if self.sensor is None:
