@@ -106,6 +106,7 @@ from .shooting.least_squares import LeastSquares
 from .studies.sweep import grid, sweep
 from .tuning.condensed import Condensed
 from .tuning.pareto import pareto_front
+from .tuning.racing import Racing
 from .tuning.screening import Screening
 from .tuning.tune import TuningResult, tune
 from .tuning.two_phase import TwoPhase
@@ -178,6 +179,7 @@ __all__ = [
     "PropagatedValue",
     "ProportionalValve",
     "Quantity",
+    "Racing",
     "Recording",
     "Rig",
     "Ripple",

@@ -125,6 +125,7 @@ PUBLIC_NAMES = [
     "read_log",
     "read_tuning",
     "record",
+    "Racing",
     "Recording",
     "resample",
     "respond",

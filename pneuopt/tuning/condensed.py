@@ -135,7 +135,7 @@ class Condensed:
     def check(self, task: TuningTask) -> None:
         """Refuse requirements and parameters without a gradient: `InputError` names them and the remedy."""
         strange = _nonsmooth_terms(task)
-        require(not strange, f"Condensed has no gradient for {', '.join(strange)}; use method=Screening()")
+        require(not strange, f"Condensed has no gradient for {', '.join(strange)}; use method=Racing()")
 
     def suits(self, task: TuningTask) -> bool:
         """Whether there are scenarios or many gains, and gradients of all requirements to all that is free."""

@@ -5,12 +5,13 @@ from types import MappingProxyType
 
 from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.method import Method, TuningTask
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.two_phase import TwoPhase
 
-# By their key in a tuning's file; the first that suits a task is chosen, and the last suits every task.
-METHODS: Mapping[str, type[TwoPhase] | type[Condensed] | type[Screening]] = MappingProxyType(
-    {"two_phase": TwoPhase, "condensed": Condensed, "screening": Screening}
+# By their key in a tuning's file; the first that suits a task is chosen: `Racing` suits every task.
+METHODS: Mapping[str, type[TwoPhase] | type[Racing] | type[Condensed] | type[Screening]] = MappingProxyType(
+    {"two_phase": TwoPhase, "racing": Racing, "condensed": Condensed, "screening": Screening}
 )
 
 

@@ -88,7 +88,7 @@ class Screening:
         """Accept every task: a simulation can be searched whatever the loop."""
 
     def suits(self, task: TuningTask) -> bool:  # noqa: ARG002
-        """Whether it is the one to choose: always, as the last in `METHODS`."""
+        """Whether it could be chosen: always."""
         return True
 
     def find(

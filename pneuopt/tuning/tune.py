@@ -1,7 +1,7 @@
 """`tune`: find PID gains and dither together, and certify them by a simulation that shares nothing with the search.
 
 A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or sampling, by compiled simulation
-(`Condensed`, `Screening`). The gains are rounded first and certified then, so that the printed numbers are proven.
+(`Racing`). The gains are rounded first and certified then, so that the printed numbers are proven.
 """
 
 import time
@@ -62,10 +62,9 @@ def tune(
     scenarios : mapping of str to mapping, optional
         Plants beside the nominal one, or tolerances of the gains: of `corners`, `samples`, `draws`, `tolerances`, or
         several of them joined with ``|``. The worst over references and scenarios counts.
-    method : TwoPhase, Condensed, Screening or another Method, optional
-        By default the first of them that suits: `TwoPhase` for one linear plant with a continuous controller that no
-        clip can hold back, if it has equations for all that is asked for; `Condensed` for scenarios or many gains where
-        all is differentiable; else, or where `TwoPhase` fails, `Screening`.
+    method : TwoPhase, Racing or another Method, optional
+        By default the first that suits: `TwoPhase` for one linear plant with a continuous controller that no clip can
+        hold back, if it has equations for all that is asked for; else, or where `TwoPhase` fails, `Racing`.
     throw : bool
         Raise an error if no design is certified; otherwise the result's status says so.
     progress : callable, optional
@@ -80,7 +79,7 @@ def tune(
     InputError
         If parameters, bounds and requirements do not fit together; the message names the one.
     ConvergenceError
-        If the limits cannot be kept, the independent simulation does not confirm them, or Ctrl-C cuts the screening
+        If the limits cannot be kept, the independent simulation does not confirm them, or Ctrl-C cuts the search
         short; the error's `solution` is the result, with the given gains unchanged: `claimed` and `certified` are
         those of the best point found, which is in its `stats`.
 

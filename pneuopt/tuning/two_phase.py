@@ -24,12 +24,12 @@ from pneuopt.quantities.status import ProgressCallback
 from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.tuning.method import SearchResult, TuningTask
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue
 from pneuopt.tuning.two_phase_transcription import BAND_PARAMETER, transcribe_two_phase, without_clip
 
-# RK4 steps between two nodes up to which the method is chosen. A lower number leaves loops to the screening that are
+# RK4 steps between two nodes up to which the method is chosen. A lower number leaves loops to the race that are
 # solved in seconds (the published one takes 3 steps); with a higher one the problem takes minutes (50 steps: a lag with
 # dead time and wide bounds).
 MAX_STEPS_A_SEGMENT = 12
@@ -81,19 +81,17 @@ class TwoPhase:
         require(self.digits is None or self.digits >= 2, f"TwoPhase: digits must be at least 2, got {self.digits}")
 
     @property
-    def successor(self) -> Screening:
+    def successor(self) -> Racing:
         """A search by simulation, for the exact problem keeps the response in the band at its nodes only."""
-        return Screening()
+        return Racing()
 
     def check(self, task: TuningTask) -> None:
         """Refuse loops that are not linear, scenarios and requirements without an equation, by an `InputError`."""
-        message = (
-            "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Screening()"
-        )
+        message = "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Racing()"
         require(is_linear(task.loop), message)
         require(not task.scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
         inexact = _inexact_requirements(task.spec)
-        require(not inexact, f"TwoPhase has no equation for {', '.join(inexact)}; use method=Screening()")
+        require(not inexact, f"TwoPhase has no equation for {', '.join(inexact)}; use method=Racing()")
 
     def suits(self, task: TuningTask) -> bool:
         """Whether the loop is linear, not clipped and without scenarios, and all that is asked for has an equation."""
@@ -156,7 +154,7 @@ def is_linear(loop: ClosedLoop) -> bool:
 
 
 def has_few_steps(loop: ClosedLoop, references: Sequence[Step], space: Space, method: TwoPhase) -> bool:
-    """Whether few enough RK4 steps lie between two nodes for the problem to take less time than a screening."""
+    """Whether few enough RK4 steps lie between two nodes for the problem to take less time than a simulated one."""
     own = Space(space.parameters, tuple(n for n in space.names if n not in ("pid.Tt", "pid.lower", "pid.upper")))
     rate = fastest_eigenvalue(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))]).max()
     longest = max(r.horizon for r in references) / min(method.nodes)

@@ -159,7 +159,7 @@ def _state_before_step(loop: ClosedLoop, space: Space, reference: Step) -> Array
         require(
             bool(np.all(np.abs(first - other) <= 1e-9 * scale)),
             f"before the step the loop rests in a state that depends on its gains (reference {reference.initial:g}, or "
-            "a load): the two-phase problem needs one that does not; step from zero, or use method=Screening()",
+            "a load): the two-phase problem needs one that does not; step from zero, or use method=Racing()",
         )
     return first
 

@@ -201,7 +201,7 @@ def test_search_and_certificate_count_alike(step: Step) -> None:
 def test_counts_are_tuned_by_screening() -> None:
     loop = encoder_loop(Encoder(2e-5, LAG))
     given = loop.parameters.with_values(SPEED_GAINS).with_bounds({"pid.Kp": (50.0, 600.0)}).freed("pid.Kp")
-    told = r"Condensed has no gradient for sensor\.resolution \(an encoder's counts\); use method=Screening\(\)"
+    told = r"Condensed has no gradient for sensor\.resolution \(an encoder's counts\); use method=Racing\(\)"
 
     def tuned(loop: ClosedLoop, method: Condensed | Screening, scenarios: Scenarios) -> bool:
         step, limits = Step(0.1, horizon=0.3), [Overshoot(0.1)]

@@ -126,7 +126,7 @@ def test_an_integral_is_minimised_within_limits() -> None:
 @pytest.mark.parametrize("requirement", [RiseTime(), Ripple()])
 def test_what_has_no_slope_is_named_with_the_remedy(requirement: Requirement) -> None:
     loop, given = friction_loop(Dither(80.0))
-    with pytest.raises(InputError, match=rf"no gradient for {type(requirement).__name__}; use method=Screening"):
+    with pytest.raises(InputError, match=rf"no gradient for {type(requirement).__name__}; use method=Racing"):
         tune(loop, Step(0.1), given, minimise=requirement, method=QUICK)
 
 
@@ -203,7 +203,7 @@ def test_a_limit_holds_the_answer_back() -> None:
 def test_what_has_no_gradient_is_refused() -> None:
     loop, given = friction_loop(Dither(80.0))
     free = given.with_bounds({"dither.frequency": (40.0, 100.0)}).freed("dither.frequency")
-    with pytest.raises(InputError, match=r"no gradient for dither\.frequency; use method=Screening"):
+    with pytest.raises(InputError, match=r"no gradient for dither\.frequency; use method=Racing"):
         tune(loop, Step(0.1), free, minimise=SettlingTime(), method=QUICK)
 
 
@@ -244,11 +244,11 @@ def test_a_working_set_takes_in_the_case_that_it_missed() -> None:
     assert best.parameters.value("pid.Kp") == pytest.approx(math.log(50) / 0.35, rel=0.015)
 
 
-@pytest.mark.parametrize(("friction", "kind"), [(Viscous(), "TwoPhase"), (Stribeck(), "Screening")])
-def test_one_plant_and_few_gains_are_left_to_the_other_methods(friction: Viscous | Stribeck, kind: str) -> None:
+@pytest.mark.parametrize(("friction", "kind"), [(Viscous(), "TwoPhase"), (Stribeck(), "Racing")])
+def test_a_race_is_chosen_for_all_that_has_no_exact_problem(friction: Viscous | Stribeck, kind: str) -> None:
     loop = ClosedLoop(ForceDrive(friction).system(), PID())
     given = loop.parameters.with_bounds({"pid.Kp": (1.0, 10.0)}).freed("pid.Kp")
     space, spec = search_space(loop, given), specify(SettlingTime())
     assert type(choose_method(TuningTask(loop, (STEP,), {}, space, spec))).__name__ == kind
     heavy: Scenarios = {"heavy": {"load.mass": 9.0}}
-    assert type(choose_method(TuningTask(loop, (STEP,), heavy, space, spec))).__name__ == "Condensed"
+    assert type(choose_method(TuningTask(loop, (STEP,), heavy, space, spec))).__name__ == "Racing"

@@ -131,7 +131,7 @@ def test_a_linear_loop_is_screened_where_the_exact_problem_has_no_equation() -> 
     loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
     given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
     limits: list[Requirement] = [PeakControl(4.0), ControlRate(30.0)]
-    with pytest.raises(InputError, match=r"TwoPhase has no equation for IAE, ControlRate; use method=Screening\(\)"):
+    with pytest.raises(InputError, match=r"TwoPhase has no equation for IAE, ControlRate; use method=Racing\(\)"):
         tune(loop, Step(1.0), given, minimise=IAE(), subject_to=limits, method=TwoPhase())
     found = tune(loop, Step(1.0), given, minimise=IAE(), subject_to=limits)
     assert column(found.certified)["ControlRate"] <= 30.0

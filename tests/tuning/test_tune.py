@@ -243,7 +243,7 @@ def test_no_reference_is_refused() -> None:
 
 def test_two_phase_refuses_friction() -> None:
     loop, parameters = friction_loop(None)
-    with pytest.raises(InputError, match="Screening"):
+    with pytest.raises(InputError, match="Racing"):
         tune(loop, STEP, parameters, minimise=SettlingTime(), method=TwoPhase())
 
 
