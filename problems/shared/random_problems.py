@@ -70,7 +70,7 @@ def problem(seed: int) -> Problem:
     kind = list(KINDS)[seed % len(KINDS)]
     for redrawn in range(MOST_DRAWS):
         plant = KINDS[kind](rng)
-        steps, minimise = _steps(plant, rng), _objective(rng)
+        steps, minimise = random_steps(plant, rng), _objective(rng)
         kinds = _limited(plant.loop, rng)
         try:
             known = _brute_force(plant, steps, kinds, rng)
@@ -196,7 +196,7 @@ def _freed(loop: po.ClosedLoop, given: po.ParameterSet, ranges: Ranges, rng: np.
     return given.with_bounds(free).freed(*free)
 
 
-def _steps(plant: Plant, rng: np.random.Generator) -> list[po.Step]:
+def random_steps(plant: Plant, rng: np.random.Generator) -> list[po.Step]:
     """One to three, either direction, some from motion; labels tell them apart."""
     found: dict[str, po.Step] = {}
     for _ in range(int(rng.integers(1, 4))):

@@ -16,6 +16,7 @@ INSIDE = {
     "problems/speed/linear_tuning.py": SEARCH,
     "problems/speed/simulation_speed.py": "times the compiled simulation, lane by lane",
     "problems/speed/t32.py": SEARCH,
+    "problems/tune/random_designs.py": "confirms refusals by brute force on the search's batched simulator",
     "problems/tune/pareto.py": "times the solver along a front, and sets brute force on its designs",
     "problems/dither/dither_map.py": "simulates the cells of a map in one batch",
 }
