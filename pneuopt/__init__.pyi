@@ -24,6 +24,7 @@ from .control.sensor import Encoder, SensorLag
 from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
 from .dynamics.stick_slip import EventKind
 from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
+from .evaluation.certificate import Certificate, Defect, Finding, certificate
 from .evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
 from .evaluation.energy import EnergyUse
 from .evaluation.evaluate import evaluate, respond
@@ -122,6 +123,7 @@ __all__ = [
     "AirUse",
     "Asymmetric",
     "BandCentre",
+    "Certificate",
     "ClosedLoop",
     "Code",
     "Condensed",
@@ -129,6 +131,7 @@ __all__ = [
     "ConvergenceError",
     "Coulomb",
     "Cylinder",
+    "Defect",
     "DesignValidation",
     "DiscreteSystem",
     "Dither",
@@ -139,6 +142,7 @@ __all__ = [
     "Experiment",
     "Factor",
     "Feedforward",
+    "Finding",
     "FirstOrder",
     "ForceDrive",
     "Form",
@@ -213,6 +217,7 @@ __all__ = [
     "average_dither",
     "bumpless_transfer",
     "catalog",
+    "certificate",
     "coarse_delay",
     "compare_logs",
     "contacts",

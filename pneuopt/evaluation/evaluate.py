@@ -1,7 +1,7 @@
-"""`evaluate`: the certificate of a loop's gains, by a simulation that shares nothing with the search; or on a rig."""
+"""`evaluate`: the metrics of a loop's gains, by a simulation that no search takes part in; or those of a rig."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from math import inf, nan
 from typing import TYPE_CHECKING
 
@@ -46,7 +46,9 @@ def evaluate(
     band: float = 0.02,
     envelope: Envelope = (),
 ) -> "pd.DataFrame":
-    """Metrics of a loop at the given parameters, by a tight simulation that no search shares (the certificate).
+    """Metrics of a loop at the given parameters over the references' horizons, by a tight simulation.
+
+    `certificate` judges them, and continues each response beyond its horizon.
 
     Parameters
     ----------
@@ -103,14 +105,57 @@ def evaluate(
     >>> ["MaxSensitivity" in found.index for found in (smooth, real)]
     [True, False]
     """
+    return tabulate_metrics(
+        evaluate_cases(loop, references, parameters, scenarios=scenarios, band=band, envelope=envelope)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CaseEvaluation:
+    """One reference on one plant as `evaluate` finds it.
+
+    Attributes
+    ----------
+    loop : ClosedLoop
+        With inputs for the references' disturbances.
+    case : TuningCase
+    parameters : ParameterSet
+        Every parameter of the loop, with this case's values.
+    metrics : dict of str to float
+    response : Trajectory
+        States and outputs up to the horizon; a rig's truth.
+    """
+
+    loop: ClosedLoop
+    case: TuningCase
+    parameters: ParameterSet
+    metrics: dict[str, float]
+    response: Trajectory
+
+
+def tabulate_metrics(evaluations: Iterable[CaseEvaluation]) -> "pd.DataFrame":
+    """A row a metric, a column a case."""
     import pandas as pd
 
+    return pd.DataFrame({found.case.label: found.metrics for found in evaluations})
+
+
+def evaluate_cases(
+    loop: ClosedLoop | Rig,
+    references: Step | Sequence[Step],
+    parameters: ParameterSet,
+    *,
+    scenarios: Scenarios = NO_SCENARIOS,
+    band: float = 0.02,
+    envelope: Envelope = (),
+) -> Iterator[CaseEvaluation]:
+    """Evaluate one case after the other; parameters and errors as for `evaluate`."""
     steps = as_steps(references)
     check_parameters(parameters)
     inner, rig = _loop_and_rig(loop, steps)
     full = inner.complete(parameters)
-    every = cases(steps, scenarios, full)
-    return pd.DataFrame({case.label: _evaluate_case(inner, rig, case, full, band, envelope) for case in every})
+    for case in cases(steps, scenarios, full):
+        yield _evaluate_case(inner, rig, case, full, band, envelope)
 
 
 def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
@@ -142,17 +187,17 @@ def _respond(loop: ClosedLoop, rig: Rig | None, reference: Step, parameters: Par
 
 def _evaluate_case(
     loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: ParameterSet, band: float, envelope: Envelope
-) -> dict[str, float]:
+) -> CaseEvaluation:
     parameters = case.case_parameters(parameters)
     response = _respond(loop, rig, case.reference, parameters)
     metrics = measure(loop, parameters, case.reference, response, band, envelope)
     metrics |= limit_cycle_metrics(loop, parameters, case.reference, response)
     metrics |= meter_metrics(loop, parameters, response, case.reference.at)
-    if rig is not None:
-        return metrics
-    x, command = final_operating_point(loop, parameters, response)
-    metrics |= friction_slope(loop, parameters, x, command)
-    return metrics | _margin_metrics(loop, parameters, x, command, case.reference)
+    if rig is None:
+        x, command = final_operating_point(loop, parameters, response)
+        metrics |= friction_slope(loop, parameters, x, command)
+        metrics |= _margin_metrics(loop, parameters, x, command, case.reference)
+    return CaseEvaluation(loop, case, parameters, metrics, response)
 
 
 def final_operating_point(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory) -> tuple[Array, float]:

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
@@ -28,6 +29,8 @@ class TuningTask:
         The free gains, and every parameter of the loop.
     spec : Specification
         Objective and limits, as asked for.
+    accept : tuple of Defect
+        Defects with which a design is certified all the same.
     """
 
     loop: ClosedLoop
@@ -35,6 +38,7 @@ class TuningTask:
     scenarios: Scenarios
     space: Space
     spec: Specification
+    accept: tuple[Defect, ...] = ()
 
     @property
     def horizon(self) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.certificate import Certificate, certificate
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
@@ -39,6 +39,8 @@ MAX_CERTIFIED_EXCESS = 0.01
 # Room left of a limit, a fraction of it, within which it counts as active. A smaller one misses limits that the
 # search's margin keeps a design away from; a larger one names limits that hold nothing back.
 ACTIVE_ROOM = 0.02
+# Defects that a status tells: fewer hide that there are several; more bury the remedy.
+MAX_DEFECTS_TOLD = 3
 RELAXATION_COLUMNS = ("asked", "needed", "share")
 TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.metric.headline)
 
@@ -75,6 +77,8 @@ class TuningResult:
         "friction_slope[0 to 0.2]" and so on, the slope of friction with which that case's margins are read [N s/m];
         where the given gains stand "rejected.pid.Kp" and so on, and "contacts" where a response ran into an end stop.
     provenance : mapping of str to str
+    certificate : Certificate, optional
+        All that the independent evaluation found; None where its simulation stopped.
     """
 
     parameters: ParameterSet
@@ -86,6 +90,7 @@ class TuningResult:
     status: Status
     stats: Mapping[str, float]
     provenance: Mapping[str, str]
+    certificate: Certificate | None = None
 
     def __repr__(self) -> str:
         free = self.parameters.select(self.parameters.free_names)
@@ -116,12 +121,11 @@ class Certifier:
         rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:
-            certified, contacts = self._evaluate(parameters)
-            slopes = _friction_slopes(certified)
-            certified = certified.loc[shown]
-            status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, certified)
+            proof, contacts = self._evaluate(parameters)
+            slopes, certified = _friction_slopes(proof.metrics), proof.metrics.loc[shown]
+            status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, proof)
         except ConvergenceError as error:
-            certified, contacts, slopes = claimed * np.nan, [], {}
+            proof, certified, contacts, slopes = None, claimed * np.nan, [], {}
             status = Status(Code.NOT_CERTIFIED, (str(error),))
         deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
         values = dict(zip(self.task.space.names, point.tolist(), strict=True))
@@ -143,13 +147,14 @@ class Certifier:
                 *self.task.references,
                 *self.task.scenarios.items(),
             ),
+            proof,
         )
 
-    def _evaluate(self, parameters: ParameterSet) -> tuple["pd.DataFrame", list[str]]:
-        """The certified metrics, and the warnings of end stops and emptied chambers that the responses met."""
+    def _evaluate(self, parameters: ParameterSet) -> tuple[Certificate, list[str]]:
+        """The certificate, and the warnings of end stops and emptied chambers that the responses met."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PhysicsWarning)
-            certified = evaluate(
+            found = certificate(
                 self.task.loop,
                 self.task.references,
                 parameters,
@@ -157,12 +162,21 @@ class Certifier:
                 band=self.task.spec.band,
                 envelope=self.task.spec.envelope,
             )
-        return certified, [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
+        return found, [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
 
-    def _certificate_status(self, found: SearchResult, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
-        """Whether the independent simulation confirms the search."""
+    def _certificate_status(self, found: SearchResult, claimed: "pd.DataFrame", proof: Certificate) -> Status:
+        """Whether the independent evaluation confirms the search, and finds no defect that is not accepted."""
         if not found.status.converged:
             return found.status
+        status = self._comparison_status(found, claimed, proof.metrics.loc[claimed.index])
+        defects = [f.sentence for f in proof.findings if f.defect not in self.task.accept]
+        if not defects:
+            return status
+        sentences = tuple(dict.fromkeys(defects)), () if status.converged else status.sentences
+        return Status(Code.NOT_CERTIFIED, (*sentences[0][:MAX_DEFECTS_TOLD], *sentences[1]))
+
+    def _comparison_status(self, found: SearchResult, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
+        """Whether the certified metrics keep the limits and agree with the claimed objective."""
         claim, proof = (worst_values([requirement_values(dict(f[r])) for r in f]) for f in (claimed, certified))
         for q in self.task.spec.violations(proof):
             n, (value, allowed) = metric_name(q), describe_value(q, proof[metric_name(q)])

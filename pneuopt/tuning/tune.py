@@ -13,10 +13,11 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.cases import cases
+from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.requirements import PeakControl, Requirement
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
-from pneuopt.quantities.arguments import check_parameters
+from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
@@ -40,6 +41,7 @@ def tune(
     minimise: Objective,
     subject_to: Sequence[Requirement] = (),
     scenarios: Scenarios = NO_SCENARIOS,
+    accept: Defect | Sequence[Defect] = (),
     method: Method | None = None,
     throw: bool = True,
     progress: ProgressCallback | None = None,
@@ -62,6 +64,8 @@ def tune(
     scenarios : mapping of str to mapping, optional
         Plants beside the nominal one, or tolerances of the gains: of `corners`, `samples`, `draws`, `tolerances`, or
         several of them joined with ``|``. The worst over references and scenarios counts.
+    accept : Defect or sequence of Defect
+        Defects with which a design is certified all the same; any other is refused, whatever is minimised.
     method : TwoPhase, Racing or another Method, optional
         By default the first that suits: `TwoPhase` for one linear plant with a continuous controller that no clip can
         hold back, if it has equations for all that is asked for; else, or where `TwoPhase` fails, `Racing`.
@@ -96,7 +100,7 @@ def tune(
     (True, True)
     """
     begun = time.perf_counter()
-    task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios)
+    task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios, accept)
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
@@ -125,6 +129,7 @@ def prepare_task(
     parameters: ParameterSet,
     spec: Specification,
     scenarios: Scenarios = NO_SCENARIOS,
+    accept: Defect | Sequence[Defect] = (),
 ) -> TuningTask:
     """Check what is to be tuned, and that its limits can be kept at all; parameters and errors as for `tune`."""
     check_closed_loop(loop)
@@ -136,7 +141,9 @@ def prepare_task(
     space = search_space(loop, parameters)
     spec = spec.without(PeakControl) if clip_level(loop, space.parameters) <= spec.limit(PeakControl) else spec
     check_feasibility(loop, cases(steps, scenarios, space.parameters, space.names), space, spec)
-    return TuningTask(loop, steps, scenarios, space, spec)
+    known = ", ".join(str(defect) for defect in Defect)
+    accept = as_tuple("accept", accept, Defect, f"one of {known}, or several")
+    return TuningTask(loop, steps, scenarios, space, spec, accept)
 
 
 def prepare_search(task: TuningTask, method: Method | None = None, progress: ProgressCallback | None = None) -> Search:

@@ -1,0 +1,124 @@
+"""`certificate`: what an independent simulation and the linear loop say about gains, and what is wrong with them."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
+from pneuopt.evaluation.metric import Source
+from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.requirements import METRICS
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.quantities.parameters import ParameterSet
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+AT_THE_END = "at the end"
+MARGIN_COLUMNS = tuple(metric.name for metric in METRICS.values() if metric.source is Source.LINEAR_LOOP)
+
+
+class Defect(Enum):
+    """What can be wrong with gains whatever was asked of them; the value is the word that files use."""
+
+    UNSTABLE = "unstable"
+    GROWS = "grows"
+    HUNTS = "hunts"
+    CREEPS = "creeps"
+    NEVER_SETTLES = "never settles"
+    STANDS_STILL = "stands still"
+    MISSES_REFERENCE = "misses reference"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A defect in one case.
+
+    Attributes
+    ----------
+    defect : Defect
+    case : str
+        The case's label, a column of `evaluate`.
+    sentence : str
+        The defect in words, with its figures.
+    """
+
+    defect: Defect
+    case: str
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What `certificate` found.
+
+    Attributes
+    ----------
+    metrics : DataFrame
+        As `evaluate` returns them.
+    findings : tuple of Finding
+        The defects; empty where the gains hold on every case.
+    notes : tuple of str
+        What a user should know and what is no defect, a sentence each.
+    margins : DataFrame
+        A row a case and operating point: "case", "point", the margins' metrics, and "stable".
+    """
+
+    metrics: "pd.DataFrame"
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+    margins: "pd.DataFrame"
+
+
+def certificate(
+    loop: ClosedLoop,
+    references: Step | Sequence[Step],
+    parameters: ParameterSet,
+    *,
+    scenarios: Scenarios = NO_SCENARIOS,
+    band: float = 0.02,
+    envelope: Envelope = (),
+) -> Certificate:
+    """Evaluate gains on every case and look for defects; parameters, errors and warnings as for `evaluate`.
+
+    Returns
+    -------
+    Certificate
+
+    Examples
+    --------
+    >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.models.linear import SecondOrder
+    >>> loop = ClosedLoop(SecondOrder().system(), PID(limits=False))
+    >>> found = certificate(loop, Step(1.0), loop.parameters.with_values({"pid.Kp": 0.5, "pid.Ki": 30.0}))
+    >>> found.findings[0].defect
+    <Defect.UNSTABLE: 'unstable'>
+    """
+    check_closed_loop(loop)
+    found = evaluate_cases(loop, references, parameters, scenarios=scenarios, band=band, envelope=envelope)
+    return judge_evaluations(tuple(found))
+
+
+def judge_evaluations(evaluations: Sequence[CaseEvaluation]) -> Certificate:
+    """The certificate of gains that have been evaluated on every case."""
+    import pandas as pd
+
+    margins = [row for found in evaluations for row in _margin_rows(found)]
+    findings = [finding for row in margins for finding in _find_instability(row)]
+    return Certificate(tabulate_metrics(evaluations), tuple(findings), (), pd.DataFrame(margins))
+
+
+def _margin_rows(found: CaseEvaluation) -> Iterator[dict[str, Any]]:
+    """Margins of a case at its operating points."""
+    values = {n: found.metrics[n] for n in MARGIN_COLUMNS if n in found.metrics}
+    stable = math.isfinite(found.metrics["MaxSensitivity"])
+    yield {"case": found.case.label, "point": AT_THE_END, **values, "stable": stable}
+
+
+def _find_instability(row: dict[str, Any]) -> Iterator[Finding]:
+    if not row["stable"]:
+        yield Finding(Defect.UNSTABLE, row["case"], f"the linear loop is unstable {row['point']} of {row['case']}")
