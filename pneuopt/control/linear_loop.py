@@ -108,16 +108,38 @@ def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.comple
     return np.asarray((1 - s / 2 + s**2 / 12) / (1 + s / 2 + s**2 / 12))
 
 
-def _linear_controller(loop: ClosedLoop, parameters: ParameterSet) -> Linearisation:
-    Kp, Ki, Kd, Tf = linear_gains(loop, loop.parameter_vector(parameters)).full().ravel().tolist()
-    require(Tf > 0, "a continuous derivative needs a filter, Tf > 0")
-    A, B = np.diag([0.0, -1 / Tf]), np.array([[Ki], [1 / Tf]])
-    C, D, dead_time = np.array([[1.0, -Kd / Tf]]), np.array([[Kp + Kd / Tf]]), loop.dead_time
+def controller_matrices(gains: Any, dead_time: float) -> tuple[Array, Array, Array, Array]:
+    """A, B, C and D of m PIDs from the control error to the command, with the loop's dead time in Padé form.
+
+    Parameters
+    ----------
+    gains : array_like, shape (4, m)
+        Kp, Ki, Kd, Tf > 0 of each, as `linear_gains` has them.
+    dead_time : float
+        [s]
+
+    Returns
+    -------
+    tuple of ndarray, shapes (m, k, k), (m, k, 1), (m, 1, k), (m, 1, 1)
+        With k = 2 states, integral and filter, or 4 with a dead time.
+    """
+    Kp, Ki, Kd, Tf = np.reshape(gains, (4, -1, 1))
+    zero, one, rate = np.zeros_like(Tf), np.ones_like(Tf), 1 / Tf
+    A = np.stack([np.hstack([zero, zero]), np.hstack([zero, -rate])], axis=1)
+    B, C, D = np.stack([Ki, rate], axis=1), np.stack([one, -Kd * rate], axis=2), (Kp + Kd * rate)[..., None]
     if dead_time:  # `pade_delay_response` is 1 - (12 s/T)/(s^2 + 6 s/T + 12/T^2), here with states of one size
-        root = np.sqrt(12) / dead_time
+        m, root = len(Kp), np.sqrt(12) / dead_time
         lags, fed = np.array([[0.0, root], [-root, -6 / dead_time]]), np.array([[0.0], [1.0]])
         taken = np.array([[0.0, -12 / dead_time]])
-        A = np.block([[A, np.zeros((2, 2))], [fed @ C, lags]])
-        B, C = np.vstack([B, fed @ D]), np.hstack([C, taken])
+        A = np.block([[A, np.zeros((m, 2, 2))], [fed @ C, np.broadcast_to(lags, (m, 2, 2))]])
+        B = np.concatenate([B, fed @ D], axis=1)
+        C = np.concatenate([C, np.broadcast_to(taken, (m, 1, 2))], axis=2)
+    return A, B, C, D
+
+
+def _linear_controller(loop: ClosedLoop, parameters: ParameterSet) -> Linearisation:
+    gains = linear_gains(loop, loop.parameter_vector(parameters)).full()
+    require(gains[3, 0] > 0, "a continuous derivative needs a filter, Tf > 0")
+    A, B, C, D = (matrix[0] for matrix in controller_matrices(gains, loop.dead_time))
     own = ("pid.integral", "pid.filter", "pid.held", "pid.held_before")[: len(A)]
     return Linearisation(A, B, C, D, own, ("error",), ("control",))

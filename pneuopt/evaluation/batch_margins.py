@@ -1,20 +1,21 @@
 """Margins and sensitivity peaks of many loops at once, for searches; `margins` gives one loop's exactly."""
 
 from collections.abc import Callable, Collection
-from math import inf
+from math import inf, nan
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.linear_loop import linear_gains, pade_delay_response
+from pneuopt.control.linear_loop import controller_matrices, linear_gains, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.margins import ComplexArray, batch_frequency_response, controller_parts
+from pneuopt.evaluation.margins import ComplexArray, are_stable, batch_frequency_response, controller_parts
 from pneuopt.quantities.arrays import Array
 
+Matrices = tuple[Array, Array, Array]  # A, B, C of m plants, shapes (m, n, n), (m, n, 1), (m, 1, n)
 # Finer grids about a coarse peak, each within two steps of the last, and the frequencies of each grid: fewer of either
 # show a sharp resonance too low, more cost time in proportion.
 PEAK_REFINEMENTS = 3
@@ -38,19 +39,21 @@ def batch_margin_function(
         ``(p, x, command, only) -> found``, shapes (m, n_parameters) in the order of ``loop.parameters``,
         (m, n_plant_states) and (m,); the plant's other inputs are zero. The result has an array of shape (m,) for each
         name in `only`: "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in
-        `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's frequencies. Arguments
-        are not checked, nor is the stability of the loops.
+        `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's frequencies. Where a
+        closed loop is unstable, its margins are NaN, its sensitivities and noise gain infinite. Arguments are not
+        checked.
     """
     w = np.asarray(omega, dtype=float)
     plants = _plant_responses(loop, w)
 
     def read_margins(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
-        Kp, Ki, Kd, Tf = linear_gains(loop, p.T).full()[..., None]
-        plant = plants(p, x, commands)
+        gains = linear_gains(loop, p.T).full()
+        Kp, Ki, Kd, Tf = gains[..., None]
+        response, matrices = plants(p, x, commands)
 
         def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
             a, b = controller_parts((Kp, Ki, Kd, Tf), w)
-            return plant(w) * (a + 1j * b), a + 1j * b
+            return response(w) * (a + 1j * b), a + 1j * b
 
         L, C = responses(w)
         with np.errstate(all="ignore"):
@@ -62,7 +65,8 @@ def batch_margin_function(
             found["NoiseGain"] = np.maximum(found["NoiseGain"], np.abs(Kp + Kd / Tf)[:, 0])
         if "MaxSensitivity" in only:  # at infinity the loop is open
             found["MaxSensitivity"] = np.maximum(found["MaxSensitivity"], 1.0)
-        return found
+            stable = are_stable(_closed_loop_poles(matrices, controller_matrices(gains, loop.dead_time)))
+        return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
 
     return read_margins
 
@@ -93,10 +97,13 @@ def _refine_peaks(
     return np.asarray(largest)
 
 
-def _plant_responses(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Array], Callable[[Array], ComplexArray]]:
-    """Function that gives responses of plants with sensor and hold, at frequencies of shape (n,) or (m, n).
+def _plant_responses(
+    loop: ClosedLoop, w: Array
+) -> Callable[[Array, Array, Array], tuple[Callable[[Array], ComplexArray], Matrices]]:
+    """Function that gives responses of plants with sensor and hold, and A, B, C of plants with sensor.
 
-    On the frequencies `w` it is checked that partial fractions are exact enough.
+    The responses are functions of frequencies of shape (n,) or (m, n); on the frequencies `w` it is checked that
+    partial fractions are exact enough.
     """
     plant = loop.plant
     x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
@@ -110,15 +117,40 @@ def _plant_responses(loop: ClosedLoop, w: Array) -> Callable[[Array, Array, Arra
     n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
     shapes, columns = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
 
-    def linearise(p: Array, x: Array, commands: Array) -> Callable[[Array], ComplexArray]:
+    def linearise(p: Array, x: Array, commands: Array) -> tuple[Callable[[Array], ComplexArray], Matrices]:
         us = np.zeros((len(p), u.numel()))
         us[:, command] = commands
         found = [matrices(*row) for row in zip(x, us, p[:, columns], strict=True)]
         A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
         plant, lag = _partial_fraction_response(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
-        return lambda w: np.asarray((plant(w) + D) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
+
+        def response(w: Array) -> ComplexArray:
+            return np.asarray((plant(w) + D) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
+
+        return response, _add_sensor((A, B[..., None], C[:, None]), lag)
 
     return linearise
+
+
+def _add_sensor(plant: Matrices, lag: Array) -> Matrices:
+    """A, B and C of plants with a first-order sensor of lag [s], shape (m, 1), where any of them has one."""
+    if not lag.any():
+        return plant
+    (A, B, C), m = plant, len(lag)
+    n, has_lag = A.shape[-1], lag > 0
+    rate = 1 / np.where(has_lag, lag, 1.0)[..., None]
+    sensed = np.block([[A, np.zeros((m, n, 1))], [C * rate, -rate]])
+    reading = np.where(has_lag[..., None], np.eye(1, n + 1, n), np.concatenate([C, np.zeros((m, 1, 1))], axis=2))
+    return sensed, np.concatenate([B, np.zeros((m, 1, 1))], axis=1), reading
+
+
+def _closed_loop_poles(plant: Matrices, controller: tuple[Array, Array, Array, Array]) -> ComplexArray:
+    """Poles of m loops with negative feedback, shape (m, n); NaN matrices count as unstable."""
+    (A, B, C), (Ac, Bc, Cc, Dc) = plant, controller
+    closed = np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]])
+    sound = np.isfinite(closed).all(axis=(1, 2))
+    closed[~sound] = np.eye(closed.shape[-1])
+    return np.asarray(np.linalg.eigvals(closed), dtype=complex)
 
 
 def _gain_margins(L: ComplexArray) -> Array:

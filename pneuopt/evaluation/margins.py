@@ -99,7 +99,8 @@ def margins(open_loop: Linearisation) -> Margins:
     D = float(open_loop.D[0, 0])
     Ms, at = _response_peak(lambda w: 1 / (1 + frequency_response(open_loop, w)), omega, 1 / (1 + D))
     Mt, _ = _response_peak(lambda w: 1 - 1 / (1 + frequency_response(open_loop, w)), omega, D / (1 + D))
-    return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, _is_stable(open_loop))
+    stable = bool(are_stable(_loop_poles(open_loop)))
+    return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, stable)
 
 
 def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float]) -> float:
@@ -272,7 +273,9 @@ def _zeros(open_loop: Linearisation) -> ComplexArray:
     return np.array([z for z in zeros if np.abs(z) < 1e3 * fastest], dtype=complex)
 
 
-def _is_stable(open_loop: Linearisation) -> bool:
-    """Whether the closed loop is stable; poles at zero are allowed: a position in a speed loop, an unused integral."""
-    poles = _loop_poles(open_loop)
-    return bool(np.max(poles.real, initial=-1.0) <= 1e-7 * np.max(np.abs(poles), initial=1.0))
+def are_stable(poles: ComplexArray) -> NDArray[np.bool_]:
+    """Which loops are stable, by their closed loop's poles along the last axis.
+
+    Poles at zero are allowed: a position in a speed loop, an unused integral.
+    """
+    return np.asarray(poles.real.max(axis=-1, initial=-1.0) <= 1e-7 * np.abs(poles).max(axis=-1, initial=1.0))

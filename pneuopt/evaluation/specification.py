@@ -22,6 +22,10 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.quantities.errors import require
 
+# Largest sensitivity of a loop that a search takes for stable where none was asked for. With a smaller one good designs
+# on fast loops are lost that nobody had forbidden; with a larger one designs are found that a tenth more or less gain,
+# or another operating point, makes unstable.
+STABILITY_SENSITIVITY = 10.0
 Kind = type | tuple[type, ...]
 NO_WEIGHTS: Mapping[Requirement, float] = MappingProxyType({})
 
@@ -76,6 +80,15 @@ class Specification:
         room |= dict.fromkeys((PeakControl, MaxSensitivity, MaxComplementarySensitivity), peaks)
         limits = tuple(with_upper_limit(q, upper_limit(q) * (1 - room.get(type(q), margin))) for q in self.limits)
         return replace(self, limits=limits, band=self.band * (1 - margin))
+
+    def with_stability(self) -> "Specification":
+        """Copy for a search, which may return stable loops only: with a limit on the sensitivity where there is none.
+
+        The sensitivity of an unstable loop is infinite, and a loop with a finite one is stable.
+        """
+        if self.limit(MaxSensitivity) < inf:
+            return self
+        return replace(self, limits=(*self.limits, MaxSensitivity(STABILITY_SENSITIVITY)))
 
     def without(self, kind: Kind) -> "Specification":
         """Copy without the limit of this kind."""

@@ -35,6 +35,7 @@ LIMIT_TOLERANCE = 1e-4
 # Share of the margin that limits on peaks of command and sensitivity are tightened by. A smaller one than a search's
 # coarse samples miss of a peak makes the certificate fail; a larger one gives performance away.
 SIMULATION_PEAK_MARGIN = 1 / 5
+WIDEN_BOUNDS = "widen the gains' bounds, or lower their lower ends"  # the remedy where no stable loop is found
 # Weight of a limit's relative violation beside that of never settling. With a smaller one a search stays with designs
 # that settle and break a limit; with a larger one with loops so slow that they keep every limit and never settle.
 VIOLATION_PENALTY = 20.0
@@ -376,6 +377,9 @@ def _screening_status(spec: Specification, values: Mapping[str, float]) -> Statu
         f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"
         for q in spec.violations(values, LIMIT_TOLERANCE)
     ]
+    if not broken and spec.with_stability().violations(values):
+        verdict = f"the closest found is no stable loop (MaxSensitivity {values['MaxSensitivity']:.3g})"
+        return Status(Code.INFEASIBLE, (verdict, WIDEN_BOUNDS))
     if broken:
         verdict = f"the closest found has {' and '.join(broken)}"
         return Status(Code.INFEASIBLE, (verdict, "relax a limit or widen the bounds"))

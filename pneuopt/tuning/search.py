@@ -139,8 +139,11 @@ class Search:
         return replace(best, parameters=self.space.parameters, status=status, stats={**values, **best.stats})
 
     def tighten(self, margin: float) -> Specification:
-        """The specification with limits tighter by a margin, as much as rounding and certificate may cost."""
-        return self.spec.tighten(margin, margin * self.method.peak_margin)
+        """The specification with limits tighter by a margin, as much as rounding and certificate may cost.
+
+        It asks for a stable loop, too, whatever was asked for.
+        """
+        return self.spec.tighten(margin, margin * self.method.peak_margin).with_stability()
 
     def _round_gains(self, simulator: Simulator, found: SearchResult, margin: float) -> Iterator[Array]:
         """Roundings of the gains found: the nearest one, then neighbours that keep the limits and lose little."""
@@ -198,7 +201,7 @@ def relax(search: Search, result: TuningResult) -> TuningResult:
         if rows[metric_name(q)]["share"] <= 0:
             return _continue_from_feasible(search, points[-1])
     search.progress("finding how far all limits together have to give way")
-    inside = spec.with_band(spec.band * (1 - search.method.margin))
+    inside = spec.with_band(spec.band * (1 - search.method.margin)).with_stability()
     shared = relax_all(search.simulator, search.space, inside, points)
     closest = min((search.certify_point(point) for point in (shared, *points)), key=relaxation_share)
     if closest.status.converged:

@@ -1,30 +1,29 @@
 """`TwoPhase`: exact tuning of a linear loop; its settling time is a free duration of a multiple-shooting problem."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 
+from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
-from pneuopt.evaluation.requirements import (
-    METRICS,
-    PeakControl,
-    metric_name,
-    upper_limit,
-)
+from pneuopt.evaluation.margins import margins
+from pneuopt.evaluation.requirements import METRICS, MaxSensitivity, PeakControl, metric_name, upper_limit
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
-from pneuopt.quantities.status import ProgressCallback
+from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.racing import Racing
+from pneuopt.tuning.screening import WIDEN_BOUNDS
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue
 from pneuopt.tuning.two_phase_transcription import BAND_PARAMETER, transcribe_two_phase, without_clip
@@ -112,7 +111,7 @@ class TwoPhase:
         """Solve from every start and return the best optimum; see `Method.find`."""
         method = self if attempt == 0 else replace(self, starts=1)
         space = Space(task.space.parameters_at(start), task.space.names)
-        optima = solve_two_phase(task.loop, task.references, space, spec, method, progress)
+        optima = _solve_stable(task, replace(task, space=space, spec=spec), method, progress)
         best, values = optima.best, optima.best.parameters
         stats = {
             "starts": float(optima.starts),
@@ -129,8 +128,11 @@ class TwoPhase:
         return replace(self, starts=2, margin=margin, solver=replace(self.solver, max_iterations=150))
 
     def limit_path(self, task: TuningTask, spec: Specification) -> "TwoPhasePath":
-        """The problem, prepared once, to be solved for moving limits and settling bands."""
-        return two_phase_path(task.loop, task.references, task.space, spec, self)
+        """The problem, prepared once, to be solved for moving limits and settling bands.
+
+        It leaves out a limit on the sensitivity that nobody asked for: a design's certificate finds it unstable.
+        """
+        return two_phase_path(task.loop, task.references, task.space, _without_stability(task, spec), self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +168,33 @@ def _inexact_requirements(spec: Specification) -> list[str]:
     return [n for n in spec.kinds if not METRICS[n].exact]
 
 
+def _solve_stable(task: TuningTask, tightened: TuningTask, method: TwoPhase, progress: ProgressCallback) -> Optima:
+    """Solve the two-phase problem for a stable loop.
+
+    Rows that limit the sensitivity make the problem several times as large. Where nobody asked for them they are left
+    out first: most optima are stable all the same.
+    """
+    loop, references, space, spec = tightened.loop, tightened.references, tightened.space, tightened.spec
+    plain = _without_stability(task, spec)
+    is_allowed = partial(_is_stable, loop, math.inf if plain is spec else spec.limit(MaxSensitivity))
+    optima = solve_two_phase(loop, references, space, plain, method, progress, is_allowed)
+    if plain is spec or optima.converged:
+        return optima
+    return solve_two_phase(loop, references, space, spec, method, progress, is_allowed)
+
+
+def _without_stability(task: TuningTask, spec: Specification) -> Specification:
+    """The specification without a limit on the sensitivity that nobody asked for."""
+    return spec if task.spec.concerns(MaxSensitivity) else spec.without(MaxSensitivity)
+
+
+def _is_stable(loop: ClosedLoop, most: float, solution: Solution) -> bool:
+    """Whether the loop with a solution's gains is stable, its sensitivity not above `most`."""
+    free_loop = without_clip(loop)
+    found = margins(open_loop(free_loop, solution.parameters.select(free_loop.parameters)))
+    return found.stable and found.max_sensitivity <= most
+
+
 def solve_two_phase(
     loop: ClosedLoop,
     references: Sequence[Step],
@@ -173,8 +202,11 @@ def solve_two_phase(
     spec: Specification,
     method: TwoPhase,
     report_progress: ProgressCallback,
+    is_allowed: Callable[[Solution], bool] = lambda _: True,
 ) -> Optima:
     """Solve the two-phase problem from every start; `report_progress` receives a line of text a start.
+
+    Solutions that are not allowed do not count as converged.
 
     Raises
     ------
@@ -191,9 +223,12 @@ def solve_two_phase(
         found.append(solve_from(problem, parameters.with_values(gains)))
         value, ended = _objective_value(found[-1]), found[-1].status.code.value
         report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
-    good = [s for s in found if s.status.converged]
+    good = [s for s in found if s.status.converged and is_allowed(s)]
     if not good:
-        return Optima(min(found, key=lambda s: s.stats.get("largest_violation", math.inf)), len(found), 0, 0)
+        closest = min(found, key=lambda s: s.stats.get("largest_violation", math.inf))
+        unstable = Status(Code.INFEASIBLE, ("every optimum found is an unstable loop, or nearly so", WIDEN_BOUNDS))
+        closest = replace(closest, status=unstable) if closest.status.converged else closest
+        return Optima(closest, len(found), 0, 0)
     best = min(good, key=_objective_value)
     agreeing = sum(
         _objective_value(s) - _objective_value(best) <= OPTIMA_TOLERANCE * abs(_objective_value(best)) for s in good
@@ -223,7 +258,8 @@ class TwoPhasePath:
         parameters = self.problem.graph.transcription.parameters
         gains = dict(zip(self.names, start.tolist(), strict=True))
         path = [
-            {metric_name(q): upper_limit(q) for q in spec.limits} | {BAND_PARAMETER: spec.band / self.band}
+            {metric_name(q): upper_limit(q) for q in spec.limits if metric_name(q) in parameters}
+            | {BAND_PARAMETER: spec.band / self.band}
             for spec in specs
         ]
         return follow_path(self.problem, parameters.with_values(gains), path)

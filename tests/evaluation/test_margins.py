@@ -164,8 +164,27 @@ def test_many_sensitivities_are_those_of_one_loop_after_another(measured: str, s
     found = batch_margin_function(loop, omega)(numbers, points, commands, ("MaxSensitivity",))["MaxSensitivity"]
     fine = np.geomspace(1, 1e4, 20001)
     for p, x, command, Ms in zip(sets, points, commands, found, strict=True):
-        L = frequency_response(open_loop(loop, p, x, {loop.command.name: command}), fine)
-        assert_allclose(Ms, 1 / np.abs(1 + L).min(), rtol=1e-5)
+        L = open_loop(loop, p, x, {loop.command.name: command})
+        is_stable = np.linalg.eigvals(L.A - L.B @ L.C).real.max() < 1e-6
+        assert_allclose(Ms, 1 / np.abs(1 + frequency_response(L, fine)).min() if is_stable else np.inf, rtol=1e-5)
+    assert np.isfinite(found).any()
+
+
+@pytest.mark.parametrize("sample_time", [None, 0.02])
+def test_the_margins_of_unstable_loops_are_none(second_order: System, sample_time: float | None) -> None:
+    """Ms on a grid is finite for an unstable loop as well: its curve encircles -1 at a distance."""
+    loop = ClosedLoop(second_order, PID(sample_time=sample_time))
+    rows = np.random.default_rng(1).uniform((-0.5, -60.0, 0.0, 0.005), (8.0, 60.0, 0.3, 0.05), (60, 4)).tolist()
+    gains = ("pid.Kp", "pid.Ki", "pid.Kd", "pid.Tf")
+    sets = [loop.parameters.with_values(dict(zip(gains, row, strict=True))) for row in rows]
+    loops = [open_loop(loop, p) for p in sets]
+    stable = np.array([np.all(control.feedback(control.ss(L.A, L.B, L.C, L.D), 1).poles().real < 0) for L in loops])
+    p, only = np.array([loop.parameter_vector(s) for s in sets]), ("MaxSensitivity", "PhaseMargin", "NoiseGain")
+    found = batch_margin_function(loop, np.geomspace(0.1, 1e4, 500))(p, np.zeros((60, 2)), np.zeros(60), only)
+    assert 10 < stable.sum() < 50
+    assert (np.isfinite(found["MaxSensitivity"]) == stable).all()
+    assert (np.isnan(found["PhaseMargin"]) == ~stable).all()
+    assert (np.isfinite(found["NoiseGain"]) == stable).all()
 
 
 def test_systems_without_a_basis_of_modes_are_solved_instead() -> None:

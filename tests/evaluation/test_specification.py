@@ -13,7 +13,7 @@ from pneuopt.evaluation.requirements import (
     SettlingTime,
     StepEnvelope,
 )
-from pneuopt.evaluation.specification import specify, specify_limits
+from pneuopt.evaluation.specification import STABILITY_SENSITIVITY, specify, specify_limits
 from pneuopt.quantities.errors import InputError
 
 TUBE, OTHER = ((0.0, -0.1, 1.1), (0.5, 0.9, 1.1)), ((0.0, -0.2, 1.2),)
@@ -33,6 +33,16 @@ def test_the_tightest_limit_counts() -> None:
     assert spec.limit(Overshoot) == 0.02
     margins = specify(SettlingTime(), [PhaseMargin(30.0), PhaseMargin(60.0), PhaseMargin(45.0)])
     assert margins.limits == (PhaseMargin(60.0),)
+
+
+def test_a_search_asks_for_a_stable_loop_whatever_was_asked_for() -> None:
+    asked = specify(SettlingTime(), [Overshoot(0.1)])
+    inside = asked.with_stability()
+    assert inside.limit(MaxSensitivity) == STABILITY_SENSITIVITY
+    assert inside.violations({"SettlingTime": 1.0, "Overshoot": 0.0, "MaxSensitivity": math.inf})
+    assert asked.limit(MaxSensitivity) == math.inf
+    own = specify(SettlingTime(), [MaxSensitivity(20.0)])
+    assert own.with_stability() is own
 
 
 def test_violated_names_what_is_not_kept_nan_included() -> None:

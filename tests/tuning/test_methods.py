@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pneuopt.control.dither import Dither
@@ -19,7 +20,7 @@ from pneuopt.quantities.status import Code
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import METHODS, choose_method
 from pneuopt.tuning.space import search_space
-from pneuopt.tuning.tune import tune
+from pneuopt.tuning.tune import prepare_search, tune
 
 STEP, LIMITS = Step(1.0, horizon=1.0), (Overshoot(0.05),)
 SMALL: dict[str, dict[str, object]] = {  # options with which each one takes a second
@@ -56,6 +57,15 @@ def read(kind: str, folder: Path, options: dict[str, object]) -> Method:
     method = read_tuning(path, FirstOrder().system()).method
     assert method is not None
     return method
+
+
+def unstable_task() -> TuningTask:
+    """A fast loop within the band over the horizon; an integral of the wrong sign drives it away later."""
+    loop = problem()[0]
+    wrong = {"pid.Kp": (40.0, 60.0), "pid.Ki": (-2.0, -0.5)}
+    given = loop.parameters.with_values({"pid.Kp": 50.0, "pid.Ki": -1.0}).with_bounds(wrong).freed(*wrong)
+    spec = specify(SettlingTime(band=0.05))
+    return TuningTask(loop, (STEP,), {}, search_space(loop, given), spec)
 
 
 @pytest.fixture(params=list(METHODS))
@@ -104,6 +114,14 @@ def test_it_finds_a_certified_design_and_reports_progress(kind: str, tmp_path: P
     assert found.certified.loc["Overshoot"].max() <= 5.0
     assert heard
     assert set(found.stats) >= {"optimum", "margin", "seconds"}
+
+
+def test_it_hands_no_unstable_loop_to_the_certificate(kind: str, tmp_path: Path) -> None:
+    task = unstable_task()
+    found = prepare_search(task, read(kind, tmp_path, SMALL[kind])).run()
+    assert np.isfinite(found.certified.loc["SettlingTime"].to_numpy(dtype=float)).all()  # over the horizon all is well
+    assert found.status.code is Code.INFEASIBLE
+    assert "stable" in str(found.status)
 
 
 def test_it_can_be_interrupted(kind: str, tmp_path: Path) -> None:
