@@ -65,7 +65,7 @@ def batch_margin_function(
             found["NoiseGain"] = np.maximum(found["NoiseGain"], np.abs(Kp + Kd / Tf)[:, 0])
         if "MaxSensitivity" in only:  # at infinity the loop is open
             found["MaxSensitivity"] = np.maximum(found["MaxSensitivity"], 1.0)
-            stable = are_stable(_closed_loop_poles(matrices, controller_matrices(gains, loop.dead_time)))
+        stable = are_stable(_closed_loop_poles(matrices, controller_matrices(gains, loop.dead_time)))
         return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
 
     return read_margins
