@@ -42,23 +42,23 @@ def period_mean(t: Array, y: Array, initial: float, period: float, at: Array) ->
     return mean
 
 
-def end_mean(t: Array, y: Array, period: float | None) -> Array:
-    """Final values, shape (m,): the last sample, or with a period the mean over the last whole periods."""
-    if period is None:
-        return y[:, -1]
-    t, y = tail(t, y, period)
-    return np.asarray(np.trapezoid(y, t, axis=1) / (t[-1] - t[0]))
+def end_mean(t: Array, y: Array, period: float) -> Array:
+    """Mean over the last five periods, or as many as the record has, of signals whose last axis is time."""
+    span = period * min(FINAL_PERIODS, int((t[-1] - t[0]) / period))
+    t, y = _cut_end(t, y, span)
+    return np.asarray(np.trapezoid(y, t, axis=-1) / (t[-1] - t[0]))
 
 
-def tail(t: Array, y: Array, period: float | None) -> tuple[Array, Array]:
-    """End of a record: its last five periods, or as many as it has; without dither its last 5 %."""
-    duration = (
-        TAIL_SHARE * (t[-1] - t[0]) if period is None else period * min(FINAL_PERIODS, int((t[-1] - t[0]) / period))
-    )
-    begin = t[-1] - duration
+def tail(t: Array, y: Array) -> Array:
+    """Signals in the last 5 % of a record, from an interpolated first value on."""
+    return _cut_end(t, y, TAIL_SHARE * (t[-1] - t[0]))[1]
+
+
+def _cut_end(t: Array, y: Array, span: float) -> tuple[Array, Array]:
+    begin = t[-1] - span
     k = min(max(int(np.searchsorted(t, begin, side="right")) - 1, 0), len(t) - 2)
-    first = y[:, [k]] + (begin - t[k]) / (t[k + 1] - t[k]) * (y[:, [k + 1]] - y[:, [k]])
-    return np.append(begin, t[t > begin]), np.concatenate([first, y[:, t > begin]], axis=1)
+    first = y[..., [k]] + (begin - t[k]) / (t[k + 1] - t[k]) * (y[..., [k + 1]] - y[..., [k]])
+    return np.append(begin, t[t > begin]), np.concatenate([first, y[..., t > begin]], axis=-1)
 
 
 @dataclass(frozen=True)

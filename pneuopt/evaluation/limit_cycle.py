@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.evaluation.dither_mean import period_mean
+from pneuopt.evaluation.dither_ripple import remove_ripple
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
@@ -93,7 +94,7 @@ def find_limit_cycle(
     start : float, optional
         Where the search starts [s]; by default after the first 40 % of the record, the transient.
     dither_period : float, optional
-        The mean over this time is taken first [s] (`ClosedLoop.dither_period`): a dither's ripple is no limit cycle.
+        The ripple of a dither with this period is removed first [s] (`ClosedLoop.dither_period`): it is no limit cycle.
     min_amplitude : float, optional
         Smallest amplitude that counts [unit]; by default 1 % of the record's range.
     standstill_speed : float, optional
@@ -147,12 +148,15 @@ def find_limit_cycle(
 
 
 def _detrend_signal(t: Array, y: Array, begin: float, period: float | None) -> tuple[Array, Array]:
-    """Time and signal on an even grid from `begin` on, the mean over a dither period, less its straight line."""
+    """Time and signal on an even grid from `begin` on, without its dither's ripple, less its straight line."""
     edge = 0.0 if period is None else period / 2
-    first, last = max(begin, t[0] + edge), t[-1] - edge
-    require(first < last, f"the record of {t[-1] - t[0]:g} s is too short to average over {2 * edge:g} s")
+    first, last = max(begin, t[0] + edge), t[-1]
+    require(first + edge < last, f"the record of {t[-1] - t[0]:g} s is too short to average over {2 * edge:g} s")
     at = np.linspace(first, last, max(3, int((last - first) / np.median(np.diff(t))) + 1))
-    level = np.interp(at, t, y) if period is None else period_mean(t, y[None], y[0], period, at)[0]
+    if period is not None:
+        means = period_mean(t, y[None], y[0], period, t[t <= last - edge])
+        y = remove_ripple(t, y[None], means, period).signal[0]
+    level = np.interp(at, t, y)
     return at, level - np.polyval(np.polyfit(at - at[0], level, 1), at - at[0])
 
 

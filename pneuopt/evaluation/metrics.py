@@ -8,15 +8,16 @@ from math import nan
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.evaluation.dither_mean import TAIL_SHARE, end_mean, period_mean, tail
+from pneuopt.evaluation.dither_mean import TAIL_SHARE, period_mean, tail
+from pneuopt.evaluation.dither_ripple import remove_ripple
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, StepEnvelope
 from pneuopt.evaluation.step_record import StepRecord, without_slopes
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 
-# Dither periods that a response must stay in its band to count as settled: with fewer, one that just passes through the
-# band counts too; more ask for longer records.
+# Dither periods that a response must stay in its band to count as settled where its ripple does not: with fewer, one
+# that just passes through the band counts too; more ask for longer records.
 MIN_SETTLED_PERIODS = 2
 
 ROW_METRICS = tuple(name for name, metric in METRICS.items() if metric.slope is not None)
@@ -65,15 +66,14 @@ def step_metrics(
     band_centre : BandCentre
         Centre of the band.
     dither_period : float, optional
-        The signal is averaged over this time first, without phase shift [s]: whole dither periods (`Dither.period`).
+        The ripple of a dither is removed first [s]: `remove_ripple`, over whole dither periods (`Dither.period`).
     control : array_like, shape (n,), optional
         The command, for PeakControl and ControlRate [its unit]; it is not averaged.
     sample_time : float, optional
         Sample time of the controller that holds the command, over which ControlRate is computed [s]; by default from
         sample to sample of the record.
     final : float, optional
-        The final value where it is known, from a dc gain [unit]; by default the last sample, with dither the mean over
-        the last five periods, or as many as there are.
+        The final value where it is known, from a dc gain [unit]; by default the last sample, without a dither's ripple.
     envelope : sequence of (float, float, float)
         Instants after the step, in order [s], each with the lower and upper bound that hold from then on, as fractions
         of the step: 0 is `initial`, 1 the reference.
@@ -89,8 +89,9 @@ def step_metrics(
             From 10 to 90 % of the change from `initial` to the final value [s].
         SettlingTime
             From `start` until the response stays in the band, interpolated linearly [s]. NaN if it never settles: it
-            ends outside the band, or enters it for good only in the last 5 % of the record after `start`, with dither
-            in the last two periods if those are longer, where a response that only passes through looks the same.
+            ends outside the band, or enters it for good only in the last 5 % of the record after `start`, where a
+            response that only passes through looks the same; where a dither's ripple exceeds the band, in the last two
+            periods, if those are longer.
         SettlingMin, SettlingMax
             Range after 90 % is reached [unit].
         Overshoot, OvershootFinal
@@ -102,7 +103,7 @@ def step_metrics(
         SteadyStateValue, SteadyStateError
             The final value [unit]; its distance from the reference, in % of the step.
         Ripple
-            Peak to peak of the raw signal over the last periods, without dither over the last 5 % [unit].
+            Peak to peak of the raw signal over the last 5 % of the record, or of a dither's ripple if larger [unit].
         IAE, ISE, ITAE
             Integrals from the step to the record's end of the absolute error [s], of its square [s], and of the
             absolute error times the time since the step [s^2]; errors are relative to the step's size.
@@ -189,14 +190,13 @@ def batch_metrics(
     """
     require(scale is not None or reference_final != initial, f"no step: the reference stays at {initial:g}")
     raw, size = _cut_record(t, y, start, band), reference_final - initial if scale is None else scale
-    if averaged is None and dither_period is not None:
-        averaged = _period_averages(raw, initial, dither_period)
-    smooth = raw if averaged is None else _Samples(raw.t[: averaged.shape[1]], averaged)
-    steady = end_mean(raw.t, raw.y, dither_period) if final is None else np.full(len(raw.y), final)
+    smooth, last, ripple = _remove_ripple(raw, initial, dither_period, averaged)
+    steady = last if final is None else np.full(len(raw.y), final)
     centre, width = steady, band * np.abs(steady - initial)
     if band_centre is BandCentre.REFERENCE:
         centre, width = np.full_like(steady, reference_final), np.full_like(steady, band * abs(size))
-    latest = raw.t[-1] - max(TAIL_SHARE * raw.t[-1], MIN_SETTLED_PERIODS * (dither_period or 0.0))
+    settled, settled_raw = (_settling_times(samples, centre, width) for samples in (smooth, raw))
+    only_mean = np.isnan(settled_raw) & (settled > raw.t[-1] - MIN_SETTLED_PERIODS * (dither_period or 0.0))
     record = _to_step_record(
         raw,
         (smooth.y - reference_final) / size,
@@ -209,11 +209,11 @@ def batch_metrics(
     )
     return {
         **_rise_metrics(smooth, initial, steady, only),
-        "SettlingTime": _settling_times(smooth, centre, width, latest),
+        "SettlingTime": np.where(only_mean, nan, settled),
         **(_overshoot_metrics(smooth, steady, reference_final, initial, only) if scale is None else {}),
         **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
-        **({"Ripple": np.ptp(tail(raw.t, raw.y, dither_period)[1], axis=1)} if _wants(only, "Ripple") else {}),
+        **({"Ripple": np.maximum(ripple, np.ptp(tail(raw.t, raw.y), axis=1))} if _wants(only, "Ripple") else {}),
         **{name: _largest(name, record) for name in ROW_METRICS if _wants(only, name) and _is_shown(name, record)},
     }
 
@@ -288,6 +288,17 @@ def _first_index_since(t: Array, start: float) -> int:
     return int(np.searchsorted(t, start - 1e-12 * max(1.0, abs(start))))
 
 
+def _remove_ripple(
+    raw: _Samples, initial: float, period: float | None, averaged: Array | None
+) -> tuple[_Samples, Array, Array]:
+    """The response without its dither's ripple, its final values, and the ripple from peak to peak."""
+    if period is None:
+        return raw, raw.y[:, -1], np.zeros(len(raw.y))
+    means = _period_averages(raw, initial, period) if averaged is None else averaged
+    found = remove_ripple(raw.t, raw.y, means, period)
+    return _Samples(raw.t, found.signal), found.final, found.ripple
+
+
 def _period_averages(record: _Samples, initial: float, period: float) -> Array:
     last = record.t[-1] - period / 2
     require(
@@ -325,8 +336,8 @@ def _first_crossing_times(t: Array, z: Array, level: float) -> Array:
     return np.asarray(np.where(k == 0, t[0], between))
 
 
-def _settling_times(record: _Samples, centre: Array, width: Array, latest: float) -> Array:
-    """Instant of the last crossing of the band, linear between samples; NaN if it is after `latest`."""
+def _settling_times(record: _Samples, centre: Array, width: Array) -> Array:
+    """Instant of the last crossing of the band, linear between samples; NaN if it lies in the record's last share."""
     t, y = record.t, record.y
     outside = np.abs(y - centre[:, None]) > width[:, None]
     k = len(t) - 1 - np.argmax(outside[:, ::-1], axis=1)
@@ -335,7 +346,7 @@ def _settling_times(record: _Samples, centre: Array, width: Array, latest: float
     edge = centre + width * np.sign(last - centre)
     with np.errstate(all="ignore"):
         settled = t[k] + (t[after] - t[k]) * (edge - last) / (following - last)
-    settled = np.where(outside[:, -1] | ~(settled <= latest), nan, settled)
+    settled = np.where(outside[:, -1] | ~(settled <= (1 - TAIL_SHARE) * t[-1]), nan, settled)
     return np.where(outside.any(axis=1), settled, 0.0)
 
 

@@ -174,7 +174,7 @@ class ControlRate(AtMost):
 
 @final
 class Ripple(AtMost):
-    """Peak to peak of the raw signal over the last dither periods, or the last 5 % of the record [measured unit]."""
+    """Peak to peak of the raw signal over the last 5 % of the record, or of a dither's ripple if larger [its unit]."""
 
     metric = Metric("Ripple", "{measured}", Source.RESPONSE)
 

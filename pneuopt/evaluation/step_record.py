@@ -34,7 +34,7 @@ class StepRecord:
     t : ndarray, shape (n,)
         Time since the step [s].
     error : tuple of ndarray, shapes (m, K) and (m, K, N)
-        Distance of the averaged signal from the reference at the first K nodes, which are every `stride`-th sample, as
+        Distance of the signal without ripple from the reference at the K nodes, which are every `stride`-th sample, as
         a fraction of the step; and its derivatives to the unknowns.
     final_error : tuple of ndarray, shapes (m, 1) and (m, 1, N)
         The same at the end of the record.

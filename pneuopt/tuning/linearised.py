@@ -1,6 +1,6 @@
 """`LinearisedProblem`: responses and their derivatives as rows of a minimax problem in gains and settling time.
 
-The settling time Ts is an unknown: from Ts on the averaged response has to lie within the band. So the objective is
+The settling time Ts is an unknown: from Ts on the response has to lie within the band. So the objective is
 smooth in the gains where the settling time itself jumps. Nodes after Ts move with it.
 """
 
@@ -53,7 +53,7 @@ class LinearisedResponse:
     Attributes
     ----------
     error : ndarray, shape (C, K)
-        The averaged signal's distance from the reference, a fraction of the step; inf where it runs away.
+        Distance of the signal without ripple from the reference, a fraction of the step; inf where it runs away.
     by_gain : ndarray, shape (C, K, n)
         Its derivatives.
     values, derivatives : dict of type to ndarray, shapes (C, R) and (C, R, n)
@@ -103,9 +103,7 @@ class LinearisedProblem:
         self.horizon = min(g.reference.horizon - g.reference.at for g in simulator.grids)
         self._strides = [max(1, (len(g.t) - g.step_index) // nodes) for g in simulator.grids]
         longest = max(self._periods, default=0.0)
-        self._nodes = [
-            reading_times(g, stride, longest) for g, stride in zip(simulator.grids, self._strides, strict=True)
-        ]
+        self._nodes = [reading_times(g, stride) for g, stride in zip(simulator.grids, self._strides, strict=True)]
         latest = min((1 - TAIL_SHARE) * self.horizon, self.horizon - MIN_SETTLED_PERIODS * longest)
         most = min(latest, spec.limit(SettlingTime))
         low = most if spec.concerns(SettlingTime) and not spec.weight(SettlingTime) else 0.0

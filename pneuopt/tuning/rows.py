@@ -1,7 +1,7 @@
 """`Lanes`: simulated responses with their derivatives to the gains, as step records from which metrics are read.
 
-The signal is averaged and read at nodes. Where a metric is the largest value over time, or the integral of an absolute
-value, its derivative is taken at the present instant of the maximum, or with the present sign.
+The signal is read at nodes, without its dither's ripple. Where a metric is the largest value over time, or the integral
+of an absolute value, its derivative is taken at the present instant of the maximum, or with the present sign.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.evaluation.dither_mean import DitherPeriodMean, end_mean
+from pneuopt.evaluation.dither_ripple import RIPPLE_ALLOWANCE, extend_means, ripple_and_slopes, wave_instants
 from pneuopt.evaluation.metrics import Envelope
-from pneuopt.evaluation.step_record import StepRecord
+from pneuopt.evaluation.step_record import StepRecord, ValuesAndSlopes
 from pneuopt.quantities.arrays import Array
 from pneuopt.tuning.readings import CONTROL_OUTPUT, INTEGRAL_OUTPUT, SIGNAL_OUTPUT, ReferenceGrid, meter_values
 
@@ -31,7 +32,7 @@ class Lanes:
     chain : ndarray, shape (m, n_columns, n_gains)
         Derivatives of those start states and parameters to the unknowns of the search.
     periods : sequence of float
-        The time over which each lane is averaged [s]; 0: it is not averaged.
+        The time over which each lane is averaged [s]; 0 without dither.
     stride : int
         Samples from node to node.
     envelope : sequence of (float, float, float)
@@ -57,26 +58,21 @@ class Lanes:
     @cached_property
     def nodes(self) -> Array:
         """The nodes' time after the step, shape (K,) [s]."""
-        return reading_times(self.grid, self.stride, max(self.periods))
+        return reading_times(self.grid, self.stride)
 
     @cached_property
     def record(self) -> StepRecord:
-        """The step record of the lanes, the averaged signal at the nodes, with derivatives to the unknowns."""
+        """The step record of the lanes, the signal without ripple at the nodes, with derivatives to the unknowns."""
         reference, columns, K = self.grid.reference, self.dy.shape[-1], len(self.nodes)
         error, by_column = np.empty((len(self.y), K)), np.empty((len(self.y), columns, K))
         last, last_by_column = np.empty((len(self.y), 1)), np.empty((len(self.y), 1, columns))
         for period, own in self._lanes_by_averaging_time():
-            signal, slopes = self._output(own, SIGNAL_OUTPUT), self._slopes(own, SIGNAL_OUTPUT)
+            signal = self._output(own, SIGNAL_OUTPUT), self._slopes(own, SIGNAL_OUTPUT)
+            along, end = self._at_nodes(signal), (signal[0][:, -1:], signal[1][..., -1:])
             if period:
-                window = DitherPeriodMean(period, self.grid.spacing)
-                integral, grown = self._output(own, INTEGRAL_OUTPUT), self._slopes(own, INTEGRAL_OUTPUT)
-                error[own] = window.means(signal, integral, reference.initial, self.stride)[:, :K]
-                found = window.means(slopes, grown, 0.0, self.stride)[:, :K]
-            else:
-                error[own], found = signal[:, :: self.stride][:, :K], slopes[:, :: self.stride][:, :K]
-            by_column[own] = found.reshape(-1, columns, K)
-            last[own, 0] = end_mean(self.t, signal, period or None)
-            last_by_column[own, 0] = end_mean(self.t, slopes, period or None).reshape(-1, columns)
+                along, end = self._remove_ripple(own, period, signal)
+            error[own], by_column[own] = along
+            last[own], last_by_column[own] = end[0], np.swapaxes(end[1], 1, 2)
         size, since = reference.nominal_size, slice(self.grid.step_index, None)
         y, dy = self.y[:, since], self.dy[:, since]
         shown = meter_values(y, self.channels), meter_values(np.moveaxis(dy, 2, -1), self.channels)
@@ -102,9 +98,42 @@ class Lanes:
         return np.ascontiguousarray(self.y[own, self.grid.step_index :, which])
 
     def _slopes(self, own: NDArray[np.bool_], which: int) -> Array:
-        """The derivatives of one output, a row for each lane and column."""
-        found = np.ascontiguousarray(np.moveaxis(self.dy[own, self.grid.step_index :, which], 2, 1))
-        return found.reshape(-1, found.shape[-1])
+        """The derivatives of one output of some lanes from the step on, shape (m, n_columns, n)."""
+        return np.ascontiguousarray(np.moveaxis(self.dy[own, self.grid.step_index :, which], 2, 1))
+
+    def _remove_ripple(
+        self, own: NDArray[np.bool_], period: float, signal: ValuesAndSlopes
+    ) -> tuple[ValuesAndSlopes, ValuesAndSlopes]:
+        """The signal without ripple at the nodes, and its final value, with derivatives; as `remove_ripple`."""
+        t, count = self.t, DitherPeriodMean(period, self.grid.spacing).mean_count(len(self.t))
+        at, weights = wave_instants(t[:count], period)
+        first = max(0, int(np.searchsorted(t, at[0])) - 1)
+        tail = self._means(own, period, first, 1)
+        rest = signal[0][:, first:count] - tail[0], signal[1][..., first:count] - tail[1]
+        ripple = ripple_and_slopes(t[first:count], rest, at, weights)
+        reach = RIPPLE_ALLOWANCE / 2 * ripple[0][:, None], RIPPLE_ALLOWANCE / 2 * ripple[1][..., None]
+        late = [extend_means(t, a, b[..., -1], count, period) for a, b in zip(signal, tail, strict=True)]
+        past = -count % self.stride
+        early = self._means(own, period, 0, self.stride)
+        means = [np.concatenate([a, b[..., past :: self.stride]], axis=-1) for a, b in zip(early, late, strict=True)]
+        level = [end_mean(t, a, period)[..., None] for a in signal]
+        ends = signal[0][:, -1:], signal[1][..., -1:]
+        return _move(self._at_nodes(signal), (means[0], means[1]), reach), _move(ends, (level[0], level[1]), reach)
+
+    def _means(self, own: NDArray[np.bool_], period: float, first: int, stride: int) -> ValuesAndSlopes:
+        """Means over the period, from sample `first` to the last that has one, and their derivatives."""
+        window = DitherPeriodMean(period, self.grid.spacing)
+        before = min(first, window.half_period_samples + 1)  # their means would need the signal further back
+        found = []
+        for read, initial in ((self._output, self.grid.reference.initial), (self._slopes, 0.0)):
+            signal, integral = (read(own, k)[..., first - before :] for k in (SIGNAL_OUTPUT, INTEGRAL_OUTPUT))
+            rows, grown = (a.reshape(-1, a.shape[-1]) for a in (signal, integral))
+            means = window.means(rows, grown, initial, stride)[:, before:]
+            found.append(means.reshape(*signal.shape[:-1], means.shape[-1]))
+        return found[0], found[1]
+
+    def _at_nodes(self, signal: ValuesAndSlopes) -> ValuesAndSlopes:
+        return signal[0][:, :: self.stride], signal[1][..., :: self.stride]
 
     def _lanes_by_averaging_time(self) -> Iterator[tuple[float, NDArray[np.bool_]]]:
         """Each averaging time and a mask of the lanes that have it."""
@@ -112,7 +141,14 @@ class Lanes:
             yield period, np.array([other == period for other in self.periods])
 
 
-def reading_times(grid: ReferenceGrid, stride: int, period: float) -> Array:
-    """The times after the step at which a response that is averaged over a period is read [s]."""
-    t = grid.t[grid.step_index :] - grid.reference.at
-    return t[: DitherPeriodMean(period, grid.spacing).mean_count(len(t)) if period else len(t)][::stride]
+def reading_times(grid: ReferenceGrid, stride: int) -> Array:
+    """The times after the step at which a response is read [s]."""
+    return (grid.t[grid.step_index :] - grid.reference.at)[::stride]
+
+
+def _move(signal: ValuesAndSlopes, mean: ValuesAndSlopes, reach: ValuesAndSlopes) -> ValuesAndSlopes:
+    """The mean where it is within reach of the signal, elsewhere the signal moved towards it by the reach."""
+    rest = signal[0] - mean[0]
+    side, inside = np.sign(rest), np.abs(rest) <= reach[0]
+    slopes = np.where(inside[:, None], mean[1], signal[1] - side[:, None] * reach[1])
+    return np.where(inside, mean[0], signal[0] - side * reach[0]), slopes

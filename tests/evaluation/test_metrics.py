@@ -139,10 +139,10 @@ def test_what_is_in_the_band_only_at_the_very_end_has_not_settled(about: BandCen
     assert np.isnan(step_metrics(T, hunting, 1.0, 0.0, band_centre=about, final=1.0)["SettlingTime"])
 
 
-def test_under_dither_two_periods_in_the_band_are_asked_for() -> None:
+def test_where_only_the_mean_settles_two_dither_periods_in_the_band_are_asked_for() -> None:
     t, period = np.linspace(0.0, 1.0, 1001), 0.1
-    for begins, settles in ((0.75, True), (0.82, False)):
-        y = np.where(t < begins, 0.5, 1.0) + 0.01 * np.sin(2 * np.pi * t / period)
+    for begins, ripple, settles in ((0.75, 0.03, True), (0.82, 0.03, False), (0.82, 0.01, True)):
+        y = np.where(t < begins, 0.5, 1.0) + ripple * np.sin(2 * np.pi * t / period)
         settled = step_metrics(t, y, 1.0, 0.0, band_centre=BandCentre.REFERENCE, dither_period=period)["SettlingTime"]
         assert np.isfinite(settled) == settles
 
