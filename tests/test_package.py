@@ -107,6 +107,7 @@ PUBLIC_NAMES = [
     "plot_fit",
     "plot_friction",
     "plot_front",
+    "plot_loop",
     "plot_map",
     "plot_prediction",
     "plot_residuals",

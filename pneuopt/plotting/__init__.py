@@ -11,6 +11,7 @@ from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
 from pneuopt.plotting.fits import plot_fit, plot_prediction
 from pneuopt.plotting.friction_map import friction_force, has_friction_map, plot_friction
 from pneuopt.plotting.fronts import plot_front
+from pneuopt.plotting.loop_diagram import plot_loop
 from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
 
@@ -30,6 +31,7 @@ __all__ = [
     "plot_fit",
     "plot_friction",
     "plot_front",
+    "plot_loop",
     "plot_map",
     "plot_prediction",
     "plot_residuals",
