@@ -218,6 +218,6 @@ KINDS = {
 
 def plain_kind(kind: str, loop: po.ClosedLoop) -> Kind:
     """The plain plant for a problem's kind and loop."""
-    if kind == "force_drive" and "friction.bristle_stiffness" in loop.parameters:
+    if kind.startswith("force_drive") and "friction.bristle_stiffness" in loop.parameters:
         return KINDS["bristle_drive"]
     return KINDS[kind.removeprefix("sampled_").removesuffix("_position")]

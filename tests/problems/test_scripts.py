@@ -8,7 +8,7 @@ import pytest
 from problems.demo import rig_demo
 from problems.friction import stick_slip
 from problems.identify import b32, b32_partial, emps, real_logs, seal_friction, step_response
-from problems.speed import simulation_speed, t32
+from problems.speed import simulation_speed
 from problems.tune import pareto, supply_and_load, tune_drive
 
 DATASETS = Path(__file__).parents[3] / "shared" / "datasets"
@@ -88,14 +88,6 @@ def test_tune_drive(tmp_path: Path) -> None:
     assert failed(tune_drive.main(job)) == ["tuned.rig.overshoot"]  # the break-away of a stuck piston: missed, and said
     tune_drive.figure(job).savefig(tmp_path / "steps.png")
     assert (tmp_path / "steps.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_t32(tmp_path: Path) -> None:
-    job = t32.run()
-    assert failed(t32.main(job)) == []
-    t32.figure(job).savefig(tmp_path / "merit.png")
-    assert (tmp_path / "merit.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
