@@ -244,8 +244,8 @@ def _narrow_heading(column: str, unit: str) -> str:
 
 
 def _is_relevant(metric: str, metrics: "pd.DataFrame", loop: ClosedLoop) -> bool:
-    """Ripple only under dither, a limit cycle only where there is one."""
-    if metric == "Ripple":
+    """Ripple and the settling with it only under dither, a limit cycle only where there is one."""
+    if metric in ("Ripple", "SettlingTimeRaw"):
         return loop.dither is not None
     return metric not in LIMIT_CYCLE_METRICS or bool((metrics.loc[LIMIT_CYCLE_METRICS[0]] > 0).any())
 
@@ -281,4 +281,4 @@ def _format_limit(requirement: Requirement) -> str:
 
 
 def _metric_cell(metric: str, value: float) -> str:
-    return "never" if metric == "SettlingTime" and math.isnan(value) else format_number(value, 4)
+    return "never" if metric in ("SettlingTime", "SettlingTimeRaw") and math.isnan(value) else format_number(value, 4)

@@ -9,7 +9,9 @@ The ripple's amplitude is read at the end of the record, off the wave that repea
 repeat, and an oscillation of the loop itself repeats with another period, so that neither counts as ripple.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isnan
 
 import numpy as np
 
@@ -74,6 +76,32 @@ def remove_ripple(t: Array, y: Array, means: Array, period: float) -> RippleFree
     reach = RIPPLE_ALLOWANCE / 2 * ripple
     signal = _move(y, np.concatenate([means, extend_means(t, y, means[:, -1], k, period)], axis=1), reach[:, None])
     return RippleFree(signal, _move(y[:, -1], end_mean(t, y, period), reach), ripple)
+
+
+def describe_ripple(metrics: Mapping[str, float], size: float, band: float) -> str | None:
+    """Sentence for a response of which only the mean over the dither's period settles; None for others.
+
+    Parameters
+    ----------
+    metrics : mapping of str to float
+        A column of `evaluate`.
+    size : float
+        The step's size [measured unit].
+    band : float
+        Half width of the settling band, a fraction of the step.
+
+    Examples
+    --------
+    >>> from math import nan
+    >>> print(describe_ripple({"SettlingTime": 0.0931, "SettlingTimeRaw": nan, "Ripple": 0.018}, 0.1, 0.02))
+    only the mean settles, in 0.0931 s: a ripple of 18 % of the step takes the signal itself out of the band of +-2 %
+    """
+    settled, raw, ripple = (metrics[n] for n in ("SettlingTime", "SettlingTimeRaw", "Ripple"))
+    if isnan(settled) or not isnan(raw):
+        return None
+    within = f"the band of +-{100 * band:.3g} %"
+    share = f"a ripple of {100 * ripple / abs(size):.2g} % of the step"
+    return f"only the mean settles, in {settled:.3g} s: {share} takes the signal itself out of {within}"
 
 
 def measure_ripple(t: Array, rest: Array, period: float) -> Array:

@@ -92,6 +92,9 @@ def step_metrics(
             ends outside the band, or enters it for good only in the last 5 % of the record after `start`, where a
             response that only passes through looks the same; where a dither's ripple exceeds the band, in the last two
             periods, if those are longer.
+        SettlingTimeRaw
+            The same of the signal as it is, with a dither's ripple [s]: what an oscilloscope shows. NaN where the
+            ripple leaves the band.
         SettlingMin, SettlingMax
             Range after 90 % is reached [unit].
         Overshoot, OvershootFinal
@@ -210,6 +213,7 @@ def batch_metrics(
     return {
         **_rise_metrics(smooth, initial, steady, only),
         "SettlingTime": np.where(only_mean, nan, settled),
+        "SettlingTimeRaw": settled_raw,
         **(_overshoot_metrics(smooth, steady, reference_final, initial, only) if scale is None else {}),
         **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
         "SteadyStateValue": steady,

@@ -267,6 +267,7 @@ def _travel_rows(record: StepRecord) -> ValuesAndSlopes:
     return without_slopes(np.abs(np.diff(spool, axis=1)).sum(axis=1)[:, None])
 
 
+_RAW = Metric("SettlingTimeRaw", "s", Source.RESPONSE)
 _REPORTED_METRICS = (
     Metric("LimitCycleAmplitude", "{measured}", Source.RESPONSE),
     Metric("LimitCycleFrequency", "Hz", Source.RESPONSE),
@@ -284,7 +285,7 @@ _REPORTED_METRICS = (
 METRICS: Mapping[str, Metric] = {
     metric.name: metric
     for source in Source
-    for metric in (*(kind.metric for kind in REQUIREMENT_KINDS), *_REPORTED_METRICS)
+    for metric in (SettlingTime.metric, _RAW, *(kind.metric for kind in REQUIREMENT_KINDS), *_REPORTED_METRICS)
     if metric.source is source
 }
 """Every metric by name, grouped by source: those that a requirement may limit, and those that are reported only."""

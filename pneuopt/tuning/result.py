@@ -11,6 +11,7 @@ import numpy as np
 from pneuopt.evaluation.certificate import Certificate, certificate
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import (
+    METRICS,
     REQUIREMENT_KINDS,
     describe_value,
     metric_name,
@@ -116,8 +117,8 @@ class Certifier:
         import pandas as pd
 
         parameters = self.task.space.parameters_at(point)
-        ripple = ("Ripple",) if self.task.loop.dither_period(parameters) else ()
-        shown = list(dict.fromkeys((*TABLE_METRICS, *ripple, *self.task.spec.kinds)))
+        ripple = ("SettlingTimeRaw", "Ripple") if self.task.loop.dither_period(parameters) else ()
+        shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *self.task.spec.kinds)]
         rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:

@@ -24,7 +24,7 @@ from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, is_so
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
 HEADLINES = {name: metric.source is Source.LINEAR_LOOP for name, metric in METRICS.items() if metric.headline}
-BASE_METRICS = (*(name for name, linear in HEADLINES.items() if not linear), "Ripple", "Excess")
+BASE_METRICS = (*(name for name, linear in HEADLINES.items() if not linear), "SettlingTimeRaw", "Ripple", "Excess")
 BASE_MARGINS = tuple(name for name, linear in HEADLINES.items() if linear)
 # Lanes up to which different references run together, the shorter ones padded. Fewer leave a processor's lanes empty;
 # more waste time on the padding.

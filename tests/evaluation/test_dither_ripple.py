@@ -11,6 +11,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.dither_ripple import describe_ripple
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.metrics import BandCentre, step_metrics
@@ -109,6 +110,21 @@ def test_a_jump_in_the_last_periods_is_no_ripple() -> None:
     assert measure(y)["Ripple"] == pytest.approx(0.5, rel=1e-3)
     late = np.where(T < 11.3, 0.5, 1.0) + sine(1 / PERIOD, 1e-6)
     assert measure(late)["SettlingTime"] == pytest.approx(11.3, abs=2e-3)
+
+
+def test_the_raw_signal_settles_too_or_a_sentence_says_that_it_does_not() -> None:
+    """A lag of .3 s under a ripple of 1 and of 9 %: the raw signal is in the band where the lag is within 1 %."""
+    small, large = (measure(1 - np.exp(-T / 0.3) + sine(1 / PERIOD, share)) for share in (0.01, 0.09))
+    for found in (small, large):
+        assert found["SettlingTime"] == pytest.approx(0.3 * log(50), rel=2e-3)
+    assert small["SettlingTimeRaw"] == pytest.approx(0.3 * log(100), abs=PERIOD)
+    assert np.isnan(large["SettlingTimeRaw"])
+    assert describe_ripple(small, 1.0, 0.02) is None
+    text = describe_ripple(large, -1.0, 0.02)
+    assert text is not None
+    assert "only the mean settles, in 1.17 s: a ripple of 18 % of the step" in text
+    hunting = measure(1 - np.exp(-T / 0.3) + sine(2.0, 0.09))
+    assert describe_ripple(hunting, 1.0, 0.02) is None
 
 
 def test_before_a_step_from_motion_the_signal_is_the_old_reference() -> None:
