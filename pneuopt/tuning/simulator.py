@@ -1,7 +1,7 @@
 """`Simulator`: compiled simulation of many candidates at once, on every reference and scenario."""
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 
 import numpy as np
 
@@ -78,7 +78,7 @@ class Simulator:
         self._wider: tuple[float, ...] = ()
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
-        self._rest = [_gain_independent_rest(case, loop, space) for case in self.cases]
+        self._rest = _rests(self.cases, loop, space)
         check_channels(loop.plant, self.response_metrics)
         self.meter_channels = needed_channels(self.response_metrics)
         self._rollout = Rollout(loop_pieces(loop, self.meter_channels))
@@ -321,8 +321,20 @@ def _select_rows(y: Array, rows: Mask) -> Array:
     return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)
 
 
+def _rests(cases: Sequence[TuningCase], loop: ClosedLoop, space: Space) -> list[Array | None]:
+    """Of each case the state before the step; references that begin alike share it, as a rest takes milliseconds."""
+    found = dict[tuple[Hashable, ...], Array | None]()
+    keys = [(case.scenario, case.reference.initial, *sorted(case.reference.start.items())) for case in cases]
+    for key, case in zip(keys, cases, strict=True):
+        if key not in found:
+            found[key] = _gain_independent_rest(case, loop, space)
+    return [found[key] for key in keys]
+
+
 def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> Array | None:
     """The state before the step, shape (n_states,); None where it depends on the gains."""
+    if not space.names:
+        return case.initial(loop, space.parameters)
     other = space.from_unit(np.full(len(space.names), 0.7))
     first, second = (case.initial(loop, space.parameters_at(point)) for point in (space.start, other))
     scale = np.array([q.nominal for q in loop.states])

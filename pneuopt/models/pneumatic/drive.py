@@ -150,7 +150,8 @@ class PneumaticDrive:
             at this speed.
         """
         self.check(parameters)
-        used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
+        own = self.parameters
+        used = own | parameters.select(n for n in parameters if n in own)
         stroke = used.value("cylinder.stroke")
         y = used.value("cylinder.start") * stroke if position is None else position
         require(0 <= y <= stroke, f"a start at position = {y:g} m lies outside the stroke, 0 to {stroke:g} m")
@@ -175,7 +176,8 @@ class PneumaticDrive:
             A_a (p_a - p_o) - A_b (p_b - p_o) [N], with the noise of the pressures.
         """
         self.check(parameters)
-        used = self.parameters | parameters.select(n for n in parameters if n in self.parameters)
+        own = self.parameters
+        used = own | parameters.select(n for n in parameters if n in own)
         numbers = {n: q.value for n, q in used.items()}
         return np.asarray(_air_force(numbers, *(measured[q.name] for q in PRESSURE_SIGNALS)))
 
@@ -276,8 +278,8 @@ class PneumaticDrive:
         z, zdot = stack(inner), stack({n: rates[n] for n in inner})
         steady = ca.substitute(-ca.solve(ca.jacobian(zdot, z), zdot), z, 0) if inner else z
         found = [ca.vertcat(*(rates[n] for n in BALANCE_RATES)), stack(x)]
-        arguments = [*given.values(), stack(p)]
-        return ca.Function("glide", arguments, ca.substitute(found, [z], [steady]) if inner else found)
+        found = ca.substitute(found, [z], [steady]) if inner else found
+        return ca.Function("glide", [*given.values(), stack(p)], [ca.densify(v) for v in found])
 
     def _find_rest(self, parameters: ParameterSet, outputs: Mapping[str, float]) -> Rest:
         others = ", ".join(sorted(outputs.keys() - {"position", "speed", "pressure_b"}))
