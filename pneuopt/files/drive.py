@@ -5,9 +5,11 @@ Which kinds of drive there are, and which sections and keys each has, is declare
 """
 
 from collections.abc import Mapping
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tomlkit
 
 from pneuopt.dynamics.system import System
@@ -21,9 +23,11 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import read_value
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from pneuopt.identification.result import IdentificationResult
 
-FIT_SECTIONS = ("estimates", "status", "verdict", "provenance")
+FIT_SECTIONS = ("estimates", "covariance", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
@@ -90,8 +94,44 @@ def read_status(path: str | Path) -> Status | None:
     return Status(Code(said["code"]), tuple(filter(None, [str(said.get("message", ""))])))
 
 
+def read_covariance(path: str | Path) -> "pd.DataFrame | None":
+    """The covariance of a fit's estimates; None for a file that no fit has written.
+
+    Parameters
+    ----------
+    path : str or Path
+        A fit.toml; from one without [covariance] come the variances of its [estimates] alone.
+
+    Returns
+    -------
+    DataFrame or None
+        As `IdentificationResult.covariance`, without what the logs do not identify.
+
+    Raises
+    ------
+    InputError
+        If it is no symmetric table of numbers.
+    """
+    import pandas as pd
+
+    table = read_toml(path).unwrap()
+    rows, estimates = table.get("covariance"), table.get("estimates", {})
+    if rows is None:
+        deviations = {n: e.get("stderr", nan) for n, e in estimates.items() if isinstance(e, dict)}
+        known = {n: float(v) for n, v in deviations.items() if isinstance(v, int | float) and isfinite(v)}
+        return pd.DataFrame(np.diag(np.square(list(known.values()))), list(known), list(known)) if known else None
+    message = f"{path}: [covariance] must hold a row of numbers for each of its parameters; run identify again"
+    require(isinstance(rows, dict) and all(isinstance(row, list) for row in rows.values()), message)
+    try:
+        matrix = np.array(list(rows.values()), dtype=float).reshape(len(rows), len(rows))
+    except ValueError:
+        raise InputError(message) from None
+    require(bool(np.isfinite(matrix).all() and np.allclose(matrix, matrix.T)), message)
+    return pd.DataFrame(matrix, list(rows), list(rows))
+
+
 def write_fit(path: str | Path, source: str | Path, result: "IdentificationResult") -> None:
-    """Write a drive's file with the values found: the user's text and comments, [estimates], [status], [verdict], ...
+    """Write a drive's file with the values found: the user's text and comments, [estimates], [covariance], ...
 
     An unidentifiable parameter keeps its given value and text (see `IdentificationResult`).
 
@@ -117,11 +157,18 @@ def write_fit(path: str | Path, source: str | Path, result: "IdentificationResul
             write_parameter(document, name, found, given[name])
     rows = result.estimates.to_dict(orient="index")
     document["estimates"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
+    document["covariance"] = toml_table(_covariance_rows(result.covariance))
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
         document["verdict"] = toml_table(result.verdict.to_dict())
     document["provenance"] = toml_table(plain_value(result.provenance))
     write_text(path, tomlkit.dumps(document))
+
+
+def _covariance_rows(covariance: "pd.DataFrame") -> dict[str, list[float]]:
+    """The rows of a covariance, without the parameters that have none."""
+    known = [n for n in covariance.index if np.isfinite(covariance.to_dict()[n][n])]
+    return {str(n): covariance.loc[n, known].to_list() for n in known}
 
 
 def _without_alias(document: tomlkit.TOMLDocument, alias: Alias, drive: Drive, given: ParameterSet) -> ParameterSet:
