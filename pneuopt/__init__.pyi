@@ -28,6 +28,7 @@ from .evaluation.certificate import Certificate, Defect, Finding, certificate
 from .evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
 from .evaluation.energy import EnergyUse
 from .evaluation.evaluate import evaluate, respond
+from .evaluation.expected_plants import ExpectedPlants, expected_plants
 from .evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from .evaluation.margins import Margins, frequency_response, margins
 from .evaluation.metrics import BandCentre, step_metrics
@@ -140,6 +141,7 @@ __all__ = [
     "Encoder",
     "EnergyUse",
     "EventKind",
+    "ExpectedPlants",
     "Experiment",
     "Factor",
     "Feedforward",
@@ -229,6 +231,7 @@ __all__ = [
     "dither_effect",
     "draws",
     "evaluate",
+    "expected_plants",
     "find_limit_cycle",
     "frequency_response",
     "friction_ladder",

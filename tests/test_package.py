@@ -50,6 +50,8 @@ PUBLIC_NAMES = [
     "EnergyUse",
     "evaluate",
     "EventKind",
+    "expected_plants",
+    "ExpectedPlants",
     "Experiment",
     "Factor",
     "Feedforward",

@@ -14,6 +14,7 @@ from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
 from pneuopt.evaluation.evaluate import LIMIT_CYCLE_METRICS
+from pneuopt.evaluation.expected_plants import PlantAxis
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, percent_factor, user_limit
 from pneuopt.quantities.parameters import ParameterSet
@@ -146,9 +147,14 @@ def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
 
 
 def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop) -> None:
-    """A requirement a row: its value over new plants, and on how many of them its limit is broken."""
+    """On how many plants a design holds, what they differ by, what breaks and would help; then the figures."""
     units = metric_units(loop)
-    console.print(f"validated on {len(found.plants)} new plants, the worst of each requirement certified")
+    console.print(Text(found.verdict, style="bold yellow" if found.broken else "bold green"), soft_wrap=True)
+    breaks = ", ".join(f"{word} on {count}" for word, count in found.breaks.items())
+    for sentence in (*found.varied, *([f"what breaks: {breaks}"] if breaks else []), *found.advice):
+        console.print(f"  {sentence}", soft_wrap=True)
+    if found.suggested:
+        console.print(f"  in the tuning's file: {'; '.join(_scenario_lines(found.suggested))}", soft_wrap=True)
     table = new_table("new plants", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
     for row in found.summary.reset_index(names="metric").to_dict(orient="records"):
         metric = str(row["metric"])
@@ -156,6 +162,16 @@ def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop)
         limit = "" if math.isnan(row["limit"]) else format_number(row["limit"], 4)
         table.add_row(metric, *figures, limit, str(row["violations"]), units[metric])
     console.print(table)
+
+
+def _scenario_lines(axes: Sequence[PlantAxis]) -> list[str]:
+    """What to write under [scenarios] to tune over these: [scenarios.corners] "load.mass" = "5 %"."""
+    kinds = {"corners": [a for a in axes if not a.is_gain], "tolerances": [a for a in axes if a.is_gain]}
+    return [
+        f"[scenarios.{kind}] " + ", ".join(f'"{n}" = "{100 * a.share:.2g} %"' for a in own for n in a.names)
+        for kind, own in kinds.items()
+        if own
+    ]
 
 
 def show_dither(console: Console, verdict: DitherVerdict) -> None:

@@ -35,7 +35,9 @@ from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate, final_operating_point, respond
+from pneuopt.evaluation.expected_plants import expected_plants
 from pneuopt.evaluation.response import linearise_open_loop
+from pneuopt.files.drive import read_covariance
 from pneuopt.files.tuning import Tuning, write_tuned
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
@@ -44,7 +46,6 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import TuningResult, tune
-from pneuopt.tuning.validation import DesignValidation, validate_design
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,6 +60,8 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
     require(bool(task.specification.weights), f"{tuning}: has nothing to minimise; {remedy}")
     require(len(task.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
+    complete, covariance = task.loop.complete(parameters), read_covariance(fit)
+    plants = expected_plants(complete, covariance, scenarios=task.validation_scenarios(parameters))
     with progress("tuning", quiet=quiet) as report_progress:
         result = tune(
             task.loop,
@@ -66,6 +69,7 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
             parameters,
             minimise=task.specification,
             scenarios=task.scenarios(parameters),
+            plants=plants,
             method=task.method,
             throw=False,
             progress=report_progress,
@@ -119,20 +123,6 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     return finish(outputs, writers, tables, None)
 
 
-def _validate_on_new_plants(task: Tuning, parameters: ParameterSet, result: TuningResult) -> DesignValidation | None:
-    """Validate a design on new plants from the boxes of the scenarios; None without scenarios."""
-    plants = task.validation_scenarios(parameters)
-    if not plants:
-        return None
-    return validate_design(
-        task.loop,
-        task.references,
-        result.parameters,
-        minimise=task.specification,
-        scenarios=plants,
-    )
-
-
 def _show_design(console: "Console", task: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
     """Show gains, metrics, the validation on new plants and the dither's verdict; returns the last two as tables."""
     show_gains(console, before, result.parameters)
@@ -149,10 +139,9 @@ def _show_design(console: "Console", task: Tuning, before: ParameterSet, result:
             f"margins are read with the slope that friction has where a step ends: {ends} {axis.force}*s/{length}"
         )
     tables: dict[str, Any] = {}
-    validation = _validate_on_new_plants(task, before, result)
-    if validation is not None:
-        show_validation(console, validation, task.loop)
-        tables["validation"] = records(validation.summary)
+    if result.validation is not None:
+        show_validation(console, result.validation, task.loop)
+        tables["validation"] = records(result.validation.summary)
     if task.loop.dither_period(result.parameters) is not None:
         tables |= _show_dither_verdict(console, task, result.parameters)
     elif "dither.amplitude" in result.parameters.free_names:

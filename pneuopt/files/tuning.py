@@ -1,6 +1,6 @@
 """tuning.toml: the controller, what may be tuned, the steps to follow and what counts; tuned.toml is made from it."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,9 +11,10 @@ import tomlkit
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
-from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios, Spread, corners, samples, tolerances
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.loop import (
     LOOP_SECTIONS,
@@ -41,8 +42,6 @@ TUNED_SECTIONS = ("certified", "status", "provenance")
 
 _TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method")
 SCENARIO_KINDS = ("corners", "samples", "tolerances")
-VALIDATION_PLANTS = 100
-"""Plants of each kind that a design is validated on: more take longer, fewer leave the 95th percentile to chance."""
 _SAMPLE_DEFAULTS = (("count", 20), ("seed", 0))
 _EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
@@ -165,9 +164,13 @@ def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSe
 
 
 def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:
-    """Draw plants and tolerances from the boxes of [scenarios], others than `read_scenarios` gives: "new 1", ..."""
-    drawn = (values for part in _read_kinds(table, where, parameters, VALIDATION_PLANTS) for values in part.values())
-    return {f"new {number}": values for number, values in enumerate(drawn, 1)}
+    """Draw plants from the boxes of [scenarios], others than `read_scenarios` gives, each with all that it varies."""
+    kinds = [list(part.values()) for part in _read_kinds(table, where, parameters, PLANT_COUNT)]
+    return {f"new {k}": _merge_scenarios(own) for k, own in enumerate(zip(*kinds, strict=True), 1)}
+
+
+def _merge_scenarios(parts: Sequence[Mapping[str, float | Factor]]) -> dict[str, float | Factor]:
+    return {n: value for part in parts for n, value in part.items()}
 
 
 def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:

@@ -30,6 +30,7 @@ from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.relaxation import describe_relaxations
 from pneuopt.tuning.responses import worst_values
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.validation import DesignValidation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -80,6 +81,8 @@ class TuningResult:
     provenance : mapping of str to str
     certificate : Certificate, optional
         All that the independent evaluation found; None where its simulation stopped.
+    validation : DesignValidation, optional
+        On how many plants like the model the design holds, and what would help; `tune` tries what it has certified.
     """
 
     parameters: ParameterSet
@@ -92,10 +95,12 @@ class TuningResult:
     stats: Mapping[str, float]
     provenance: Mapping[str, str]
     certificate: Certificate | None = None
+    validation: DesignValidation | None = None
 
     def __repr__(self) -> str:
         free = self.parameters.select(self.parameters.free_names)
-        return f"TuningResult {self.status}\n{free!r}\n{self.certified.to_string()}"
+        tried = f"\n{self.validation.verdict}" if self.validation else ""
+        return f"TuningResult {self.status}{tried}\n{free!r}\n{self.certified.to_string()}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -303,7 +303,8 @@ class Simulator:
         rates = fastest_eigenvalue(self.loop, corners, states)
         worst = corners[np.argsort(rates)[-STIFFEST_CORNERS:]]
         others = [case.case_vectors(worst, order) for case in self.cases[len(references) :: len(references)]]
-        return float(max([rates.max(), *(fastest_eigenvalue(self.loop, p, states).max() for p in others)]))
+        fastest = fastest_eigenvalue(self.loop, np.vstack(others), states).max() if others else 0.0
+        return float(max(rates.max(), fastest))
 
     def _sample_states(self, k: int) -> list[Array]:
         """States along the response of the given gains, from the start on."""

@@ -14,6 +14,7 @@ from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
 from pneuopt.evaluation.requirements import PeakControl, Requirement
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
@@ -27,6 +28,7 @@ from pneuopt.tuning.methods import choose_method
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, relax
 from pneuopt.tuning.space import Space, clip_level, search_space
+from pneuopt.tuning.validation import validate_design
 
 __all__ = ["TuningResult", "prepare_search", "prepare_task", "tune"]
 # Endings of a search that contradictory limits may have caused: `tune` then seeks how far they have to give way.
@@ -42,6 +44,7 @@ def tune(
     subject_to: Sequence[Requirement] = (),
     scenarios: Scenarios = NO_SCENARIOS,
     accept: Defect | Sequence[Defect] = (),
+    plants: ExpectedPlants | Scenarios | None = None,
     method: Method | None = None,
     throw: bool = True,
     progress: ProgressCallback | None = None,
@@ -66,6 +69,10 @@ def tune(
         several of them joined with ``|``. The worst over references and scenarios counts.
     accept : Defect or sequence of Defect
         Defects with which a design is certified all the same; any other is refused, whatever is minimised.
+    plants : ExpectedPlants or mapping, optional
+        Plants that no search sees, on which the certified design is tried: the result's `validation` says on how many
+        it holds. By default those of `expected_plants`, with usual tolerances; after a fit give
+        ``expected_plants(parameters, fit.covariance)``. ``{}``: none.
     method : TwoPhase, Racing or another Method, optional
         By default the first that suits: `TwoPhase` for one linear plant with a continuous controller that no clip can
         hold back, if it has equations for all that is asked for; else, or where `TwoPhase` fails, `Racing`.
@@ -118,9 +125,30 @@ def tune(
         status=result.status.with_remedies(note),
         stats={**result.stats, "seconds": time.perf_counter() - begun},
     )
+    if result.status.converged:
+        result = _try_on_plants(task, result, plants, search.progress)
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
     return result
+
+
+def _try_on_plants(
+    task: TuningTask, result: TuningResult, plants: ExpectedPlants | Scenarios | None, progress: ProgressCallback
+) -> TuningResult:
+    """The result with its validation; where that is interrupted or stops, the status says so."""
+    chosen = expected_plants(task.space.parameters, scenarios=task.scenarios) if plants is None else plants
+    count = len(chosen.scenarios if isinstance(chosen, ExpectedPlants) else chosen)
+    if not count:
+        return result
+    progress(f"trying the design on {count} plants")
+    try:
+        found = validate_design(
+            task.loop, task.references, result.parameters, minimise=task.spec, scenarios=chosen, accept=task.accept
+        )
+    except (ConvergenceError, KeyboardInterrupt) as error:
+        reason = str(error) or "interrupted"
+        return replace(result, status=result.status.with_details(f"not tried on other plants: {reason}"))
+    return replace(result, validation=found)
 
 
 def prepare_task(

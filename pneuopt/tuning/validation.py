@@ -1,7 +1,7 @@
-"""`validate_design`: a design's metrics on new plants, or with gains off by a tolerance, that no search has used."""
+"""`validate_design`: a design on plants that no search has used: on how many it holds, what breaks, what would help."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step, as_steps
-from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.cases import TuningCase
+from pneuopt.evaluation.certificate import Defect, certificate
+from pneuopt.evaluation.expected_plants import ExpectedPlants, PlantAxis
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, user_limit
-from pneuopt.evaluation.scenarios import Scenarios
+from pneuopt.evaluation.scenarios import Scenarios, apply_scenario
 from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import require
+from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.advice import LANE_DEFECTS, NO_REST, advise, find_breaks
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
@@ -33,7 +36,7 @@ SUMMARY_PERCENTILE = 95.0
 
 @dataclass(frozen=True, eq=False)
 class DesignValidation:
-    """The metrics of a design on new plants.
+    """A design on new plants.
 
     Attributes
     ----------
@@ -45,15 +48,53 @@ class DesignValidation:
     plants : DataFrame
         A row a plant, a column a metric, the worst over the references; by the compiled simulation.
     certified : DataFrame
-        A row a metric, a column a reference and one of the worst plants; by the independent simulation.
+        A row a metric, a column a case that is the worst for a requirement; by the independent simulation.
+    broken : mapping of str to tuple of str
+        By plant, without those on which the design holds: defects ("never settles", "unstable", of the worst plants
+        all that a certificate finds; "has no rest"), then the limits that it breaks.
+    varied : tuple of str
+        What the plants differ by.
+    advice : tuple of str
+        What would help, a sentence each; computed from these plants.
+    suggested : tuple of PlantAxis
+        What of it to tune over.
     """
 
     summary: "pd.DataFrame"
     plants: "pd.DataFrame"
     certified: "pd.DataFrame"
+    broken: Mapping[str, tuple[str, ...]]
+    varied: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    suggested: tuple[PlantAxis, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of plants."""
+        return len({*map(str, self.plants.index), *self.broken})
+
+    @property
+    def held(self) -> int:
+        """Number of plants on which every limit holds, the response settles and the loop is stable."""
+        return self.count - len(self.broken)
+
+    @property
+    def verdict(self) -> str:
+        """On how many plants it holds, in a sentence."""
+        found = f"holds on {self.held} of {self.count} plants"
+        if self.broken or not self.count:
+            return found
+        return f"{found}: with 95 % confidence on at least {100 * 0.05 ** (1 / self.count):.3g} % of all such plants"
+
+    @property
+    def breaks(self) -> Mapping[str, int]:
+        """By limit or defect: on how many plants it breaks, the most frequent first."""
+        words = [w for found in self.broken.values() for w in found]
+        return {w: words.count(w) for w in sorted(set(words), key=lambda w: (-words.count(w), w))}
 
     def __repr__(self) -> str:
-        return f"DesignValidation on {len(self.plants)} new plants\n{self.summary.to_string()}"
+        lines = (f"DesignValidation {self.verdict}", *(f"  {s}" for s in (*self.varied, *self.advice)))
+        return "\n".join((*lines, self.summary.to_string()))
 
 
 def validate_design(
@@ -63,9 +104,10 @@ def validate_design(
     *,
     minimise: Objective,
     subject_to: Sequence[Requirement] = (),
-    scenarios: Scenarios,
+    scenarios: Scenarios | ExpectedPlants,
+    accept: Collection[Defect] = (),
 ) -> DesignValidation:
-    """Simulate a design on new plants: all compiled, the worst one of each requirement by the independent simulation.
+    """Simulate a design on new plants: all compiled, the worst case of each requirement by the independent simulation.
 
     Parameters
     ----------
@@ -73,9 +115,11 @@ def validate_design(
         As for `tune`.
     parameters : ParameterSet
         The design's, a `TuningResult.parameters` for example.
-    scenarios : mapping of str to mapping
-        The plants, or tolerances of the gains: of `samples` or `draws` with another seed than the search had, or
-        `tolerances` with a count.
+    scenarios : mapping of str to mapping, or ExpectedPlants
+        The plants, or tolerances of the gains: of `samples` or `draws` with another seed than the search had,
+        `tolerances` with a count, or `expected_plants`, with which the advice says what to tune over.
+    accept : collection of Defect
+        Defects that do not count.
 
     Returns
     -------
@@ -86,7 +130,7 @@ def validate_design(
     InputError
         If there is no scenario, or parameters, scenarios and requirements do not fit together.
     ConvergenceError
-        If the loop has no rest on one of the plants, or the independent simulation stops.
+        If the loop rests on none of the plants, or the independent simulation stops.
 
     Examples
     --------
@@ -100,51 +144,113 @@ def validate_design(
     >>> found = validate_design(
     ...     loop, Step(1.0), design, minimise=SettlingTime(), subject_to=[Overshoot(0.01)], scenarios=plants
     ... )
-    >>> int(found.summary.loc["Overshoot", "violations"])
-    0
+    >>> int(found.summary.loc["Overshoot", "violations"]), found.held
+    (0, 50)
     """
-    require(len(scenarios) > 0, "no new plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)")
+    expected = scenarios if isinstance(scenarios, ExpectedPlants) else ExpectedPlants(scenarios, ())
+    message = "no new plants; draw some: scenarios=samples(parameters, {'load.mass': 0.3}, 100)"
+    require(len(expected.scenarios) > 0, message)
     spec = specify(minimise, subject_to)
     check_closed_loop(loop)
     check_parameters(parameters)
     steps = as_steps(references)
     loop = add_disturbances(loop, steps)
     full = loop.complete(parameters).select(loop.parameters)
-    values = _simulate_plants(loop, steps, full, spec, scenarios)
-    plants = [str(n) for n in values]
-    worst = {str(n): plants[_rank_order(row.to_numpy(dtype=float), str(n))[-1]] for n, row in values.iterrows()}
-    named = list(dict.fromkeys(worst.values()))
-    certified = evaluate(
-        loop, steps, full, scenarios={n: scenarios[n] for n in named}, band=spec.band, envelope=spec.envelope
-    )
-    certified = certified.loc[list(values.index), certified.columns[len(steps) :]]
+    ends = {f"{a.label} {side}": v for a in expected.axes for side, v in (("low", a.low), ("high", a.high))}
+    by_case, restless = _simulate_plants(loop, steps, full, spec, {**expected.scenarios, **ends})
+    restless = [n for n in restless if n in expected.scenarios]
+    values = _worst_by_plant(by_case, [n for n in expected.scenarios if n not in restless], steps)
+    by_plant = {str(n): {str(m): float(v) for m, v in row.items()} for n, row in values.to_dict().items()}
+    breaks = {n: find_breaks(row, spec, accept) for n, row in by_plant.items()} | dict.fromkeys(restless, (NO_REST,))
+    shown = [name for name in METRICS if name in spec.kinds]
+    worst = {n: _worst_case(by_case, values, n, steps) for n in shown}
+    certified, findings = _certify(loop, full, spec, expected.scenarios, steps, list(dict.fromkeys(worst.values())))
+    for plant, words in findings:
+        own = [w for w in words if Defect(w) not in accept and w not in breaks[plant]]
+        breaks[plant] = (*own, *breaks[plant])
+    broken = {n: found for n, found in breaks.items() if found}
+    sides = {a: [f"[{a.label} {side}]" for side in ("low", "high")] for a in expected.axes}
+    axes = {a: by_case[[c for c in by_case if str(c).endswith(tuple(ends))]] for a, ends in sides.items()}
+    advice, suggested = advise(loop, spec, values.T, broken, certified, axes)
     return DesignValidation(
-        _summary(values, worst, _worst_by_plant(certified, named, len(steps)), spec), values.T, certified
+        _summary(values.loc[shown], worst, certified, spec),
+        values.loc[shown].T,
+        certified.loc[shown],
+        broken,
+        expected.sentences,
+        advice,
+        suggested,
     )
 
 
 def _simulate_plants(
     loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
-) -> "pd.DataFrame":
-    """The metrics of each plant by compiled simulation, the worst over the references."""
+) -> tuple["pd.DataFrame", list[str]]:
+    """The metrics of each case by compiled simulation, a column a case, and the plants that have no rest."""
     import pandas as pd
 
-    simulator = Simulator(loop, steps, Space(parameters, ()), scenarios, spec)
+    space, restless = Space(parameters, ()), list[str]()
+    try:
+        simulator = Simulator(loop, steps, space, scenarios, spec)
+    except (ConvergenceError, InputError):
+        restless = [n for n in scenarios if not _rests(loop, steps, parameters, n, scenarios)]
+        left = {n: values for n, values in scenarios.items() if n not in restless}
+        if not restless or not left:
+            raise
+        simulator = Simulator(loop, steps, space, left, spec)
     rows = simulator.table(np.zeros(0), spec)
     found = pd.DataFrame({case.label: row for case, row in zip(simulator.cases, rows, strict=True)})
-    shown = [name for name in METRICS if name in spec.kinds]
-    return _worst_by_plant(found.loc[shown, found.columns[len(steps) :]], list(scenarios), len(steps))
+    return found.loc[[n for n in METRICS if n in (*spec.kinds, *LANE_DEFECTS)]], restless
 
 
-def _worst_by_plant(metrics: "pd.DataFrame", plants: Sequence[str], references: int) -> "pd.DataFrame":
-    """The worst of each plant's metrics over its references, from columns plant by plant; NaN is the worst."""
+def _rests(loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, plant: str, scenarios: Scenarios) -> bool:
+    """Whether the loop rests, or moves steadily, on a plant before each step."""
+    try:
+        for step in steps:
+            TuningCase(step, plant, scenarios[plant]).initial(loop, parameters)
+    except (ConvergenceError, InputError):
+        return False
+    return True
+
+
+def _certify(
+    loop: ClosedLoop,
+    parameters: ParameterSet,
+    spec: Specification,
+    scenarios: Scenarios,
+    steps: Sequence[Step],
+    worst: Sequence[str],
+) -> tuple["pd.DataFrame", list[tuple[str, list[str]]]]:
+    """The metrics of some cases by the independent simulation, a column a case, and the defects of their plants."""
     import pandas as pd
 
-    found = {}
-    for number, plant in enumerate(plants):
-        own = metrics.iloc[:, number * references : (number + 1) * references]
-        found[plant] = {n: _worst_value(row.to_numpy(dtype=float), str(n)) for n, row in own.iterrows()}
-    return pd.DataFrame(found, index=metrics.index)
+    every = {case.label: case for n, v in scenarios.items() for case in (TuningCase(step, n, v) for step in steps)}
+    metrics, defects = {}, []
+    for label in worst:
+        case = every[label]
+        plant = apply_scenario(parameters, case.values)
+        found = certificate(loop, case.reference, plant, band=spec.band, envelope=spec.envelope)
+        metrics[label] = found.metrics.iloc[:, 0]
+        defects.append((case.scenario, [finding.defect.value for finding in found.findings]))
+    return pd.DataFrame(metrics), defects
+
+
+def _worst_case(by_case: "pd.DataFrame", values: "pd.DataFrame", metric: str, steps: Sequence[Step]) -> str:
+    """The case in which a metric is worst."""
+    plant = str(values.columns[_rank_order(values.loc[metric].to_numpy(dtype=float), metric)[-1]])
+    own = [TuningCase(step, plant).label for step in steps]
+    return own[int(_rank_order(by_case.loc[metric, own].to_numpy(dtype=float), metric)[-1])]
+
+
+def _worst_by_plant(by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Step]) -> "pd.DataFrame":
+    """The worst of each plant's metrics over its references, a column a plant; NaN is the worst."""
+    import pandas as pd
+
+    columns = {str(label): number for number, label in enumerate(by_case)}
+    own = np.array([[columns[TuningCase(step, plant).label] for step in steps] for plant in plants])
+    table = by_case.to_numpy(dtype=float)[:, own]
+    worst = [[_worst_value(row, str(n)) for row in rows] for n, rows in zip(by_case.index, table, strict=True)]
+    return pd.DataFrame(worst, index=by_case.index, columns=list(plants))
 
 
 def _worst_value(values: Array, metric: str) -> float:
@@ -164,16 +270,17 @@ def _summary(
     """The table `DesignValidation.summary`."""
     import pandas as pd
 
-    limits, proven = {metric_name(q): _metric_limit(q) for q in spec.limits}, certified.to_dict()
+    limits = {metric_name(q): _metric_limit(q) for q in spec.limits}
     rows = {}
-    for metric, plant in worst.items():
+    for metric, case in worst.items():
         given, limit = values.loc[metric].to_numpy(dtype=float), limits.get(metric, math.nan)
+        order = _rank_order(given, metric)
         rows[metric] = {
             "median": _quantile(given, metric, 50.0),
             "p95": _quantile(given, metric, SUMMARY_PERCENTILE),
             "worst": _worst_value(given, metric),
-            "worst_plant": plant,
-            "certified": float(proven[plant][metric]),
+            "worst_plant": str(values.columns[order[-1]]),
+            "certified": float(certified[case].to_dict()[metric]),
             "limit": limit,
             "violations": int(np.sum(~_keeps_limit(given, limit, metric))),
         }

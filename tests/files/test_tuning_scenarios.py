@@ -98,9 +98,9 @@ def test_new_plants_come_from_the_same_boxes_and_differ(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     said = read_toml(path).unwrap()["scenarios"]
     seen, fresh = (found(said, "tuning.toml", RIG) for found in (read_scenarios, read_validation_scenarios))
-    assert len(fresh) == 200
-    masses = [v["load.mass"] for v in fresh.values() if "load.mass" in v]
-    factors = [v["pid.Kp"] for v in fresh.values() if "pid.Kp" in v]
+    assert len(fresh) == 100
+    masses = [v["load.mass"] for v in fresh.values()]
+    factors = [v["pid.Kp"] for v in fresh.values()]
     assert all(isinstance(m, float) and 3.5 <= m <= 6.5 for m in masses)
     assert all(isinstance(f, Factor) and 0.99 <= f.share <= 1.01 for f in factors)
     assert not {v["load.mass"] for v in seen.values() if "load.mass" in v} & set(masses)
@@ -117,10 +117,13 @@ def test_a_tuning_with_scenarios_is_validated_on_new_plants(tmp_path: Path, monk
     Path("tuning.toml").write_text(f'{loop}\nhorizon = "0.3 s"\n{asked}\n{scenarios}', encoding="utf-8")
     result = CliRunner().invoke(app, ["tune", "drive.toml", "tuning.toml", "--json", "out.json"])
     assert result.exit_code == 0, result.output
-    assert "validated on 100 new plants" in result.output
+    assert "holds on 100 of 100 plants" in result.output
+    assert "as the scenarios have them: load.mass" in result.output
+    assert "assumed tolerances: friction.viscous +-10 %" in result.output
     found = json.loads(Path("out.json").read_text(encoding="utf-8"))
     settling, overshoot = found["validation"]
     worst_corner = max(row["SettlingTime"] for row in found["certified"])
     assert settling["violations"] == overshoot["violations"] == 0
-    assert 0.5 * worst_corner < settling["median"] <= settling["p95"] <= settling["worst"] <= 1.01 * worst_corner
+    assert 0.5 * worst_corner < settling["median"] <= settling["p95"] <= settling["worst"]
+    assert settling["worst"] <= 1.05 * worst_corner, "friction and the gain vary beside the mass: by 10 % and by 1 %"
     assert settling["certified"] == pytest.approx(settling["worst"], rel=1e-2)

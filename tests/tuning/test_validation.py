@@ -1,6 +1,7 @@
 """Fresh plants: an integrator under P control settles after ln 50/(K Kp), so that each figure is known."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -8,11 +9,27 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.requirements import MaxSensitivity, Overshoot, PhaseMargin, SettlingTime
-from pneuopt.evaluation.scenarios import apply_scenario, samples, tolerances
+from pneuopt.evaluation.cases import TuningCase
+from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.expected_plants import PLANT_COUNT, expected_plants
+from pneuopt.evaluation.requirements import (
+    IAE,
+    MaxSensitivity,
+    Overshoot,
+    PeakControl,
+    PhaseMargin,
+    SettlingTime,
+)
+from pneuopt.evaluation.scenarios import apply_scenario, corners, samples, tolerances
+from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import Space
+from pneuopt.tuning.tune import tune
 from pneuopt.tuning.validation import validate_design
 
 STEPS = [Step(1.0, horizon=2.0), Step(-0.5, horizon=1.5)]
@@ -87,3 +104,107 @@ def test_no_plant_is_refused() -> None:
     loop, design = integrator()
     with pytest.raises(InputError, match="no new plants"):
         validate_design(loop, STEPS, design, minimise=SettlingTime(), subject_to=[MaxSensitivity(2.0)], scenarios={})
+
+
+def test_a_plant_that_never_settles_is_unstable_or_has_no_rest_counts_as_broken() -> None:
+    """P control of an integrator behind a dead time of 0.1 s is unstable from a gain of pi/2/0.1 on."""
+    loop = ClosedLoop(Integrator(pade_order=3).system(), PID(limits=False))
+    design = loop.parameters.with_values({"plant.gain": 1.0, "plant.dead_time": 0.1, "pid.Kp": 5.0})
+    plants = {"good": {"plant.gain": 1.0}, "slow": {"plant.gain": 0.1}, "wild": {"plant.gain": 5.0}}
+    found = validate_design(loop, STEPS, design, minimise=IAE(), subject_to=[Overshoot(0.5)], scenarios=plants)
+    assert (found.count, found.held) == (3, 1)
+    assert found.broken["slow"] == ("never settles",)
+    assert {"unstable", "Overshoot"} <= set(found.broken["wild"])
+    assert found.breaks["never settles"] == 2
+    assert "no relaxed limit helps on 2 plants" in " ".join(found.advice)
+
+
+def test_what_is_accepted_does_not_count() -> None:
+    loop, design = integrator(1.0)
+    slow = {"slow": {"plant.gain": 0.5}}
+    assert validate_design(loop, STEPS, design, minimise=IAE(), scenarios=slow).held == 0
+    assert validate_design(loop, STEPS, design, minimise=IAE(), scenarios=slow, accept=tuple(Defect)).held == 1
+
+
+def test_a_plant_without_rest_is_broken_and_the_others_are_tried() -> None:
+    """A load that the supply cannot hold: the cylinder pushes 380 N at 6 bar(g), and no more."""
+    loop = ClosedLoop(PneumaticDrive(friction=Viscous()).system(), PID(sample_time=2e-3))
+    design = loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ki": 10.0})
+    plants = {"light": {"load.force": 10.0}, "heavy": {"load.force": 900.0}}
+    step = Step(0.05, horizon=0.3)
+    found = validate_design(loop, step, design, minimise=IAE(), scenarios=plants, accept=tuple(Defect))
+    assert found.broken == {"heavy": ("has no rest",)}
+    assert list(found.plants.index) == ["light"]
+
+
+def test_the_advice_is_true_the_relaxed_limit_holds_and_what_to_tune_over_is_what_breaks_it() -> None:
+    """A settling time of ln 50/(K Kp) breaks by the plant's gain of +-5 %, not by the controller's of +-1 %."""
+    loop, design = integrator(5.0)
+    design = design.with_bounds({"pid.Kp": (0.1, 50.0)}).freed("pid.Kp")
+    asked = math.log(50) / 5 * 1.02
+    plants = expected_plants(design)
+    found = validate_design(loop, STEPS, design, minimise=SettlingTime(max=asked), scenarios=plants)
+    varied = [apply_scenario(loop.complete(design), values) for values in plants.scenarios.values()]
+    truth = sum(math.log(50) / (p.value("plant.gain") * p.value("pid.Kp")) > asked for p in varied)
+    assert len(found.broken) == truth > 0
+    relaxed = re.search(r"with SettlingTime <= ([0-9.]+) s .* these gains hold on 100 of 100", found.advice[0])
+    assert relaxed is not None
+    again = validate_design(loop, STEPS, design, minimise=SettlingTime(max=float(relaxed[1])), scenarios=plants)
+    assert again.held == 100
+    assert again.advice == ()
+    assert [a.names for a in found.suggested] == [("plant.gain",)]
+    better = tune(
+        loop,
+        STEPS,
+        design,
+        minimise=IAE(),
+        subject_to=[SettlingTime(max=asked)],
+        scenarios=corners(design, {"plant.gain": 0.05}),
+    )
+    assert better.validation is not None
+    assert better.validation.held > found.held
+
+
+def test_tune_tries_a_certified_design_on_plants_and_says_on_how_many_it_holds() -> None:
+    loop, given = integrator(5.0)
+    given = given.with_bounds({"pid.Kp": (0.1, 20.0)}).freed("pid.Kp")
+    best = tune(loop, STEPS, given, minimise=SettlingTime(), subject_to=[PeakControl(10.0)])
+    assert best.validation is not None
+    assert best.validation.count == PLANT_COUNT
+    assert 0 < best.validation.held < PLANT_COUNT, "half of the gains are above 10 V/m"
+    assert best.validation.verdict in repr(best)
+
+
+def test_all_plants_hold_with_the_confidence_that_their_number_gives() -> None:
+    loop, design = integrator()
+    plants = samples(design, {"plant.gain": 0.1}, 59, seed=1)
+    found = validate_design(loop, STEPS, design, minimise=SettlingTime(), scenarios=plants)
+    assert found.verdict == "holds on 59 of 59 plants: with 95 % confidence on at least 95 % of all such plants"
+
+
+def test_ctrl_c_while_the_plants_are_tried_keeps_the_design(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pneuopt.tuning.tune.validate_design", interrupt)
+    loop, given = integrator(5.0)
+    given = given.with_bounds({"pid.Kp": (0.1, 20.0)}).freed("pid.Kp")
+    assert tune(loop, STEPS, given, minimise=SettlingTime(), plants={}).validation is None, "none is tried, none stops"
+    best = tune(loop, STEPS, given, minimise=SettlingTime())
+    assert best.status.converged
+    assert best.validation is None
+    assert "not tried on other plants: interrupted" in str(best.status)
+
+
+def test_a_rest_is_sought_once_a_plant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred plants and two references that begin alike take a hundred rests, and one of the nominal plant."""
+    loop, design = integrator()
+    sought, initial = list[str](), TuningCase.initial
+
+    def count(case: TuningCase, loop: ClosedLoop, parameters: ParameterSet) -> Array:
+        sought.append(case.scenario)
+        return initial(case, loop, parameters)
+
+    monkeypatch.setattr(TuningCase, "initial", count)
+    Simulator(loop, STEPS, Space(loop.complete(design), ()), samples(design, {"plant.gain": 0.1}, 100))
+    assert len(sought) == len(set(sought)) == 101

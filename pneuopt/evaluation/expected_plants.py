@@ -1,0 +1,192 @@
+"""`expected_plants`: the plants that a model may stand for, within what a fit leaves open and what hardware varies by.
+
+A parameter that a fit has estimated is drawn from the fit's covariance; of the others, those named in `TOLERANCES` vary
+by the usual tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, AxisNames, Factor, Scenarios, draws, tolerances
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Plants on which a design is tried. If it holds on all of 100, at least 97 % of such plants hold with 95 % confidence
+# (0.05^(1/100)); fewer say less, more cost time in proportion.
+PLANT_COUNT = 100
+PLANT_SEED = 1  # another one than `samples` and `draws` have by default, so that no search has seen these plants
+# By what share of its value a parameter differs from plant to plant where no fit has estimated it. Parameters on one
+# line vary together. Larger shares find fault with every design, smaller ones with none.
+TOLERANCES: Mapping[tuple[str, ...], float] = {
+    ("load.mass",): 0.05,  # a moving mass from drawings, without hoses, cables and what is clamped on
+    ("load.inertia",): 0.05,  # likewise
+    ("supply.pressure",): 0.05,  # droop and hysteresis of a regulator: 0.3 bar at 6 bar(g)
+    # Friction of one seal from run to run (problems/identify/seal_friction.py), and as it warms up.
+    ("friction.coulomb", "friction.static"): 0.1,
+    ("friction.viscous",): 0.1,
+    ("plant.gain",): 0.05,  # of a transfer function: as for mass and supply, on which it depends
+    ("plant.time_constant",): 0.05,
+    ("plant.natural_frequency",): 0.05,
+    ("plant.damping",): 0.1,  # friction's share in it
+    ("plant.dead_time",): 0.05,
+}
+# Share by which a controller's gain differs from the printed one: rounding to three digits, integer scaling in a PLC.
+GAIN_TOLERANCE = 0.01
+GAIN_PREFIXES = ("pid.", "feedforward.")
+# Standard deviations of a fit's estimate that count as its low and its high end: 95 % of the plants lie between.
+FIT_SPREAD = 1.96
+
+
+@dataclass(frozen=True, eq=False)
+class PlantAxis:
+    """Parameters that vary together from plant to plant, on their own.
+
+    Attributes
+    ----------
+    names : tuple of str
+    share : float
+        By which fraction of the value they vary, either way.
+    low, high : mapping of str to float or Factor
+        The scenario in which they are at their low, and at their high end, and nothing else differs.
+    is_gain : bool
+        Whether it is the controller's.
+    """
+
+    names: tuple[str, ...]
+    share: float
+    low: Mapping[str, float | Factor]
+    high: Mapping[str, float | Factor]
+    is_gain: bool = False
+
+    @property
+    def label(self) -> str:
+        """Names and tolerance, "load.mass +-5 %"."""
+        return f"{' and '.join(self.names)} +-{100 * self.share:.2g} %"
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedPlants:
+    """Plants that a model may stand for, and what they differ by.
+
+    Attributes
+    ----------
+    scenarios : mapping of str to mapping
+        "plant 1" and so on.
+    axes : tuple of PlantAxis
+        What varies, without the parameters of the scenarios that a tuning knows already.
+    from_fit : tuple of str
+        Parameters that are drawn from a fit's covariance.
+    known : tuple of str
+        Parameters that vary as the tuning's own scenarios have them.
+    """
+
+    scenarios: Scenarios
+    axes: tuple[PlantAxis, ...]
+    from_fit: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What varies and by how much, a sentence a source."""
+        stated = [a for a in self.axes if not a.is_gain and not set(a.names) & set(self.from_fit)]
+        gains = [a for a in self.axes if a.is_gain]
+        fitted = [a.label for a in self.axes if set(a.names) & set(self.from_fit)]
+        parts = (
+            ("as the fit leaves them", fitted),
+            ("assumed tolerances", [a.label for a in stated]),
+            ("of the controller", [f"each gain +-{100 * a.share:.2g} %" for a in gains[:1]]),
+            ("as the scenarios have them", list(self.known)),
+        )
+        return tuple(f"{lead}: {', '.join(labels)}" for lead, labels in parts if labels)
+
+
+def expected_plants(
+    parameters: ParameterSet,
+    covariance: "pd.DataFrame | None" = None,
+    *,
+    scenarios: Scenarios = NO_SCENARIOS,
+    count: int = PLANT_COUNT,
+    seed: int = PLANT_SEED,
+) -> ExpectedPlants:
+    """Draw the plants that a model may stand for.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        Of plant and controller, as for `tune`: what is free counts as tuned.
+    covariance : DataFrame, optional
+        `IdentificationResult.covariance`, which also says which parameters the logs have identified.
+    scenarios : mapping of str to mapping, optional
+        Plants that the design is meant for, the search's own or others from the same boxes: plant k differs from the
+        model as the k-th of them does, over and above what else varies; after the last one comes the first.
+    count : int
+    seed : int
+
+    Returns
+    -------
+    ExpectedPlants
+
+    Examples
+    --------
+    >>> from pneuopt.quantities.parameters import Parameter
+    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "pid.Kp": Parameter(2.0, "V*s/m", 0.1, 9.0, free=True)})
+    >>> plants = expected_plants(rig, count=20)
+    >>> len(plants.scenarios), plants.sentences
+    (20, ('assumed tolerances: load.mass +-5 %', 'of the controller: each gain +-1 %'))
+    """
+    require(count >= 1, f"count must be at least 1, got {count}")
+    known = {n for values in scenarios.values() for n in values}
+    estimated = _select_estimates(parameters, covariance, known)
+    shares = _usual_tolerances(parameters, {*known, *(estimated.index if estimated is not None else ())})
+    varied = tolerances(parameters, shares, count, seed=seed) if shares else {}
+    drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed)
+    own = list(scenarios.values()) or [{}]
+    parts = zip(*((list(part.values()) or [{}] * count) for part in (varied, drawn)), strict=True)
+    plants = {f"plant {k + 1}": {**a, **b, **own[k % len(own)]} for k, (a, b) in enumerate(parts)}
+    axes = [_tolerance_axis(names, share) for names, share in shares.items()]
+    from_fit = tuple(estimated.index) if estimated is not None else ()
+    axes += [
+        _estimate_axis(parameters, n, float(estimated.loc[n, n]) ** 0.5) for n in from_fit if estimated is not None
+    ]
+    return ExpectedPlants(plants if axes or known else {}, tuple(axes), from_fit, tuple(sorted(known)))
+
+
+def _select_estimates(
+    parameters: ParameterSet, covariance: "pd.DataFrame | None", known: Collection[str]
+) -> "pd.DataFrame | None":
+    """The part of a covariance that the plants are drawn from: identified parameters of this loop; None without one."""
+    if covariance is None:
+        return None
+    spread = dict(zip(map(str, covariance.index), np.diag(covariance.to_numpy(dtype=float)).tolist(), strict=True))
+    names = [n for n, v in spread.items() if n in parameters and n not in known and v > 0 and not parameters[n].free]
+    return covariance.loc[names, names] if names else None
+
+
+def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict[AxisNames, float]:
+    """By which share the parameters vary that neither a fit nor a scenario speaks of; a value of 0 has no share."""
+    gains = [n for n in parameters.free_names if n.startswith(GAIN_PREFIXES)]
+    rows = [*TOLERANCES.items(), *(((n,), GAIN_TOLERANCE) for n in gains)]
+    found: dict[AxisNames, float] = {}
+    for names, share in rows:
+        own = tuple(n for n in names if n in parameters and n not in others and parameters.value(n) != 0)
+        found |= {own: share} if own else {}
+    return found
+
+
+def _tolerance_axis(names: AxisNames, share: float) -> PlantAxis:
+    low, high = ({n: Factor(1 + side * share) for n in names} for side in (-1, 1))
+    return PlantAxis(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES))
+
+
+def _estimate_axis(parameters: ParameterSet, name: str, deviation: float) -> PlantAxis:
+    """An estimate with the interval that its standard deviation leaves, within its bounds."""
+    p, width = parameters[name], FIT_SPREAD * deviation
+    ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
+    low, high = (float(min(max(end, p.lower), p.upper)) for end in ends)
+    return PlantAxis((name,), width / abs(p.value) if p.value else 0.0, {name: low}, {name: high})

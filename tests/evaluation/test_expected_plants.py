@@ -1,0 +1,86 @@
+"""The plants that a model may stand for: drawn from a fit where there is one, within stated tolerances elsewhere."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.evaluation.expected_plants import GAIN_TOLERANCE, PLANT_COUNT, TOLERANCES, expected_plants
+from pneuopt.evaluation.scenarios import apply_scenario, corners
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder, SecondOrder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.rotary import RotaryDrive
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+
+
+def parameters() -> ParameterSet:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=1e-3))
+    return loop.parameters.with_bounds({"pid.Kp": (1, 1e3)}).with_values({"pid.Kp": 200.0}).freed("pid.Kp")
+
+
+def test_without_a_fit_the_stated_tolerances_hold() -> None:
+    given = parameters()
+    plants = expected_plants(given)
+    assert len(plants.scenarios) == PLANT_COUNT
+    table = pd.DataFrame(
+        [
+            apply_scenario(given, v).to_frame()["value"] / given.to_frame()["value"] - 1
+            for v in plants.scenarios.values()
+        ]
+    )
+    for names, share in {**TOLERANCES, ("pid.Kp",): GAIN_TOLERANCE}.items():
+        for n in (n for n in names if n in given):
+            spread = table[n].astype(float)
+            assert 0.9 * share < spread.abs().max() <= share * (1 + 1e-12)
+            assert abs(spread.mean()) < 0.3 * share
+    assert (table["friction.coulomb"] - table["friction.static"]).abs().max() < 1e-12, "they vary together"
+    assert (table[["friction.smoothing", "friction.stribeck_velocity", "load.force"]].fillna(0) == 0).all(axis=None)
+    assert plants.sentences[0].startswith("assumed tolerances: load.mass +-5 %")
+
+
+def test_a_fit_replaces_the_tolerances_of_what_it_identified() -> None:
+    """Correlations count: two estimates of which the logs know only the sum vary against each other."""
+    given = parameters()
+    names = ["friction.coulomb", "load.force", "friction.viscous"]
+    matrix = np.array([[4.0, -3.9, 0.0], [-3.9, 4.0, 0.0], [0.0, 0.0, np.nan]])
+    covariance = pd.DataFrame(matrix, index=names, columns=names)
+    plants = expected_plants(given, covariance, count=400)
+    frame = pd.DataFrame(list(plants.scenarios.values()))
+    drawn = frame[["friction.coulomb", "load.force"]].astype(float)
+    assert drawn["friction.coulomb"].std() == pytest.approx(2.0, rel=0.1)
+    assert np.corrcoef(drawn.to_numpy().T)[0, 1] == pytest.approx(-3.9 / 4, abs=0.02)
+    assert plants.from_fit == ("friction.coulomb", "load.force")
+    assert "friction.viscous" in frame, "what the logs could not identify varies by its tolerance"
+    assert "friction.coulomb and" not in " ".join(plants.sentences)
+    assert any(s.startswith("as the fit leaves them: friction.coulomb +-13 %") for s in plants.sentences)
+
+
+def test_scenarios_of_the_tuning_are_kept_and_the_rest_still_varies() -> None:
+    given = parameters()
+    asked = corners(given, {"load.mass": 0.3})
+    plants = expected_plants(given, scenarios=asked, count=10)
+    masses = [v["load.mass"] for v in plants.scenarios.values()]
+    assert masses == [3.5, 6.5] * 5
+    assert all("pid.Kp" in v for v in plants.scenarios.values())
+    assert plants.known == ("load.mass",)
+    assert not any("load.mass" in a.names for a in plants.axes)
+
+
+def test_the_seed_makes_them_repeatable() -> None:
+    given = parameters()
+    assert expected_plants(given, count=3).scenarios == expected_plants(given, count=3).scenarios
+    assert expected_plants(given, count=3, seed=2).scenarios != expected_plants(given, count=3).scenarios
+
+
+def test_nothing_that_varies_gives_no_plants() -> None:
+    assert expected_plants(ParameterSet({"other": Parameter(1.0, "m")})).scenarios == {}
+
+
+def test_every_tolerance_names_a_parameter_of_a_drive() -> None:
+    """A parameter that is renamed takes its tolerance along."""
+    drives = (PneumaticDrive(friction=Stribeck()), RotaryDrive(), FirstOrder(pade_order=2), SecondOrder())
+    known = {n for drive in drives for n in drive.system().parameters}
+    assert {n for names in TOLERANCES for n in names} <= known
