@@ -19,10 +19,10 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.race import Race, may_be_cut
 from pneuopt.tuning.screening import (
     SIMULATION_PEAK_MARGIN,
     BestPoint,
-    MeritFunction,
     first_population,
     screening_result,
 )
@@ -38,6 +38,9 @@ PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 25, 1e-3, 1e-4
 # Share of the population that the phase on fine samples keeps. Fewer lose the optimum where coarse and fine samples
 # rank points differently; each more costs fine simulations.
 FINE_SHARE = 0.5
+# Best settling times, and shares of the horizon, that a race sees of each response, whichever is longer. Less takes for
+# settled what leaves the band later; more simulates what seldom changes a merit. Each new best is proved on the whole.
+CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15
 NEARBY = 0.05  # spread about a start that is close, a share of each range: a wider one leaves it, a narrower one sticks
 
 
@@ -187,26 +190,48 @@ class _RacingSearch:
         rng: np.random.Generator,
         progress: ProgressCallback,
     ) -> None:
-        self._space, self._spec, self._scale, self._rng, self._progress = simulator.space, spec, scale, rng, progress
+        self._simulator, self._space, self._spec, self._scale = simulator, simulator.space, spec, scale
+        self._rng, self._progress = rng, progress
         self.best, self.count = np.clip(start, 0.0, 1.0), 0
 
     def evolve(self, population: Array, phase: _Phase) -> Array:
         """Evolve a population through a phase; the points in which it ends, the best first."""
-        merit = MeritFunction(phase.simulator, self._space, self._spec, self._scale, self.best)
-        merits, worst = merit.race(population, np.full(len(population), np.inf), None)
-        self.best, self.count = merit.best, self.count + len(population)
+        race, before, bests = Race(phase.simulator, self._spec, self._scale), self.count, list[float]()
+        merits, worst = race.merits(self._space.from_unit(population))
         order = np.argsort(merits, kind="stable")[: phase.members]
-        history, worst, bests = SuccessHistory(population[order], merits[order], self._rng), worst[order], list[float]()
+        history, worst = SuccessHistory(population[order], merits[order], self._rng), worst[order]
+        self.best, best = history.population[0].copy(), float(history.merits[0])
+        self._cut(race)
         for number in range(-(-phase.trials // len(order))):
             trials = history.propose()
-            merits, cases = merit.race(trials, history.merits, worst)
+            merits, cases = race.race(self._space.from_unit(trials), history.merits, worst)
+            merits = self._prove(race, trials, merits, best)
             worst = np.where(history.select(trials, merits), cases, worst)
-            self.best, self.count = merit.best, self.count + len(trials)
-            bests.append(float(history.merits.min()))
-            self._progress(f"{phase.name}, generation {number + 1}: best {bests[-1]:.4g}")
+            self.count = before + race.count
+            if history.merits.min() < best:
+                best, self.best = float(history.merits.min()), history.population[np.argmin(history.merits)].copy()
+                self._cut(race)
+            bests.append(best)
+            self._progress(f"{phase.name}, generation {number + 1}: best {best:.4g}")
             if _is_done(bests, history.merits):
                 break
         return history.population[np.argsort(history.merits, kind="stable")]
+
+    def _prove(self, race: Race, trials: Array, merits: Array, best: float) -> Array:
+        """Merits, those that beat the best one on responses cut short replaced by those on whole responses."""
+        better = (merits < best) & race.is_cut
+        if better.any():
+            merits[better] = race.merits(self._space.from_unit(trials[better]))[0]
+        return merits
+
+    def _cut(self, race: Race) -> None:
+        """Cut the responses of a race to a multiple of the best settling time, where that changes no merit."""
+        if not may_be_cut(self._spec):
+            return
+        values = self._simulator.coarse(self._spec).respond(self._space.from_unit(self.best[None]), self._spec.band)
+        settled = float(values.values["SettlingTime"][0])
+        if np.isfinite(settled):
+            race.cut(max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale))
 
 
 def _is_done(bests: Sequence[float], merits: Array) -> bool:

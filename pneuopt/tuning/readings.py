@@ -1,7 +1,7 @@
 """The outputs that a search runs, the grid on which it samples a reference, and the metrics that it reads there."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -51,6 +51,17 @@ class ReferenceGrid:
     def step_index(self) -> int:
         """The index of the first sample at or after the step."""
         return int(np.searchsorted(self.t, self.reference.at - 1e-12))
+
+    def cut(self, duration: float) -> "ReferenceGrid":
+        """The samples up to so long after the step [s]; of a sampled loop up to a sample of its controller."""
+        last = int(np.searchsorted(self.t, self.reference.at + duration - 1e-12))
+        if self.sample_time is not None:
+            readings = round(self.sample_time / self.spacing)
+            last = -(-last // readings) * readings
+        if last >= len(self.t) - 1:
+            return self
+        reference = replace(self.reference, horizon=float(self.t[last]))
+        return replace(self, reference=reference, t=self.t[: last + 1], u=self.u[: last + 1])
 
     def pad(self, n: int) -> tuple[Array, Array, Array]:
         """Inputs, instants and steps, the last sample repeated up to n samples with steps of 0: there a run ends."""

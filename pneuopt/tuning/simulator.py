@@ -61,6 +61,8 @@ class Simulator:
         The metrics read off the responses, and off the loop linearised about their ends.
     meter_channels : tuple of str
         Channels of the plant's meter that are run for them.
+    rollout : Rollout
+        Its outputs are those of `loop_pieces`.
     """
 
     def __init__(
@@ -81,7 +83,7 @@ class Simulator:
         self._rest = _rests(self.cases, loop, space)
         check_channels(loop.plant, self.response_metrics)
         self.meter_channels = needed_channels(self.response_metrics)
-        self._rollout = Rollout(loop_pieces(loop, self.meter_channels))
+        self.rollout = Rollout(loop_pieces(loop, self.meter_channels))
         self.grids = _grids(loop, references, space.parameters)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
@@ -107,6 +109,16 @@ class Simulator:
             self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE_SAMPLES_A_PERIOD
         )
         part.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in part.grids]
+        return part
+
+    def bands(self, band: float) -> tuple[float, ...]:
+        """The settling bands over which SettlingTime is averaged."""
+        return (band, *self._wider)
+
+    def cut(self, duration: float) -> "Simulator":
+        """A copy that runs and reads so much of each response after the step [s], at most."""
+        part = copy.copy(self)
+        part.grids = [grid.cut(duration) for grid in self.grids]
         return part
 
     def select_cases(self, chosen: Sequence[int]) -> "Simulator":
@@ -196,7 +208,7 @@ class Simulator:
         u = np.tile(grid.u[-1], (len(p), n + 1, 1))
         t, steps = (np.tile(a, (len(p), 1)) for a in (grid.t[-1] + h * np.arange(n + 1), [h] * n + [0.0]))
         with np.errstate(all="ignore"):
-            found = self._rollout.run(x_end, u, p, t, steps, substeps=rk4_substeps(self._rate, h), states=True)
+            found = self.rollout.run(x_end, u, p, t, steps, substeps=rk4_substeps(self._rate, h), states=True)
             assert found.x is not None
             plant, control = found.x[:, :, : len(self.loop.plant.states)], found.y[:, :, CONTROL_OUTPUT, None]
             along = np.concatenate([plant, control], axis=2)
@@ -212,7 +224,7 @@ class Simulator:
             Each lane's candidate, a row of `points`, and its case.
         """
         base, order = self.space.vectors(points)[rows], list(self.space.parameters)
-        p, starts = np.empty_like(base), np.empty((len(rows), self._rollout.n_states))
+        p, starts = np.empty_like(base), np.empty((len(rows), self.rollout.n_states))
         for k in np.unique(case).tolist():
             own = case == k
             p[own] = self.cases[k].case_vectors(base[own], order)
@@ -231,6 +243,17 @@ class Simulator:
     def starts_vary(self, case: int) -> bool:
         """Whether the state before the step depends on the gains in a case."""
         return self._rest[case] is None
+
+    def lane_periods(self, p: Array) -> Array:
+        """The time over which each lane is averaged, shape (m,) [s]; 0: it is not."""
+        periods = np.zeros(len(p))
+        for period, rows in self.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
+            periods[rows] = period or 0.0
+        return periods
+
+    def grid_of(self, case: int) -> int:
+        """The number of the grid on which a case runs."""
+        return int(self._grid_of[case])
 
     def lanes_by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Mask]]:
         """Each averaging time [s], None without dither, and a mask of the sound lanes that it is for."""
@@ -265,19 +288,43 @@ class Simulator:
             return
         u, t, h, steps = self.pad(case)
         with np.errstate(all="ignore"):
-            found = self._rollout.run(starts, u, p, t, h, substeps=steps)
-        out.x_end[chunk] = found.x_end
-        planes = np.ascontiguousarray(np.moveaxis(found.y, 2, 0))  # reading is over time, several times faster so
+            found = self.rollout.run(starts, u, p, t, h, substeps=steps)
+        self._read(out, chunk, case, p, (found.y, found.x_end), band)
+
+    def read(self, p: Array, case: Indices, run: tuple[Array, Array], shape: tuple[int, int], band: float) -> Responses:
+        """The responses of candidates on every case, of which the outputs and end states are known.
+
+        Parameters
+        ----------
+        p : ndarray, shape (m n_cases, n_parameters)
+        case : ndarray of int, shape (m n_cases,)
+        run : tuple of ndarray, shapes (m n_cases, n, n_outputs) and (m n_cases, n_states)
+            Outputs and end states.
+        shape : tuple of int
+            m and n_cases.
+        band : float
+        """
+        measured = LaneMetrics.empty(len(p), run[1].shape[1], self.response_metrics)
+        for chunk in self._chunks(case):
+            self._read(measured, chunk, case[chunk], p[chunk], (run[0][chunk], run[1][chunk]), band)
+        return Responses(np.ones(shape, dtype=bool), p, measured, MarginReader(self.margin_metrics, self._read_margins))
+
+    def _read(
+        self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: tuple[Array, Array], band: float
+    ) -> None:
+        """Fill the rows `chunk` of `out` from outputs and end states."""
+        out.x_end[chunk] = run[1]
+        planes = np.ascontiguousarray(np.moveaxis(run[0], 2, 0))  # reading is over time, several times faster so
         for g in np.unique(self._grid_of[case]).tolist():
             own, grid = self._grid_of[case] == g, self.grids[g]
             y = np.moveaxis(planes[:, own, : len(grid.t)], 0, 2)
-            sound = is_sound(y, found.x_end[own])
+            sound = is_sound(y, run[1][own])
             out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
             for period, rows in self.lanes_by_dither_period(p[own], sound):
                 metrics = read_metrics(
                     grid,
                     _select_rows(y, rows),
-                    (band, *self._wider),
+                    self.bands(band),
                     period,
                     self.response_metrics,
                     self._envelope,
@@ -311,7 +358,7 @@ class Simulator:
         grid, given = self.grids[k], self.space.start[None]
         start, p = self.starts(k, given), self.space.vectors(given)
         u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-        found = self._rollout.run(start, u, p, t, h, substeps=MAX_LOOP_SUBSTEPS, states=True).x
+        found = self.rollout.run(start, u, p, t, h, substeps=MAX_LOOP_SUBSTEPS, states=True).x
         assert found is not None
         along = np.vstack([start, found[0][:: max(1, len(grid.t) // 10)]])[:, : len(self.loop.states)]
         return list(along[np.isfinite(along).all(axis=1)])

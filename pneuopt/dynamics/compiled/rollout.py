@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -254,17 +255,30 @@ class Rollout:
         function.restype = None
         arrays = (*given, *others)
         pointers = [a.ctypes.data if a is not None else None for a in arrays]
+        stride = p.shape[1] if p.ndim == 2 else 0
+        self._share_out(function, [(a, b, n, substeps, stride, *pointers) for a, b in self._parts(m)], arrays)
+
+    def race(self, course: ctypes.Structure, m: int, arrays: Sequence[Any]) -> None:
+        """Run the race of m candidates that a struct Race of race.c describes, by pointers to `arrays`."""
+        assert self._library is not None
+        function = self._library.race
+        function.argtypes, function.restype = [ctypes.c_void_p, ctypes.c_longlong, ctypes.c_longlong], None
+        self._share_out(function, [(ctypes.addressof(course), a, b) for a, b in self._parts(m)], (course, *arrays))
+
+    def _parts(self, m: int) -> list[tuple[int, int]]:
+        """Begin and end of each thread's part of m segments."""
         blocks = -(-m // self.lanes)
         parts = max(1, min(self._threads, blocks))
-        edges = [min(m, blocks * i // parts * self.lanes) for i in range(parts + 1)]
-        stride = p.shape[1] if p.ndim == 2 else 0
-        calls = [(a, b, n, substeps, stride, *pointers) for a, b in itertools.pairwise(edges)]
+        return list(itertools.pairwise(min(m, blocks * i // parts * self.lanes) for i in range(parts + 1)))
+
+    def _share_out(self, function: Callable[..., None], calls: list[tuple[object, ...]], kept: tuple[Any, ...]) -> None:
+        """Make the calls, each in a thread of its own."""
         if len(calls) == 1:
             function(*calls[0])
-        else:
-            running = [_pool(self._threads).submit(_call_part, function, call, arrays) for call in calls]
-            for each in running:
-                each.result()
+            return
+        running = [_pool(self._threads).submit(_call_part, function, call, kept) for call in calls]
+        for each in running:
+            each.result()
 
     def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> RolloutResult:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
@@ -293,8 +307,8 @@ class Rollout:
         return RolloutResult(run_y, x_end, run_x, run_dy, _unstack(S, nx, m, ns))
 
 
-def _call_part(function: Callable[..., None], call: tuple[object, ...], arrays: tuple[Array | None, ...]) -> None:  # noqa: ARG001
-    """Run a thread's part; it holds the arrays, so that Ctrl-C in the main thread cannot free them meanwhile."""
+def _call_part(function: Callable[..., None], call: tuple[object, ...], kept: tuple[Any, ...]) -> None:  # noqa: ARG001
+    """Run a thread's part; it holds what they point to, which Ctrl-C in the main thread must not free."""
     function(*call)
 
 

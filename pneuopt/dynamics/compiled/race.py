@@ -1,0 +1,155 @@
+"""`race`: candidates that run on several cases, each pair a SIMD lane, until they are certain to lose to their rivals.
+
+A bound of a candidate's merit is read while its responses run; it can only grow. When it passes the rival's merit, the
+candidate's lanes are dropped and the next pairs take their places. The first two outputs of the system are the measured
+signal and the command; where a period is given, the last one is the signal's integral.
+"""
+
+import ctypes
+from dataclasses import dataclass
+
+import numpy as np
+
+from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.quantities.arrays import Array, Indices
+
+RACE_VALUES = ("SettlingTime", "Overshoot", "PeakControl", "IAE", "ISE", "ITAE")  # as race.c numbers them
+
+
+@dataclass(frozen=True, eq=False)
+class RaceCourse:
+    """The cases of a race and the grids on which they run.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n_grids, n, n_inputs)
+    t, h : ndarray, shape (n_grids, n)
+        Instants and steps [s].
+    grid, length, first : ndarray of int, shape (n_cases,)
+        Each case's grid, the number of its samples, and the first one from the step on.
+    settings : ndarray, shape (n_cases, 6)
+        The reference after the step, the step's size, the signal before it, the spacing of the samples [s], the time of
+        `first` after the step [s], and 1 for a step, 0 for a disturbance.
+    substeps : int
+        RK4 steps a sample.
+    """
+
+    u: Array
+    t: Array
+    h: Array
+    grid: Indices
+    length: Indices
+    first: Indices
+    settings: Array
+    substeps: int
+
+
+@dataclass(frozen=True, eq=False)
+class RaceMerit:
+    """What a bound of the merit is made of.
+
+    Parameters
+    ----------
+    bands : ndarray
+        Half widths of settling bands, fractions of the step, over which the settling time is averaged.
+    weights, limits : ndarray, shape (6,)
+        Of `RACE_VALUES`: weights in the objective, 0 for none, and limits, inf for none.
+    worst, penalty : float
+        A merit beyond any objective, and the weight of a limit's relative excess in multiples of it.
+    runaway : float
+        Size of signal and command from which a candidate has lost.
+    """
+
+    bands: Array
+    weights: Array
+    limits: Array
+    worst: float
+    penalty: float
+    runaway: float
+
+
+@dataclass(frozen=True, eq=False)
+class RaceOutcome:
+    """How a race ended.
+
+    Attributes
+    ----------
+    loser : ndarray of int, shape (m,)
+        The case by which each candidate lost; -1: it came through.
+    y : ndarray, shape (m, n_cases, n, n_outputs)
+        The outputs of those that came through.
+    x_end : ndarray, shape (m, n_cases, n_states)
+    """
+
+    loser: Indices
+    y: Array
+    x_end: Array
+
+
+class _Race(ctypes.Structure):
+    """The struct Race of race.c."""
+
+    _fields_ = (
+        *((n, ctypes.c_longlong) for n in ("cases", "samples", "bands")),
+        ("substeps", ctypes.c_int),
+        *((n, ctypes.c_double) for n in ("worst_merit", "penalty", "runaway")),
+        *((n, ctypes.c_void_p) for n in ("u", "t", "h", "grid", "length", "first", "settings")),
+        *((n, ctypes.c_void_p) for n in ("p", "x0", "period", "order", "rival", "band", "weight", "limit")),
+        *((n, ctypes.c_void_p) for n in ("y", "x_end", "loser", "worst")),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RaceField:
+    """The candidates of a race.
+
+    Parameters
+    ----------
+    p : ndarray, shape (m, n_cases, n_parameters)
+    x0 : ndarray, shape (m, n_cases, n_states)
+    period : ndarray, shape (m, n_cases)
+        The time over which a response is averaged [s]; 0: it is not.
+    order : ndarray of int, shape (m, n_cases)
+        Each candidate's cases in the order in which they run.
+    rivals : ndarray, shape (m,)
+        The merits to beat.
+    """
+
+    p: Array
+    x0: Array
+    period: Array
+    order: Indices
+    rivals: Array
+
+
+def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: RaceField, y: Array) -> RaceOutcome:
+    """Run a race.
+
+    Parameters
+    ----------
+    rollout : Rollout
+        With machine code, and without sensitivities.
+    course : RaceCourse
+    merit : RaceMerit
+    candidates : RaceField
+    y : ndarray, shape (m, n_cases, n, n_outputs)
+        Where the outputs are put.
+
+    Returns
+    -------
+    RaceOutcome
+    """
+    m, cases = candidates.order.shape
+    outcome = RaceOutcome(np.full(m, -1, dtype=np.int64), y, np.empty((m, cases, rollout.n_states)))
+    given = vars(course) | vars(candidates) | {"band": merit.bands, "weight": merit.weights, "limit": merit.limits}
+    given["rival"] = given.pop("rivals")
+    whole = ("grid", "length", "first", "order")
+    kept = {
+        n: np.ascontiguousarray(a, dtype=np.int64 if n in whole else np.float64)
+        for n, a in given.items()
+        if n != "substeps"
+    }
+    kept |= {"y": y, "x_end": outcome.x_end, "loser": outcome.loser, "worst": np.zeros((m, len(RACE_VALUES)))}
+    sizes = (cases, course.t.shape[1], len(merit.bands), course.substeps, merit.worst, merit.penalty, merit.runaway)
+    rollout.race(_Race(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, list(kept.values()))
+    return outcome
