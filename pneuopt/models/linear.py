@@ -22,7 +22,7 @@ from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
-from pneuopt.quantities.units import difference_unit
+from pneuopt.quantities.units import difference_unit, read_si
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
 MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known (see above)
@@ -183,8 +183,7 @@ def _build_plant(structure: Structure) -> Plant:
     options = structure.options("plant")
     signals = [options["input"], options["output"]]
     check_names("channel", signals, CHANNELS, f"{structure.location('plant', '')}: [plant]")
-    known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
-    u, y = (known.get(name, Quantity(name, CHANNELS[name])) for name in signals)
+    u, y = (_signal(structure, key) for key in ("input", "output"))
     order = options["pade_order"]
     if order is None:
         order = USUAL_PADE_ORDER if structure.has("plant", "dead_time") else 0
@@ -194,6 +193,17 @@ def _build_plant(structure: Structure) -> Plant:
     return plant
 
 
+def _signal(structure: Structure, key: str) -> Quantity:
+    """The input or the output, in the channel's unit or in another one: that of a transducer, say."""
+    name, unit = structure.option("plant", key), structure.option("plant", f"{key}_unit")
+    if unit is None:
+        known = {q.name: q for q in (VALVE_VOLTAGE, SPEED, POSITION, FORCE)}
+        return known.get(name, Quantity(name, CHANNELS[name]))
+    where = structure.place("plant", f"{key}_unit")
+    require(read_si(f"1 {unit}", where=where) == 1.0, f'{where}: {unit!r} is no SI unit without a prefix, such as "V"')
+    return Quantity(name, unit)
+
+
 LINEAR_KIND = DriveKind(
     FirstOrder.kind,
     {
@@ -201,6 +211,8 @@ LINEAR_KIND = DriveKind(
             "model": choice({"first_order": FirstOrder, "second_order": SecondOrder, "integrator": Integrator}),
             "input": Key("text", (str,), VALVE_VOLTAGE.name),
             "output": Key("text", (str,), SPEED.name),
+            "input_unit": Key("text", (str,)),
+            "output_unit": Key("text", (str,)),
             "pade_order": Key("a whole number", (int,)),
         },
         "friction": FRICTION_KEYS,

@@ -24,7 +24,7 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -107,6 +107,16 @@ def test_builds_the_drive_that_the_file_says(tmp_path: Path, text: str, drive: o
     built, rig = read_drive(written(tmp_path, text))
     assert built == drive
     assert tuple(rig) == tuple(built.system().parameters)
+
+
+def test_a_linear_plants_signal_in_a_unit_of_its_own(tmp_path: Path) -> None:
+    text = '[drive]\nkind = "linear"\n[plant]\nmodel = "second_order"\noutput_unit = "V"\ngain = 14.7\n'
+    drive, p = read_drive(written(tmp_path, text))
+    assert drive == SecondOrder(output=Quantity("speed", "V"))
+    assert p.value("plant.gain") == 14.7
+    for unit, message in (("mV", "no SI unit without a prefix"), ("bananas", "bananas")):
+        with pytest.raises(InputError, match=message):
+            read_drive(written(tmp_path, text.replace('"V"', f'"{unit}"')))
 
 
 def test_a_linear_plant_between_other_signals(tmp_path: Path) -> None:
