@@ -25,7 +25,8 @@ from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_sti
 from .dynamics.stick_slip import EventKind
 from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
 from .evaluation.certificate import Certificate, Defect, Finding, certificate
-from .evaluation.dither_verdict import DitherVerdict, Usefulness, dither_effect, judge_dither
+from .evaluation.dither_effect import dither_effect
+from .evaluation.dither_verdict import DitherVerdict, Usefulness, judge_dither
 from .evaluation.energy import EnergyUse
 from .evaluation.evaluate import evaluate, respond
 from .evaluation.expected_plants import ExpectedPlants, expected_plants

@@ -9,7 +9,8 @@ from pneuopt.cli.terminal import make_console
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.evaluation.dither_verdict import DitherEffect, DitherVerdict, Usefulness
+from pneuopt.evaluation.dither_effect import DitherEffect
+from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     MaxComplementarySensitivity,

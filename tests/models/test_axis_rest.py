@@ -9,7 +9,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import System, names, parameter_vector
-from pneuopt.evaluation.dither_verdict import dither_effect
+from pneuopt.evaluation.dither_effect import dither_effect
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck, Viscous
 from pneuopt.models.load import Load
