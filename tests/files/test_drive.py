@@ -16,7 +16,7 @@ from pneuopt.files.toml import read_toml
 from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, LuGre, PressureDependent, Stribeck, Viscous
-from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
+from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.models.load import Load
 from pneuopt.models.pneumatic.chamber import Polytropic, Thermal
 from pneuopt.models.pneumatic.cylinder import Cylinder
@@ -24,7 +24,7 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
-from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -107,24 +107,6 @@ def test_builds_the_drive_that_the_file_says(tmp_path: Path, text: str, drive: o
     built, rig = read_drive(written(tmp_path, text))
     assert built == drive
     assert tuple(rig) == tuple(built.system().parameters)
-
-
-def test_a_linear_plants_signal_in_a_unit_of_its_own(tmp_path: Path) -> None:
-    text = '[drive]\nkind = "linear"\n[plant]\nmodel = "second_order"\noutput_unit = "V"\ngain = 14.7\n'
-    drive, p = read_drive(written(tmp_path, text))
-    assert drive == SecondOrder(output=Quantity("speed", "V"))
-    assert p.value("plant.gain") == 14.7
-    for unit, message in (("mV", "no SI unit without a prefix"), ("bananas", "bananas")):
-        with pytest.raises(InputError, match=message):
-            read_drive(written(tmp_path, text.replace('"V"', f'"{unit}"')))
-
-
-def test_a_linear_plant_between_other_signals(tmp_path: Path) -> None:
-    text = '[drive]\nkind = "linear"\n[plant]\nmodel = "integrator"\noutput = "position"\ngain = "50 mm/(V*s)"\n'
-    plant, rig = read_drive(written(tmp_path, text))
-    assert isinstance(plant, Integrator)
-    assert [q.name for q in (*plant.system().inputs, *plant.system().outputs)] == ["valve_voltage", "position"]
-    assert rig.value("plant.gain") == 0.05
 
 
 @pytest.mark.parametrize(
