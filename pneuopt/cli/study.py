@@ -69,7 +69,8 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
         cases = grid(parameters, {axis.name: axis.points for axis in axes})
     except InputError as error:
         raise InputError(f"{file}: [axes] {error}") from None
-    certify = partial(evaluate, task.loop, task.references, band=study.band or task.specification.band)
+    band = study.band or task.specification.band
+    certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
     with progress("certifying", quiet=quiet) as report_progress:
         table = sweep(certify, parameters, cases, progress=report_progress)
     verdict, status = _grid_verdict(table, len(task.references))
@@ -106,6 +107,7 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
             scenarios=task.scenarios(parameters),
             points=front_spec.points,
             until=until,
+            max_steps=task.max_steps,
             progress=report_progress,
         )
     front, known = _convert_to_percent(front, first, second), metric_units(task.loop)

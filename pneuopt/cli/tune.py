@@ -70,6 +70,7 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
             minimise=task.specification,
             scenarios=task.scenarios(parameters),
             plants=plants,
+            max_steps=task.max_steps,
             method=task.method,
             throw=False,
             progress=report_progress,
@@ -108,6 +109,7 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
         scenarios=scenarios,
         band=task.specification.band,
         envelope=task.specification.envelope,
+        max_steps=task.max_steps,
     )
     show_metrics(make_console(), metrics, task.loop, limits=task.specification.limits)
     writers: Writers = {}
@@ -170,6 +172,7 @@ def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | 
             scenarios=task.scenarios(parameters),
             band=task.specification.band,
             envelope=task.specification.envelope,
+            max_steps=task.max_steps,
         )
     except (ConvergenceError, InputError):
         return None

@@ -24,6 +24,9 @@ from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, r
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
+# Steps of a tight simulation, and the time that one takes, a pneumatic drive's with a compiler: 3e6 are five minutes.
+# A smaller budget refuses what users mean; with a larger one a mistyped sample time runs for hours without a word.
+MAX_STEPS, SECONDS_A_STEP = 3e6, 1e-4
 REST_COORDINATE = "position"  # the state that `initial` may give alone: the plant then rests there
 
 
@@ -52,6 +55,7 @@ def simulate(
     t_out: ArrayLike | None = None,
     rtol: float = 1e-10,
     atol: float = 1e-12,
+    max_steps: float = MAX_STEPS,
 ) -> Trajectory:
     """Integrate a model over its inputs.
 
@@ -72,6 +76,8 @@ def simulate(
         Instants to report [s], within the inputs' time; by default those of the inputs.
     rtol, atol : float
         Tolerances of a step; atol is relative to each state's nominal value.
+    max_steps : float
+        Samples of a loop with a sampled PID that are refused as too many.
 
     Returns
     -------
@@ -82,8 +88,8 @@ def simulate(
     Raises
     ------
     InputError
-        If an input is missing or NaN, an instant lies outside, hardware is impossible, or a state starts outside its
-        physical range.
+        If an input is missing or NaN, an instant lies outside, hardware is impossible, a state starts outside its
+        physical range, or a loop would take more samples than `max_steps`.
     ConvergenceError
         If the integration stops; the message gives the time and the state, `solution` is the trajectory so far.
 
@@ -100,6 +106,7 @@ def simulate(
     >>> round(run["speed"][-1].item(), 6)
     0.632121
     """
+    _check_samples(as_runnable(model, "model"), inputs, max_steps)
     run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol))
     warn_contacts(met)
     return run.trajectory()
@@ -181,6 +188,19 @@ def new_integration(system: System, p: Array, grid: Array, rtol: float, atol: fl
     """The integration that a plant needs; it records at the instants of `grid` [s]."""
     return (StickSlipIntegration if FRICTION_DIRECTION in system.parameters else SmoothIntegration)(
         system, p, grid, rtol, atol
+    )
+
+
+def _check_samples(model: Runnable, inputs: Trajectory, max_steps: float) -> None:
+    """Refuse a sampled loop whose samples over the inputs' time are more than a budget."""
+    check_argument("inputs", inputs, Trajectory, "a Trajectory; a log's is its .trajectory")
+    sample_time, duration = model.motion().sample_time, float(inputs.t[-1] - inputs.t[0])
+    count = duration / sample_time if sample_time else 0.0
+    require(
+        count <= max_steps,
+        f"{duration:g} s of samples every {sample_time or 0.0:g} s are {count:.2g} samples, about "
+        f"{count * SECONDS_A_STEP / 60:.2g} minutes, more than {max_steps:.2g}; lengthen the sample time, shorten "
+        "the inputs, or raise max_steps",
     )
 
 

@@ -11,7 +11,8 @@ from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.linear_loop import linear_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, as_steps
-from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.simulate import MAX_STEPS, simulate
+from pneuopt.evaluation.budget import POINTS_PER_READING, check_steps
 from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
-# Points of the simulated record for each reading of a search: with one, the record would miss what happens between the
-# search's readings just as the search does; more cost time in proportion.
-POINTS_PER_READING = 4
 
 
 def evaluate(
@@ -45,6 +43,7 @@ def evaluate(
     scenarios: Scenarios = NO_SCENARIOS,
     band: float = 0.02,
     envelope: Envelope = (),
+    max_steps: float = MAX_STEPS,
 ) -> "pd.DataFrame":
     """Metrics of a loop at the given parameters over the references' horizons, by a tight simulation.
 
@@ -65,6 +64,8 @@ def evaluate(
         Half width of the settling band around the reference, a fraction of the step.
     envelope : sequence of (float, float, float)
         The bounds of a `StepEnvelope`.
+    max_steps : float
+        Steps of the simulations together that are refused as too many.
 
     Returns
     -------
@@ -81,7 +82,8 @@ def evaluate(
     Raises
     ------
     InputError
-        If two references have one label, or a scenario names an unknown parameter.
+        If two references have one label, a scenario names an unknown parameter, or the responses take more
+        steps than `max_steps`.
     ConvergenceError
         If the simulation stops.
 
@@ -105,6 +107,10 @@ def evaluate(
     >>> ["MaxSensitivity" in found.index for found in (smooth, real)]
     [True, False]
     """
+    steps = as_steps(references)
+    check_parameters(parameters)
+    inner, _ = _loop_and_rig(loop, steps)
+    check_steps(inner, steps, inner.complete(parameters), plants=1 + len(scenarios), max_steps=max_steps)
     return tabulate_metrics(
         evaluate_cases(loop, references, parameters, scenarios=scenarios, band=band, envelope=envelope)
     )
@@ -182,7 +188,7 @@ def _respond(loop: ClosedLoop, rig: Rig | None, reference: Step, parameters: Par
     if rig is not None:
         return record(rig, run, parameters, initial=start).truth
     count = POINTS_PER_READING * readings_a_sample(loop, reference) * (len(run) - 1) + 1
-    return simulate(loop, run, parameters, initial=start, t_out=np.linspace(run.t[0], run.t[-1], count))
+    return simulate(loop, run, parameters, initial=start, t_out=np.linspace(run.t[0], run.t[-1], count), max_steps=inf)
 
 
 def _evaluate_case(

@@ -10,6 +10,7 @@ import tomlkit
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
-_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method")
+_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method", "budget")
 SCENARIO_KINDS = ("corners", "samples", "tolerances")
 _SAMPLE_DEFAULTS = (("count", 20), ("seed", 0))
 _EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
@@ -64,6 +65,8 @@ class Tuning:
         It maps them to other plants and tolerances from the same boxes, on which a design is validated.
     method : Method, optional
         None: the first that suits the loop.
+    max_steps : float
+        Steps of the simulations that are refused as too many.
     """
 
     loop: ClosedLoop
@@ -73,6 +76,7 @@ class Tuning:
     scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
     validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
     method: Method | None = None
+    max_steps: float = MAX_STEPS
 
 
 def read_tuning(path: str | Path, plant: System) -> Tuning:
@@ -105,7 +109,8 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     scenarios, validation = (partial(read, *section) for read in (read_scenarios, read_validation_scenarios))
     method = read_method(table.get("method", {}), f"{path}: [method]")
     references = _references(table, loop, path)
-    return Tuning(loop, references, parameters, spec, scenarios, validation, method)
+    max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
+    return Tuning(loop, references, parameters, spec, scenarios, validation, method, max_steps)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") -> None:
@@ -171,6 +176,14 @@ def read_validation_scenarios(table: Mapping[str, Any], where: str, parameters: 
 
 def _merge_scenarios(parts: Sequence[Mapping[str, float | Factor]]) -> dict[str, float | Factor]:
     return {n: value for part in parts for n, value in part.items()}
+
+
+def _read_budget(table: Mapping[str, Any], where: str) -> float:
+    """Read how many steps a simulation may take."""
+    check_names("key", table, ("steps",), where)
+    steps = read_fixed_value(table, "steps", "1", where) if "steps" in table else MAX_STEPS
+    require(steps > 0, f"{where} steps must be positive, got {steps:g}; {MAX_STEPS:g} is usual")
+    return steps
 
 
 def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:

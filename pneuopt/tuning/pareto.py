@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.requirements import (
     Requirement,
     metric_name,
@@ -36,6 +37,7 @@ def pareto_front(
     scenarios: Scenarios = NO_SCENARIOS,
     points: int = 15,
     until: float | None = None,
+    max_steps: float = MAX_STEPS,
     method: Method | None = None,
     progress: ProgressCallback | None = None,
 ) -> "pd.DataFrame":
@@ -43,7 +45,7 @@ def pareto_front(
 
     Parameters
     ----------
-    loop, references, parameters, subject_to, scenarios, method, progress
+    loop, references, parameters, subject_to, scenarios, max_steps, method, progress
         As for `tune`.
     minimise : (Requirement, Requirement)
         Two kinds; a bound of theirs is a limit as well, and with that of the second the front begins.
@@ -91,7 +93,8 @@ def pareto_front(
     message = f"a front from {metric_name(second)} {user_limit(second)} until {until} ends before it begins"
     require(last is None or last < upper_limit(second), message)
     spec = specify({first: 1.0, second: 1.0}, subject_to)
-    both = prepare_search(prepare_task(loop, references, parameters, spec, scenarios), method, progress)
+    task = prepare_task(loop, references, parameters, spec, scenarios, max_steps=max_steps)
+    both = prepare_search(task, method, progress)
     front = Front(both, first, second, last)
     with suppress(KeyboardInterrupt):
         front.find_designs(points)

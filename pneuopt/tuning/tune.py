@@ -12,6 +12,8 @@ from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.runnable import check_smooth
+from pneuopt.dynamics.simulate import MAX_STEPS
+from pneuopt.evaluation.budget import check_steps
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
@@ -45,6 +47,7 @@ def tune(
     scenarios: Scenarios = NO_SCENARIOS,
     accept: Defect | Sequence[Defect] = (),
     plants: ExpectedPlants | Scenarios | None = None,
+    max_steps: float = MAX_STEPS,
     method: Method | None = None,
     throw: bool = True,
     progress: ProgressCallback | None = None,
@@ -73,6 +76,8 @@ def tune(
         Plants that no search sees, on which the certified design is tried: the result's `validation` says on how many
         it holds. By default those of `expected_plants`, with usual tolerances; after a fit give
         ``expected_plants(parameters, fit.covariance)``. ``{}``: none.
+    max_steps : float
+        Steps of one certificate's simulations together that are refused as too many; the search takes about as long.
     method : TwoPhase, Racing or another Method, optional
         By default the first that suits: `TwoPhase` for one linear plant with a continuous controller that no clip can
         hold back, if it has equations for all that is asked for; else, or where `TwoPhase` fails, `Racing`.
@@ -107,7 +112,7 @@ def tune(
     (True, True)
     """
     begun = time.perf_counter()
-    task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios, accept)
+    task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios, accept, max_steps)
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
@@ -158,6 +163,7 @@ def prepare_task(
     spec: Specification,
     scenarios: Scenarios = NO_SCENARIOS,
     accept: Defect | Sequence[Defect] = (),
+    max_steps: float = MAX_STEPS,
 ) -> TuningTask:
     """Check what is to be tuned, and that its limits can be kept at all; parameters and errors as for `tune`."""
     check_closed_loop(loop)
@@ -166,6 +172,7 @@ def prepare_task(
     steps = as_steps(references)
     loop = add_disturbances(loop, steps)
     require(len(steps) > 0, "no reference to tune for; give a Step")
+    check_steps(loop, steps, loop.complete(parameters), plants=1 + len(scenarios), max_steps=max_steps)
     space = search_space(loop, parameters)
     spec = spec.without(PeakControl) if clip_level(loop, space.parameters) <= spec.limit(PeakControl) else spec
     check_feasibility(loop, cases(steps, scenarios, space.parameters, space.names), space, spec)
