@@ -191,12 +191,11 @@ class PID:
         u : casadi.SX
             What the actuator gets [output unit].
         """
-        Kp, Ki, Kd, Tf = parallel_gains(self.form, p)
-        error = p["c"] * r - y
-        v = Kp * (p["b"] * r - y) + x["integral"] + Kd / Tf * (error - x["filter"])
+        _, Ki, _, Tf = parallel_gains(self.form, p)
+        v = self.output(x, r, y, p)
         u = self.clip(v + added, p)
         windup = (u - v - added) / p["Tt"] if self.limits else 0.0
-        return {"integral": Ki * self._integrand(r - y, p) + windup, "filter": (error - x["filter"]) / Tf}, u
+        return {"integral": Ki * self._integrand(r - y, p) + windup, "filter": (p["c"] * r - y - x["filter"]) / Tf}, u
 
     def update(self, x: Symbols, r: ca.SX, y: ca.SX, added: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The sampled law at a sample: the next value of each state, "command" being what is held.
@@ -204,19 +203,33 @@ class PID:
         Parameters as for `rates`; the states are "integral", "derivative", "previous_error", "command", and with a
         delay "pending", the command that the next sample holds.
         """
-        h, (Kp, Ki, Kd, Tf) = self.sample_time or 0.0, parallel_gains(self.form, p)
-        error = p["c"] * r - y
-        derivative = (Tf * x["derivative"] + Kd * (error - x["previous_error"])) / (Tf + h)
-        integral = x["integral"] + Ki * h * self._integrand(r - y, p)
-        w = Kp * (p["b"] * r - y) + integral + derivative + added
+        integral, derivative = self._sampled_terms(x, r, y, p)
+        w = self._proportional_term(r, y, p) + integral + derivative + added
         u = self.clip(w, p)
-        windup = h / p["Tt"] * (u - w) if self.limits else 0.0
+        windup = (self.sample_time or 0.0) / p["Tt"] * (u - w) if self.limits else 0.0
         sent = {"command": x["pending"], "pending": u} if self.delay else {"command": u}
-        return {"integral": integral + windup, "derivative": derivative, "previous_error": error, **sent}
+        return {"integral": integral + windup, "derivative": derivative, "previous_error": p["c"] * r - y, **sent}
+
+    def output(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> ca.SX:
+        """The command v of the law itself, before anything is added to it; at a sample that of a sampled one."""
+        if self.sample_time is not None:
+            integral, derivative = self._sampled_terms(x, r, y, p)
+            return self._proportional_term(r, y, p) + integral + derivative
+        _, _, Kd, Tf = parallel_gains(self.form, p)
+        return self._proportional_term(r, y, p) + x["integral"] + Kd / Tf * (p["c"] * r - y - x["filter"])
 
     def clip(self, w: ca.SX, p: Symbols) -> ca.SX:
         """The saturated command: hard, as in a real controller; exact derivatives on either side of the corner."""
         return ca.fmin(ca.fmax(w, p["lower"]), p["upper"]) if self.limits else w
+
+    def _proportional_term(self, r: ca.SX, y: ca.SX, p: Symbols) -> ca.SX:
+        return parallel_gains(self.form, p)[0] * (p["b"] * r - y)
+
+    def _sampled_terms(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> tuple[ca.SX, ca.SX]:
+        """Integral, before back-calculation, and derivative of a sampled controller at a sample."""
+        h, (_, Ki, Kd, Tf) = self.sample_time or 0.0, parallel_gains(self.form, p)
+        derivative = (Tf * x["derivative"] + Kd * (p["c"] * r - y - x["previous_error"])) / (Tf + h)
+        return x["integral"] + Ki * h * self._integrand(r - y, p), derivative
 
     def _integrand(self, error: ca.SX, p: Symbols) -> ca.SX:
         if not self.dead_band:
