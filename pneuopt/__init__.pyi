@@ -3,6 +3,7 @@
 from . import plotting
 from .control.averaging import average_dither, mean_start, ripple
 from .control.bumpless import bumpless_transfer
+from .control.dead_zone_inverse import DeadZoneInverse
 from .control.dither import Dither, Waveform
 from .control.feedforward import Feedforward
 from .control.forms import (
@@ -16,6 +17,8 @@ from .control.forms import (
     to_series,
     to_standard,
 )
+from .control.friction_feedforward import Direction, FrictionFeedforward
+from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
 from .control.pid import PID
@@ -134,8 +137,10 @@ __all__ = [
     "ConvergenceError",
     "Coulomb",
     "Cylinder",
+    "DeadZoneInverse",
     "Defect",
     "DesignValidation",
+    "Direction",
     "DiscreteSystem",
     "Dither",
     "DitherVerdict",
@@ -150,6 +155,7 @@ __all__ = [
     "FirstOrder",
     "ForceDrive",
     "Form",
+    "FrictionFeedforward",
     "FullSpace",
     "GainMargin",
     "Huber",
@@ -159,6 +165,7 @@ __all__ = [
     "IsentropicNozzle",
     "Iso6358",
     "Karnopp",
+    "Knocker",
     "LeastSquares",
     "LimitCycle",
     "Linearisation",

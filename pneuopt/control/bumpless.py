@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pneuopt.control.compensation import invert_increasing
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
 from pneuopt.quantities.arrays import Array
@@ -20,6 +21,7 @@ def bumpless_transfer(
     The next command that the new gains give, before the clip, is the one that the old gains would have given. What
     differs is taken by the integral, ``I' = I + Kp (b r - y) + D - Kp' (b' r - y) - D'``, each with what it adds by
     itself (feedforward, dither's offset), and where c changes, the error that the derivative remembers moves with it.
+    With compensators, which bend the command, the integral is sought that gives the same sum.
 
     Parameters
     ----------
@@ -61,8 +63,21 @@ def bumpless_transfer(
     c, c_new = (loop.parameter_vector(p)[list(loop.parameters).index("pid.c")] for p in (old, new))
     before = _next_command(loop, state, old, reference)
     state[remembered] += (c_new - c) * reference
-    state[order.index("pid.integral")] += before - _next_command(loop, state, new, reference)
+    integral = order.index("pid.integral")
+    state[integral] += before - _next_command(loop, state, new, reference)
+    if loop.compensators:
+        state[integral] = _integral_for(loop, state, new, reference, before)
     return state
+
+
+def _integral_for(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float, command: float) -> float:
+    """The integral with which the next command is a given one."""
+    own = np.array(names(loop.states)) == "pid.integral"
+
+    def commands(integrals: Array) -> Array:
+        return np.array([_next_command(loop, np.where(own, i, x), parameters, reference) for i in integrals])
+
+    return float(invert_increasing(commands, np.array([command]))[0])
 
 
 def _next_command(loop: ClosedLoop, x: Array, parameters: ParameterSet, reference: float) -> float:

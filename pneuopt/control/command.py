@@ -1,9 +1,10 @@
-"""`added_command`: what is added to the PID's command before the clip: feedforward and dither."""
+"""`added_command`: what is added to the PID's command before the clip: feedforward, compensators and dither."""
 
 from typing import Protocol
 
 import casadi as ca
 
+from pneuopt.control.compensation import Compensator, Instant, compensate
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.pid import PID
@@ -30,9 +31,16 @@ class CommandParts(Protocol):
         """The first to add."""
         ...
 
+    @property
+    def compensators(self) -> tuple[Compensator, ...]:
+        """They add between the two."""
+        ...
 
-def added_command(parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
-    """What feedforward and dither add to the PID's command.
+
+def added_command(
+    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, p: Symbols
+) -> tuple[Signals, ca.SX]:
+    """What feedforward, compensators and dither, in this order, add to the PID's command.
 
     Parameters
     ----------
@@ -40,6 +48,8 @@ def added_command(parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, p: Symb
     t : casadi.SX
     x, u, p : mapping of str to casadi.SX
         The loop's states, inputs and parameters.
+    measured : casadi.SX
+        The measured signal, as the controller sees it.
 
     Returns
     -------
@@ -48,8 +58,13 @@ def added_command(parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, p: Symb
     added : casadi.SX
         [the command's unit]
     """
-    lead, added = _feedforward_terms(parts, x, u, p)
-    return lead, _dither_command(parts, t, p) + added
+    moved, added = _feedforward_terms(parts, x, u, p)
+    if parts.compensators:
+        v = parts.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
+        seen = Instant(t, u["reference"], measured, v + added, parts.pid.sample_time)
+        own, more = compensate(parts.compensators, seen, x, p)
+        moved, added = moved | own, added + more
+    return moved, _dither_command(parts, t, p) + added
 
 
 def _dither_command(parts: CommandParts, t: ca.SX, p: Symbols) -> ca.SX:

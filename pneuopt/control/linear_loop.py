@@ -7,9 +7,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.control.compensation import acting_always, compensation_slopes
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.rest import find_rest
-from pneuopt.dynamics.system import Linearisation
+from pneuopt.dynamics.system import Linearisation, names, parameter_vector
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -35,10 +36,8 @@ def linear_plant(
     Linearisation
     """
     loop.check(parameters)
-    if x is None:
-        x, command = find_rest(loop, parameters, 0.0, {})
-        u = {loop.command.name: command, **(u or {})}
-    plant = loop.plant.linearise(x, u or {}, parameters)
+    x, u = _operating_point(loop, parameters, x, u)
+    plant = loop.plant.linearise(x, u, parameters)
     j, i = plant.inputs.index(loop.command.name), plant.outputs.index(loop.feedback.name)
     A, B, C, D = plant.A, plant.B[:, j : j + 1], plant.C[i : i + 1], plant.D[i : i + 1, j : j + 1]
     states, lag = plant.states, loop.sensor_lag(loop.parameter_vector(parameters))
@@ -56,14 +55,16 @@ def open_loop(
     """``L(s) = C(s) P(s)`` under negative feedback, cut at the measured output, without saturation and dither.
 
     A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé form,
-    its integral as one without a dead band. Parameters as for `linear_plant`.
+    its integral as one without a dead band. Compensators that act always count by their slopes at the operating point;
+    a knocker's pulses do not. Parameters as for `linear_plant`.
 
     Returns
     -------
     Linearisation
         From the control error, input "error", to the measured output; the plant's states come first.
     """
-    plant, controller = linear_plant(loop, parameters, x, u), _linear_controller(loop, parameters)
+    x, u = _operating_point(loop, parameters, x, u)
+    plant, controller = linear_plant(loop, parameters, x, u), _linear_controller(loop, parameters, x, u)
     m, n = len(controller.A), len(plant.A)
     return Linearisation(
         np.block([[plant.A, plant.B @ controller.C], [np.zeros((m, n)), controller.A]]),
@@ -76,24 +77,46 @@ def open_loop(
     )
 
 
-def linear_gains(loop: ClosedLoop, p: Any) -> Any:
+def linear_gains(loop: ClosedLoop, p: Any, measured: ArrayLike = 0.0, command: ArrayLike = 0.0) -> Any:
     """Kp, Ki, Kd, Tf of the controller's continuous equivalent, shape (4, m).
 
     Backward Euler puts ``(1 - e^(-s h))/h``, nearly ``s/(1 + s h/2)``, for s: a sampled controller is the continuous
-    one with ``Kp + Ki h/2`` and ``Tf + h/2``.
+    one with ``Kp + Ki h/2`` and ``Tf + h/2``. Compensators that act always multiply the gains by their slope, and what
+    they feed back of the measured signal is taken from Kp.
 
     Parameters
     ----------
     loop : ClosedLoop
     p : array or casadi.SX, shape (n_parameters, m)
-        In the order of ``loop.parameters``.
+        In the order of ``loop.parameters``; numbers where compensators act always.
+    measured, command : float or array_like, shape (m,)
+        The measured signal and the command at the operating point, which only such compensators feel.
 
     Returns
     -------
     casadi.DM or casadi.SX, shape (4, m)
     """
     gains, half = loop.gains(p), 0.5 * (loop.pid.sample_time or 0.0)
-    return ca.vertcat(gains[0, :] + half * gains[1, :], gains[1:3, :], gains[3, :] + half)
+    found = ca.vertcat(gains[0, :] + half * gains[1, :], gains[1:3, :], gains[3, :] + half)
+    if not acting_always(loop):
+        return found
+    slope, feedback = compensation_slopes(loop, np.asarray(p, dtype=float), measured, command)
+    scaled = [ca.DM(slope).T * found[k, :] for k in range(3)]
+    return ca.vertcat(scaled[0] - ca.DM(feedback).T, *scaled[1:], found[3, :])
+
+
+def operating_gains(
+    loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
+) -> tuple[float, float, float, float]:
+    """Kp, Ki, Kd, Tf of `linear_gains` at an operating point of the plant. Parameters as for `linear_plant`."""
+    x, u = _operating_point(loop, parameters, x, u)
+    p, command = loop.parameter_vector(parameters), u.get(loop.command.name, 0.0)
+    y = loop.plant.ode(
+        0, x, [u.get(n, 0.0) for n in names(loop.plant.inputs)], parameter_vector(loop.plant.parameters, parameters)
+    )[1]
+    measured = float(y[names(loop.plant.outputs).index(loop.feedback.name)])
+    Kp, Ki, Kd, Tf = linear_gains(loop, p, measured, command).full().ravel().tolist()
+    return Kp, Ki, Kd, Tf
 
 
 def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.complex128]:
@@ -137,8 +160,18 @@ def controller_matrices(gains: Any, dead_time: float) -> tuple[Array, Array, Arr
     return A, B, C, D
 
 
-def _linear_controller(loop: ClosedLoop, parameters: ParameterSet) -> Linearisation:
-    gains = linear_gains(loop, loop.parameter_vector(parameters)).full()
+def _operating_point(
+    loop: ClosedLoop, parameters: ParameterSet, x: Array | None, u: Mapping[str, float] | None
+) -> tuple[Array, Mapping[str, float]]:
+    """The plant's state and inputs; without a state those of the closed loop's rest."""
+    if x is not None:
+        return x, u or {}
+    found, command = find_rest(loop, parameters, 0.0, {})
+    return found, {loop.command.name: command, **(u or {})}
+
+
+def _linear_controller(loop: ClosedLoop, parameters: ParameterSet, x: Array, u: Mapping[str, float]) -> Linearisation:
+    gains = np.reshape(operating_gains(loop, parameters, x, u), (4, 1))
     require(gains[3, 0] > 0, "a continuous derivative needs a filter, Tf > 0")
     A, B, C, D = (matrix[0] for matrix in controller_matrices(gains, loop.dead_time))
     own = ("pid.integral", "pid.filter", "pid.held", "pid.held_before")[: len(A)]

@@ -1,8 +1,8 @@
 """`ClosedLoop`: a plant, a PID and a dither, as a `System` or a `DiscreteSystem` for the solvers.
 
 Where the parts meet: the reference r and the measured output y, or what a sensor shows of it, enter the PID,
-feedforward and dither are added to its command, the sum is clipped, and the result, the output "control", drives the
-actuated input.
+feedforward, compensators and dither are added to its command, the sum is clipped, and the result, the output "control",
+drives the actuated input.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +15,13 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.command import added_command
+from pneuopt.control.compensation import (
+    Compensator,
+    check_compensators,
+    check_values,
+    compensation_function,
+    uncompensated_command,
+)
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
@@ -58,12 +65,15 @@ class ClosedLoop:
         Through which the controller sees it. What the loop is judged by is the output itself.
     feedforward : Feedforward, optional
         What a change of the reference adds to the PID's command.
+    compensators : tuple of Compensator
+        What is added to the command against friction and dead zone, in the order in which they act: `Knocker`,
+        `FrictionFeedforward`, `DeadZoneInverse`.
 
     Raises
     ------
     ModelError
         If the input or output is ambiguous or unknown, if the measured output depends on the command without any lag
-        (an algebraic loop), if the sensor does not fit, or if names collide.
+        (an algebraic loop), if the sensor or a compensator does not fit, or if names collide.
     InputError
         If the dither cannot be sampled.
     """
@@ -75,6 +85,7 @@ class ClosedLoop:
     measured: str | None = None
     sensor: SensorLag | Encoder | None = None
     feedforward: Feedforward | None = None
+    compensators: tuple[Compensator, ...] = ()
 
     def __post_init__(self) -> None:
         if self.sensor is not None:
@@ -88,6 +99,7 @@ class ClosedLoop:
             require(name not in taken, f"the plant has a signal {name!r} of its own; rename it", ModelError)
         doubled = isinstance(self.sensor, SensorLag) and "sensor.lag" in self.plant.parameters
         require(not doubled, "the plant has a sensor.lag of its own; leave sensor= out", ModelError)
+        check_compensators(self.compensators, self._sensor_feedback, self.plant.axis)
         _ = self.parameters
 
     def __repr__(self) -> str:
@@ -111,26 +123,33 @@ class ClosedLoop:
 
     @cached_property
     def parameters(self) -> ParameterSet:
-        """Those of the plant, "pid.*", "dither.*", "sensor.*" and "feedforward.*", with their defaults."""
+        """Those of the plant, "pid.*", "dither.*", "sensor.*", "feedforward.*" and the compensators', all defaults."""
         h, measured, unit = self.pid.sample_time, self.feedback.unit, self.command.unit
         parts = {
             "pid": self.pid.parameters(measured, unit),
             "dither": self.dither.parameters(unit, h) if self.dither else ParameterSet(),
             "sensor": self.sensor.parameters(self._sensor_feedback) if self.sensor else ParameterSet(),
             "feedforward": self.feedforward.parameters(measured, unit) if self.feedforward else ParameterSet(),
+            **{c.section: c.parameters(self._sensor_feedback, unit) for c in self.compensators},
         }
         return reduce(or_, (own.with_prefix(name) for name, own in parts.items()), self.plant.parameters)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
-        """The plant's, the sensor's ("sensor.reading"), then the controller's ("pid.*", "feedforward.filter")."""
+        """The plant's, the sensor's ("sensor.reading"), the controller's ("pid.*", "feedforward.filter") and so on."""
         parts = {
             "sensor": self.sensor.states(self._sensor_feedback) if self.sensor else (),
             "pid": self.pid.states(self.feedback, self.command),
             "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
+            **{c.section: c.states(self.command) for c in self.compensators},
         }
         own = (replace(q, name=f"{name}.{q.name}") for name, quantities in parts.items() for q in quantities)
         return (*self.plant.states, *own)
+
+    @property
+    def tunable_sections(self) -> tuple[str, ...]:
+        """Prefixes of the parameters that a tuning may change: the controller's, not the sensor's or the plant's."""
+        return ("pid", "dither", "feedforward", *(c.section for c in self.compensators))
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
@@ -173,12 +192,13 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        (moved, added), seen, y = added_command(self, t, x, u, p), Signals(), self._plant_rates(t, x, u, p, ca.SX(0))[1]
+        seen, y = Signals(), self._plant_rates(t, x, u, p, ca.SX(0))[1]
         if self.sensor:
             seen = self.sensor.update(
                 without_prefix(x, "sensor"), y, self._sensor_feedback, without_prefix(p, "sensor")
             )
         measured = seen.get("reading", y[self.feedback.name])
+        moved, added = added_command(self, t, x, u, measured, p)
         own = self.pid.update(
             without_prefix(x, "pid"),
             u["reference"],
@@ -226,6 +246,7 @@ class ClosedLoop:
         if self.feedforward:
             time = value["feedforward.time"]
             require(time > 0, f"feedforward.time must be positive, got {time:g} s; without it set its gain to zero")
+        check_values(self.compensators, self.parameters, value)
         Tf = float(self.gains(list(value.values()))[3])
         self.pid.check({**without_prefix(value, "pid"), "Tf": Tf}, self.command.unit)
 
@@ -245,6 +266,11 @@ class ClosedLoop:
         """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form, which is what runs, from the parameters of any `Form`."""
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
         return ca.Function("gains", [stack(p)], [ca.vertcat(*parallel_gains(self.pid.form, without_prefix(p, "pid")))])
+
+    @cached_property
+    def compensation(self) -> ca.Function:
+        """The compensators that act always, and their slopes: see `compensation_function`."""
+        return compensation_function(self.compensators, self.parameters)
 
     def parallel_form(self, parameters: ParameterSet) -> ParallelForm:
         """The gains in the parallel form, from the parameters of any `Form`."""
@@ -314,15 +340,18 @@ class ClosedLoop:
             x, shape = np.asarray(x_plant, dtype=float), (len(self.plant.states),)
             require(x.shape == shape, f"x_plant has shape {x.shape}, the plant's state has {shape}")
         check_initial_command(command, value, self.command.unit)
-        y = dict(zip(names(self.plant.outputs), self._plant_outputs(0, x, p).full().ravel().tolist(), strict=True))
+        shown = self.plant.ode(0, x, np.zeros(len(self.plant.inputs)), [value[n] for n in self.plant.parameters])[1]
+        y = dict(zip(names(self.plant.outputs), shown.full().ravel().tolist(), strict=True))
         sensor = self.sensor.start(y, self._sensor_feedback, without_prefix(value, "sensor")) if self.sensor else []
         seen = sensor[0] if sensor else y[self.feedback.name]
-        own = self.pid.start(reference, seen, command, {**without_prefix(value, "pid"), "Kp": float(self.gains(p)[0])})
-        return np.concatenate([x, sensor, own, [reference] if self.feedforward else []])
+        v = float(uncompensated_command(self, p, reference, seen, command)[0])
+        own = self.pid.start(reference, seen, v, {**without_prefix(value, "pid"), "Kp": float(self.gains(p)[0])})
+        others = [remembered for part in self.compensators for remembered in part.start(v)]
+        return np.concatenate([x, sensor, own, [reference] if self.feedforward else [], others])
 
     def _continuous_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        moved, added = added_command(self, t, x, u, p)
         seen = x["sensor.reading"] if self.sensor else self._plant_rates(t, x, u, p, ca.SX(0))[1][self.feedback.name]
+        moved, added = added_command(self, t, x, u, seen, p)
         rates, command = self.pid.rates(
             without_prefix(x, "pid"),
             u["reference"],
@@ -341,7 +370,8 @@ class ClosedLoop:
                 command + self.dither.wave(t, without_prefix(p, "dither")), without_prefix(p, "pid")
             )
         xdot, y = self._plant_rates(t, x, u, p, command)
-        own = {n: ca.SX(0) for n in x if n.startswith(("pid.", "feedforward."))} | self._sensor_rates(x, y, p)
+        held = tuple(f"{n}." for n in self.tunable_sections)
+        own = {n: ca.SX(0) for n in x if n.startswith(held)} | self._sensor_rates(x, y, p)
         return xdot | own, y | {"control": command}
 
     def _sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
@@ -356,13 +386,6 @@ class ClosedLoop:
     @cached_property
     def _sensor_feedback(self) -> SensedSignal:
         return SensedSignal(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time)
-
-    @cached_property
-    def _plant_outputs(self) -> ca.Function:
-        """The plant's outputs without a command."""
-        t, x, u = ca.SX.sym("t"), symbols(self.plant.states), {q.name: ca.SX(0) for q in self.plant.inputs}
-        p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        return ca.Function("shown", [t, stack(x), stack(p)], [stack(self._plant_rates(t, x, u, p, ca.SX(0))[1])])
 
 
 def check_closed_loop(loop: object) -> None:

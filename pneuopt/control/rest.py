@@ -53,6 +53,11 @@ class WiredLoop(Protocol):
         """``p -> [Kp, Ki, Kd, Tf]`` of the parallel form."""
         ...
 
+    @property
+    def compensation(self) -> ca.Function:
+        """``(command, reference, measured, p) -> compensated`` command, and its slopes."""
+        ...
+
 
 def find_rest(
     loop: WiredLoop, parameters: ParameterSet, reference: float, start: Mapping[str, float]
@@ -142,8 +147,10 @@ def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSe
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
         y = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1][loop.feedback.name]
-        gains = loop.gains(ca.vertcat(*p.values()))
+        every = ca.vertcat(*p.values())
+        gains = loop.gains(every)
         command = gains[0] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL_STATE, 0.0)
+        command = loop.compensation(command, u["reference"], y, every)[0]
         rates, outputs = evaluate_plant(plant, loop.command.name, t, moving, u, p, command)
         rates |= {INTEGRAL_STATE: gains[1] * (u["reference"] - y)}
         return {n: rates[n] for n in x}, outputs | {"control": command}

@@ -47,9 +47,9 @@ def batch_margin_function(
     plants = _plant_responses(loop, w)
 
     def read_margins(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
-        gains = linear_gains(loop, p.T).full()
+        response, matrices, measured = plants(p, x, commands)
+        gains = linear_gains(loop, p.T, measured, commands).full()
         Kp, Ki, Kd, Tf = gains[..., None]
-        response, matrices = plants(p, x, commands)
 
         def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
             a, b = controller_parts((Kp, Ki, Kd, Tf), w)
@@ -99,8 +99,8 @@ def _refine_peaks(
 
 def _plant_responses(
     loop: ClosedLoop, w: Array
-) -> Callable[[Array, Array, Array], tuple[Callable[[Array], ComplexArray], Matrices]]:
-    """Function that gives responses of plants with sensor and hold, and A, B, C of plants with sensor.
+) -> Callable[[Array, Array, Array], tuple[Callable[[Array], ComplexArray], Matrices, Array]]:
+    """Function that gives responses of plants with sensor and hold, A, B, C of plants with sensor, measured signals.
 
     The responses are functions of frequencies of shape (n,) or (m, n); on the frequencies `w` it is checked that
     partial fractions are exact enough.
@@ -113,21 +113,23 @@ def _plant_responses(
     inward, outward = ca.diag(1 / scale), ca.diag(scale)
     A, B = (inward @ ca.jacobian(xdot, v) for v in (x, u[command]))
     C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
-    matrices = compile_function(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D]))
+    matrices = compile_function(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D, y[output]]))
     n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
-    shapes, columns = ((n, n), (n,), (n,), (1,)), [position[name] for name in plant.parameters]
+    shapes, columns = ((n, n), (n,), (n,), (1,), ()), [position[name] for name in plant.parameters]
 
-    def linearise(p: Array, x: Array, commands: Array) -> tuple[Callable[[Array], ComplexArray], Matrices]:
+    def linearise(p: Array, x: Array, commands: Array) -> tuple[Callable[[Array], ComplexArray], Matrices, Array]:
         us = np.zeros((len(p), u.numel()))
         us[:, command] = commands
         found = [matrices(*row) for row in zip(x, us, p[:, columns], strict=True)]
-        A, B, C, D = (np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes))
+        A, B, C, D, measured = (
+            np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes)
+        )
         plant, lag = _partial_fraction_response(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
 
         def response(w: Array) -> ComplexArray:
             return np.asarray((plant(w) + D) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
 
-        return response, _add_sensor((A, B[..., None], C[:, None]), lag)
+        return response, _add_sensor((A, B[..., None], C[:, None]), lag), measured
 
     return linearise
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.linear_loop import linear_gains
+from pneuopt.control.linear_loop import operating_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.simulate import MAX_STEPS, simulate
@@ -258,13 +258,12 @@ def _margin_metrics(
 ) -> dict[str, float]:
     open_loop = linearise_open_loop(loop, parameters, x, command, reference)
     robust = margins(open_loop)
-    Kp, Ki, Kd, Tf = linear_gains(loop, loop.parameter_vector(parameters)).full().ravel().tolist()
     found = {
         "MaxSensitivity": robust.max_sensitivity,
         "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
         "GainMargin": robust.gain_margin,
         "PhaseMargin": robust.phase_margin,
-        "NoiseGain": noise_gain(open_loop, (Kp, Ki, Kd, Tf)),
+        "NoiseGain": noise_gain(open_loop, operating_gains(loop, parameters, x, {loop.command.name: command})),
     }
     return found if robust.stable else {n: nan if n.endswith("Margin") else inf for n in found}
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
+from pneuopt.control.compensation import acting_always
 from pneuopt.control.linear_loop import linear_gains, linear_plant, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import Linearisation
@@ -207,8 +208,12 @@ def sensitivity_terms(
     Raises
     ------
     ModelError
-        If a parameter of the plant is free: the terms do not depend on it.
+        If a parameter of the plant is free: the terms do not depend on it; or a compensator's slope, which is no
+        smooth function of the gains, counts.
     """
+    shaping = ", ".join(type(c).__name__ for c in acting_always(loop))
+    message = f"{shaping}: its slope at the operating point counts in the sensitivity; use margins(open_loop(...))"
+    require(not shaping, message, ModelError)
     free = [n for n in parameters.free_names if n in loop.plant.parameters]
     require(
         not free,

@@ -1,11 +1,13 @@
-"""The loop in a tuning.toml: [loop], [pid], [sensor], [dither] and [feedforward]."""
+"""The loop in a tuning.toml: [loop], [pid], [sensor], [dither], [feedforward] and the sections of `COMPENSATORS`."""
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pneuopt.control.compensation import Compensator
+from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
@@ -21,15 +23,16 @@ from pneuopt.quantities.units import read_value, write_value
 TuningSections = Mapping[str, Any]
 Made = TypeVar("Made")
 
-LOOP_SECTIONS = ("loop", "sensor", "pid", "dither", "feedforward")
-TUNABLE_SECTIONS = ("pid", "dither", "feedforward")
+TUNABLE_SECTIONS = ("pid", "dither", "feedforward", *COMPENSATORS)
 """Sections whose values may be free."""
+LOOP_SECTIONS = ("loop", "sensor", *TUNABLE_SECTIONS)
 
 _LOOP_STRUCTURE: Mapping[str, tuple[str, ...]] = {
     "loop": ("measured", "actuated"),
     "pid": ("form", "sample_time", "delay", "limits"),
     "dither": ("waveform", "analogue"),
     "feedforward": (),
+    **{section: tuple(f.name for f in fields(part)) for section, part in COMPENSATORS.items()},
 }
 _SHARED_PID_KEYS = ("b", "c", "Tt")
 _GAIN_CORRECTIONS: Mapping[Form, Mapping[str, str]] = {
@@ -87,7 +90,10 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
     dither = _dither(table["dither"], f"{path}: [dither]") if "dither" in table else None
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
-    return construct_at(lambda: ClosedLoop(plant, pid, dither, **wiring, sensor=sensor, feedforward=lead), str(path))
+    parts = tuple(_compensator(n, table[n], f"{path}: [{n}]") for n in COMPENSATORS if n in table)
+    return construct_at(
+        lambda: ClosedLoop(plant, pid, dither, **wiring, sensor=sensor, feedforward=lead, compensators=parts), str(path)
+    )
 
 
 def _pid(table: Mapping[str, Any], where: str) -> PID:
@@ -147,6 +153,17 @@ def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
         return Feedforward()
     time = read_parameter(table["time"], Parameter(1.0, "s"), f"{where} time").value
     return construct_at(lambda: Feedforward(time), where)
+
+
+def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:
+    """A compensator, whose fields are choices of an enum."""
+    kind, chosen = COMPENSATORS[section], dict[str, Any]()
+    require(kind.size in table, f"{where} has no {kind.size}, without which it adds nothing; write {kind.size}")
+    for key in (f.name for f in fields(kind) if f.name in table):
+        choices = type(getattr(kind, key))
+        check_names(key, [str(table[key])], [c.value for c in choices], where)
+        chosen[key] = choices(table[key])
+    return construct_at(lambda: kind(**chosen), where)
 
 
 def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path) -> ParameterSet:

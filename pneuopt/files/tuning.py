@@ -56,7 +56,7 @@ class Tuning:
     loop : ClosedLoop
     references : tuple of Step
     parameters : ParameterSet
-        "pid.*", "dither.*", "sensor.*" and "feedforward.*", the free ones within finite bounds.
+        "pid.*", "dither.*", "sensor.*", "feedforward.*", the compensators'; the free ones within finite bounds.
     specification : Specification
         Objective and limits, checked; without terms of an objective where the file only describes a loop.
     scenarios : callable

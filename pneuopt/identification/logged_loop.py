@@ -119,9 +119,11 @@ class LoggedLoop:
     def unobservable_start(self, measured: Trajectory, states: Trajectory, parameters: ParameterSet) -> Array:
         """The start states on which no measured output depends, from a candidate; NaN for those that are estimated.
 
-        The command is computed anew at the first sample; of previous error and derivative only a sum counts.
+        The command is computed anew at the first sample; of previous error and derivative only a sum counts, and what
+        a compensator remembers soon passes.
         """
         held = {"pid.command", "pid.previous_error"}
+        held |= {f"{c.section}.{q.name}" for c in self.loop.compensators for q in c.states(self.loop.command)}
         acting = {"pid.Kd": "pid.derivative", "pid.Td": "pid.derivative", "feedforward.gain": "feedforward.filter"}
         for gain, state in acting.items():
             idle = gain in parameters and not (parameters[gain].free or parameters[gain].value)
@@ -178,6 +180,9 @@ class LoggedLoop:
         own = pid.start(reference[0], seen[0], 0.0, {n: known[f"pid.{n}"] for n in ("Kp", "b", "c")})
         x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.feedback, alone.command), own, strict=True)}
         x0 |= {"sensor.reading": seen[0], "feedforward.filter": reference[0]}
+        for part in alone.compensators:
+            remembered = zip(part.states(alone.command), part.start(0.0), strict=True)
+            x0 |= {f"{part.section}.{q.name}": v for q, v in remembered}
         x0 |= {} if was_at_rest else {"pid.integral": 0.0}
         start = np.array([[x0[n] for n in names(discrete.states)]])
         u, h = np.column_stack([reference, seen, acts]), np.append(np.diff(t), 0.0)

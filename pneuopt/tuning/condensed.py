@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import ROBUSTNESS_REQUIREMENTS, metric_name
 from pneuopt.evaluation.specification import Specification
@@ -165,16 +166,17 @@ class Condensed:
 
 def _nonsmooth_terms(task: TuningTask) -> list[str]:
     """The names of requirements without a gradient, and of free parameters to which there is none."""
-    return [*_nonsmooth_requirements(task.spec), *_nonsmooth_parameters(task.space)]
+    return [*_nonsmooth_requirements(task.spec), *_nonsmooth_parameters(task.space, task.loop)]
 
 
 def _nonsmooth_requirements(spec: Specification) -> list[str]:
     return [metric_name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH_REQUIREMENTS)]
 
 
-def _nonsmooth_parameters(space: Space) -> list[str]:
+def _nonsmooth_parameters(space: Space, loop: ClosedLoop) -> list[str]:
+    jumping = {f"{c.section}.{n}" for c in loop.compensators for n in c.without_gradient}
     counted = [f"{n} (an encoder's counts)" for n in QUANTISER_PARAMETERS if n in space.parameters]
-    return [n for n in space.names if n in NONSMOOTH_PARAMETERS] + counted
+    return [n for n in space.names if n in NONSMOOTH_PARAMETERS or n in jumping] + counted
 
 
 def run_gradient_search(

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from pneuopt.control.compensation import acting_always
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
@@ -286,8 +287,10 @@ class LinearisedProblem:
             len(self._wrt),
             [k for k in ROBUSTNESS_REQUIREMENTS if self._spec.concerns(k)],
         )
-        felt = {f"pid.{gain}" for gain in self._simulator.loop.pid.form.gains}
-        shaping = [k for k, name in enumerate(names) if name in felt]
+        loop = self._simulator.loop
+        sections = tuple(f"{c.section}." for c in acting_always(loop))
+        felt = {f"pid.{gain}" for gain in loop.pid.form.gains}
+        shaping = [k for k, name in enumerate(names) if name in felt or name.startswith(sections)]
         found: dict[type, tuple[Array, Array]] = {
             kind: (np.full((len(p), 1), np.inf), np.zeros((len(p), 1, n))) for kind in kinds
         }

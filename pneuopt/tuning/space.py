@@ -149,8 +149,8 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     Raises
     ------
     InputError
-        If nothing is free, something is free that is not the controller's (dither and feedforward included), or a bound
-        is missing.
+        If nothing is free, something is free that is not the controller's (dither, feedforward and compensators
+        included), or a bound is missing.
     """
     full = loop.complete(parameters).select(loop.parameters)
     free = tuple(n for n in parameters.free_names if n in loop.parameters)
@@ -158,7 +158,7 @@ def search_space(loop: ClosedLoop, parameters: ParameterSet) -> Space:
     divisors = {"dither.frequency", *(f"pid.{n}" for n in loop.pid.positive_parameters)}
     for n in free:
         require(
-            n.startswith(("pid.", "dither.", "feedforward.")),
+            n.partition(".")[0] in loop.tunable_sections,
             f"{n} is free, but tune changes the controller and the dither only; use parameters.fixed({n!r})",
         )
         p = full[n]

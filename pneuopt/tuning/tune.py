@@ -61,8 +61,8 @@ def tune(
     references : Step or sequence of Step
         Each from rest, or from steady motion, and with a label of its own; the worst counts.
     parameters : ParameterSet
-        Of plant, controller and dither. The free ones ("pid.*", "dither.*", "feedforward.*") are tuned and need two
-        finite bounds each.
+        Of plant, controller and dither. The free ones ("pid.*", "dither.*", "feedforward.*", a compensator's) are tuned
+        and need two finite bounds each.
     minimise : Requirement, mapping of Requirement to weight, or Specification
         A Specification, such as a tuning's file holds, brings its limits along: `subject_to` is then left out.
     subject_to : sequence of Requirement

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pneuopt.control.dead_zone_inverse import DeadZoneInverse
 from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.knocker import Knocker
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import SensorLag
@@ -84,6 +86,21 @@ def test_a_delay_and_a_feedforward_are_part_of_the_loop() -> None:
     drive = ForceDrive(Coulomb()).system()
     loop = ClosedLoop(drive, PID(2e-3, delay=1), feedforward=Feedforward(0.05))
     known = given(loop).with_values({"feedforward.gain": 100.0})
+    t = np.arange(600) * 1e-3
+    wanted = np.where(t < 0.1, 0.0, np.where(t < 0.35, 0.3, -0.2))
+    run = simulate(loop, Trajectory(t, {"reference": wanted}), known, initial=[0.0] * len(loop.states))
+    noisy = run["position"] + NOISE["position"] * np.random.default_rng(1).standard_normal(t.size)
+    log = Experiment(Trajectory(t, {"speed_reference": wanted, "position": noisy}), {"position": NOISE["position"]})
+    fit = identify(loop, [log], known.freed("friction.coulomb", "load.mass"))
+    assert fit.estimates["value"]["load.mass"] == pytest.approx(3.0, rel=0.01)
+
+
+def test_what_compensators_add_is_part_of_the_loop() -> None:
+    """Their pulses and their inverse are replayed from the log's first sample on."""
+    drive = ForceDrive(Coulomb()).system()
+    loop = ClosedLoop(drive, PID(2e-3), compensators=(Knocker(), DeadZoneInverse()))
+    sizes = {"knocker.amplitude": 8.0, "knocker.smoothing": 2.0, "dead_zone_inverse.width": 5.0}
+    known = given(loop).with_values({**sizes, "dead_zone_inverse.smoothing": 2.0})
     t = np.arange(600) * 1e-3
     wanted = np.where(t < 0.1, 0.0, np.where(t < 0.35, 0.3, -0.2))
     run = simulate(loop, Trajectory(t, {"reference": wanted}), known, initial=[0.0] * len(loop.states))

@@ -1,0 +1,13 @@
+"""`COMPENSATORS`: the compensators by their section of a tuning's file, where a new one is registered."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from pneuopt.control.dead_zone_inverse import DeadZoneInverse
+from pneuopt.control.friction_feedforward import FrictionFeedforward
+from pneuopt.control.knocker import Knocker
+
+# A file's compensators act in this order: the one that inverts the valve comes last, where it sees all but the dither.
+COMPENSATORS: Mapping[str, type[FrictionFeedforward] | type[Knocker] | type[DeadZoneInverse]] = MappingProxyType(
+    {part.section: part for part in (FrictionFeedforward, Knocker, DeadZoneInverse)}
+)

@@ -1,0 +1,366 @@
+"""Every registered compensator through the same mill; a new one is a row of the registry, and one of `ROWS`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pandas as pd
+import pytest
+
+from pneuopt.control.bumpless import bumpless_transfer
+from pneuopt.control.compensation import Compensator, Instant
+from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.friction_feedforward import Direction, FrictionFeedforward
+from pneuopt.control.linear_loop import open_loop
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.control.sensor import SensedSignal
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import System, names
+from pneuopt.evaluation.batch_margins import batch_margin_function
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.margins import margins, sensitivity_terms
+from pneuopt.evaluation.record import record
+from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.evaluation.rig import Rig, Sensor
+from pneuopt.evaluation.specification import specify
+from pneuopt.files.tuning import read_tuning, write_tuned
+from pneuopt.models import catalog
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import SecondOrder
+from pneuopt.quantities.errors import InputError, ModelError
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.quantities.status import Code, Status
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import unit_ratio
+from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
+from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import search_space
+from pneuopt.tuning.two_phase import is_linear
+
+H = 2e-3  # [s] of the sampled loops
+
+
+@dataclass(frozen=True)
+class Row:
+    """A compensator's units for V and m/s, values that act on a friction loop in N, and a tuning's section in V.
+
+    `smooth` is a free parameter that the response depends on smoothly, with its bounds.
+    """
+
+    units: Mapping[str, str]
+    acting: Mapping[str, float]
+    section: str
+    smooth: tuple[str, float, float]
+    continuous: bool = True
+
+
+ROWS: Mapping[str, Row] = {
+    "friction_feedforward": Row(
+        {"level": "V", "smoothing": "m/s"},
+        {"level": 18.0, "smoothing": 0.02},
+        'level = { value = "0.2 V", lower = "0 V", upper = "1 V", free = true }\nsmoothing = "5 mm/s"\n'
+        'direction = "measured"',
+        ("level", 0.0, 40.0),
+    ),
+    "knocker": Row(
+        {"amplitude": "V", "width": "s", "period": "s", "smoothing": "V"},
+        {"amplitude": 15.0, "width": 4e-3, "period": 2e-2, "smoothing": 0.5},
+        'amplitude = { value = "0.2 V", lower = "0 V", upper = "1 V", free = true }\nwidth = "4 ms"\nperiod = "20 ms"',
+        ("amplitude", 0.0, 30.0),
+        continuous=False,
+    ),
+    "dead_zone_inverse": Row(
+        {"width": "V", "smoothing": "V"},
+        {"width": 8.0, "smoothing": 5.0},
+        'width = { value = "0.2 V", lower = "0 V", upper = "1 V", free = true }\nsmoothing = "50 mV"',
+        ("width", 0.0, 20.0),
+    ),
+}
+KINDS = pytest.mark.parametrize("section", COMPENSATORS)
+SETTINGS = [(n, h) for n in COMPENSATORS for h in (None, H) if h or ROWS[n].continuous]
+EVERY_SETTING = pytest.mark.parametrize(("section", "sample_time"), SETTINGS)
+SPEED = SensedSignal(Quantity("speed", "m/s"), {}, H)
+
+
+def part(section: str) -> Compensator:
+    return COMPENSATORS[section]()
+
+
+def friction_loop(section: str, sample_time: float | None) -> tuple[ClosedLoop, ParameterSet]:
+    """A mass with friction under a PI and the compensator, one gain and the smooth parameter free."""
+    row = ROWS[section]
+    own = {f"{section}.{n}": v for n, v in row.acting.items()}
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time), compensators=(part(section),))
+    name, low, high = row.smooth
+    bounds = {"pid.Kp": (50.0, 400.0), f"{section}.{name}": (low, high)}
+    values = {"pid.Kp": 200.0, "pid.Ki": 4000.0, "pid.lower": -300.0, "pid.upper": 300.0, **own}
+    return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
+
+
+def test_every_compensator_has_a_row() -> None:
+    assert set(ROWS) == set(COMPENSATORS)
+    assert all(kind.section == name for name, kind in COMPENSATORS.items())
+
+
+@KINDS
+def test_parameters_are_declared_with_units_and_bounds(section: str) -> None:
+    kind, row = part(section), ROWS[section]
+    found = kind.parameters(SPEED, "V")
+    assert {n: q.unit for n, q in found.items()} == dict(row.units)
+    assert set(kind.without_gradient) <= set(found)
+    assert (found[kind.size].value, found[kind.size].lower) == (0.0, 0.0)
+    assert all(unit_ratio(q.unit, "1") for q in found.values())
+    for name in found:
+        bad = ParameterSet({f"{section}.{name}": Parameter(-1.0, found[name].unit)})
+        loop = ClosedLoop(SecondOrder().system(), PID(H), compensators=(kind,))
+        with pytest.raises(InputError, match=rf"{section}\.{name} must lie within"):
+            loop.check(loop.parameters | bad)
+    assert f"{section}.{kind.size}" in repr(loop)
+
+
+@EVERY_SETTING
+def test_of_size_zero_it_changes_nothing(section: str, sample_time: float | None) -> None:
+    drive = ForceDrive(Stribeck()).system()
+    plain, other = (ClosedLoop(drive, PID(sample_time), compensators=c) for c in ((), (part(section),)))
+    rng, n = np.random.default_rng(1), len(plain.states)
+    for _ in range(5):
+        x, r = rng.normal(size=len(other.states)), rng.normal()
+        p = rng.uniform(0.1, 1.0, len(plain.parameters))
+        q = np.array([*p, *(other.parameters.value(n) for n in list(other.parameters)[len(p) :])])
+        bare, full = (
+            np.array(m.system().ode(0.0, z, [r], w)[0] if sample_time is None else m.update(0.0, z, [r], w)).ravel()
+            for m, z, w in ((plain, x[:n], p), (other, x, q))
+        )
+        np.testing.assert_allclose(full[:n], bare, rtol=1e-12, atol=1e-12)
+
+
+@KINDS
+def test_derivatives_agree_with_finite_differences(section: str) -> None:
+    kind, values = part(section), ROWS[section].acting
+    r, y, v = (ca.SX.sym(n) for n in "ryv")
+    x = {q.name: ca.SX.sym(q.name) for q in kind.states(Quantity("u", "V"))}
+    p = {n: ca.SX.sym(n) for n in kind.parameters(SPEED, "V")}
+    moved, added = kind.act(Instant(ca.SX(0.0), r, y, v, H), x, p)
+    assert list(moved) == list(x)
+    smooth = [n for n in p if n not in kind.without_gradient]
+    z = ca.vertcat(r, y, v, *x.values(), *p.values())
+    f = ca.Function("f", [z], [ca.vertcat(added, *moved.values())])
+    slope = ca.Function("J", [z], [ca.jacobian(f(z), z)])
+    at = np.array([0.02, 0.01, 0.4, *[0.3] * len(x), *(values[n] for n in p)])
+    own = slice(0, 3 + len(x)), [3 + len(x) + list(p).index(n) for n in smooth]
+    columns = [*range(own[0].stop), *own[1]]
+    nudges = [1e-6 * max(1e-3, abs(at[k])) * (np.arange(len(at)) == k) for k in columns]
+    found = [(np.array(f(at + e)) - np.array(f(at - e))).ravel() / (2 * e.sum()) for e in nudges]
+    np.testing.assert_allclose(np.array(slope(at))[:, columns], np.column_stack(found), rtol=1e-5, atol=1e-7)
+    assert np.abs(found).max() > 0
+
+
+@EVERY_SETTING
+def test_gradients_of_a_response_are_those_of_finite_differences(
+    section: str, sample_time: float | None, check_slopes: Callable[[LinearisedProblem, np.ndarray], None]
+) -> None:
+    loop, given = friction_loop(section, sample_time)
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], search_space(loop, given))
+    spec = specify(SettlingTime(), [Overshoot(0.1)])
+    posed = LinearisedProblem(simulator, sensitivity_rollout(simulator), spec, 60, 1.0)
+    z = np.array([0.4, 0.4, 0.2037])
+    (point,) = posed.evaluate(z[None])
+    assert np.abs(point.slopes[:, 1]).max() > 0
+    check_slopes(posed, z)
+
+
+@EVERY_SETTING
+def test_search_and_certificate_agree(section: str, sample_time: float | None) -> None:
+    loop, given = friction_loop(section, sample_time)
+    step = Step(0.2, horizon=0.6)
+    simulator = Simulator(loop, [step], search_space(loop, given))
+    size = given.value(f"{section}.{ROWS[section].smooth[0]}")
+    (claimed,) = simulator.table(np.array([200.0, size]), specify(SettlingTime()))
+    certified = evaluate(loop, step, given)[step.label]
+    bare = evaluate(loop, step, given.with_values({f"{section}.{part(section).size}": 0.0}))[step.label]
+    assert certified["IAE"] != pytest.approx(bare["IAE"], rel=1e-3)
+    for name, off in {"SettlingTime": 2e-4, "Overshoot": 2e-3, "SteadyStateError": 2e-3, "PeakControl": 1e-3}.items():
+        assert claimed[name] == pytest.approx(certified[name], rel=2e-3, abs=off, nan_ok=True), name  # NaN: it hunts
+
+
+@EVERY_SETTING
+def test_a_moving_drive_goes_on_as_it_was(section: str, sample_time: float | None) -> None:
+    """The valve's command in steady motion is not zero; the controller takes it over through the compensator."""
+    drive, hardware = catalog.t32()
+    loop = ClosedLoop(drive.system(), PID(sample_time), compensators=(part(section),))
+    values = {"level": 0.3, "smoothing": 0.05, "width": 0.4, "amplitude": 0.3, "period": 0.02}
+    own = {f"{section}.{n}": v for n, v in values.items() if f"{section}.{n}" in loop.parameters}
+    p = (hardware | loop.parameters.select(n for n in loop.parameters if n not in hardware)).with_values(own)
+    p = p.with_values({"pid.Ki": 3.0})
+    plain = ClosedLoop(drive.system(), PID(sample_time))
+    x, u = loop.initial(p, reference=0.1), [0.1]
+    model, bare = (m.system() if sample_time is None else m.hold_system() for m in (loop, plain))
+    if sample_time is not None:
+        x = np.array(loop.update(0.0, x, u, loop.parameter_vector(p))).ravel()
+    rates, y = (np.array(v).ravel() for v in model.ode(0.0, x, u, loop.parameter_vector(p)))
+    wanted = np.array(bare.ode(0.0, plain.initial(p, reference=0.1), u, plain.parameter_vector(p))[1]).ravel()
+    assert abs(y[-1]) > 0.05
+    assert y[-1] == pytest.approx(wanted[-1], abs=1e-9)
+    moving = [k for k, n in enumerate(names(model.states)) if n != "position"]
+    scale = np.array([q.nominal for q in model.states])
+    np.testing.assert_allclose((rates / scale)[moving], 0.0, atol=1e-6)
+
+
+@EVERY_SETTING
+def test_new_gains_on_a_running_loop_do_not_bump(section: str, sample_time: float | None) -> None:
+    loop, old = friction_loop(section, sample_time)
+    sizes = {f"{section}.{part(section).size}": 3.0, "pid.Kp": 90.0, "pid.b": 0.4}
+    new = old.with_values(sizes)
+    rng = np.random.default_rng(4)
+    x = rng.uniform(0.05, 0.2, len(loop.states))
+    after = bumpless_transfer(loop, x, old, new, reference=0.3)
+    sent = []
+    for z, p in ((x, old), (after, new)):
+        q = loop.parameter_vector(p)
+        next_one = (
+            loop.system().ode(0.0, z, [0.3], q)[1][-1]
+            if sample_time is None
+            else loop.update(0.0, z, [0.3], q)[names(loop.states).index("pid.command")]
+        )
+        sent.append(float(next_one))
+    assert sent[1] == pytest.approx(sent[0], abs=1e-9)
+
+
+@KINDS
+def test_a_rigs_controller_runs_it(section: str) -> None:
+    """On a rig without imperfections the recorded command is that of the loop."""
+    loop, given = friction_loop(section, H)
+    t = np.arange(101) * H
+    step = Trajectory(t, {"reference": np.where(t > 0, 0.1, 0.0)})
+    log = record(Rig(loop, {"speed": Sensor()}), step, given, rtol=1e-9).experiment.trajectory
+    sent = simulate(loop, step, given, rtol=1e-9)["control"]
+    np.testing.assert_allclose(log["force"], sent, atol=1e-3)
+
+
+@EVERY_SETTING
+def test_a_file_reads_it_and_writes_what_was_found(section: str, sample_time: float | None, tmp_path: Path) -> None:
+    text = "[pid]\n" + (f'sample_time = "{1e3 * sample_time:g} ms"\n' if sample_time else "") + 'Kp = "2 V*s/m"\n'
+    text += f'[{section}]\n{ROWS[section].section}\n[[reference]]\nstep = "0.1 m/s"\nhorizon = "1 s"\n'
+    source = tmp_path / "tuning.toml"
+    source.write_text(text, encoding="utf-8")
+    tuning = read_tuning(source, SecondOrder().system())
+    (found,) = tuning.loop.compensators
+    size = f"{section}.{found.size}"
+    assert (type(found), tuning.parameters.free_names) == (COMPENSATORS[section], (size,))
+    assert tuning.parameters.value(size) == 0.2
+    if isinstance(found, FrictionFeedforward):
+        assert found.direction is Direction.MEASURED
+    table = pd.DataFrame()
+    tuned = tuning.parameters.with_values({size: 0.75})
+    write_tuned(
+        tmp_path / "tuned.toml",
+        source,
+        TuningResult(tuned, table, table, table, table, (), Status(Code.CONVERGED), {}, {}),
+    )
+    again = read_tuning(tmp_path / "tuned.toml", SecondOrder().system())
+    assert again.loop.compensators == tuning.loop.compensators
+    assert again.parameters.value(size) == 0.75
+    source.write_text(text.replace(f"{found.size} =", "strange ="), encoding="utf-8")
+    with pytest.raises(InputError, match=rf"\[{section}\] has no {found.size}"):
+        read_tuning(source, SecondOrder().system())
+
+
+@KINDS
+def test_several_act_one_on_the_others_command(section: str, second_order: System) -> None:
+    """Behind a feedforward and before the clip, whose back-calculation unwinds what they add, too."""
+    parts = tuple(part(n) for n in COMPENSATORS)
+    loop = ClosedLoop(second_order, PID(H), feedforward=Feedforward(), compensators=parts)
+    sizes = {f"{c.section}.{c.size}": 0.3 for c in parts}
+    values = {
+        "pid.Kp": 2.0,
+        "pid.Ki": 0.0,
+        "pid.Tt": 0.02,
+        "pid.lower": -0.9,
+        "pid.upper": 0.9,
+        "feedforward.gain": 1.0,
+    }
+    p = loop.parameters.with_values({**values, **sizes, "friction_feedforward.smoothing": 0.05})
+    x = np.zeros(len(loop.states))
+    after = dict(
+        zip(names(loop.states), np.array(loop.update(0.0, x, [0.1], loop.parameter_vector(p))).ravel(), strict=True)
+    )
+    v = 2.0 * 0.1 + 0.1 * 0.05 / 0.052
+    v += 0.3 * np.tanh(0.1 / 0.05)
+    pulse = 0.3 * np.tanh(v / 0.01)
+    w = v + pulse + 0.3 * np.tanh((v + pulse) / 0.02)
+    assert after["knocker.command"] == pytest.approx(v)
+    assert (w > 0.9, after["pid.command"]) == (True, 0.9)
+    assert after["pid.integral"] == pytest.approx(H / 0.02 * (0.9 - w))
+    assert section in loop.tunable_sections
+
+
+def closed_poles(loop: ClosedLoop, p: ParameterSet, reference: float) -> np.ndarray:
+    """Of the whole loop's own Jacobian at its equilibrium, by AD through the compensators."""
+    system, x = loop.system(), loop.initial(p, reference=reference)
+    linear = system.linearise(x, {"reference": reference}, p)
+    return np.sort_complex(np.linalg.eigvals(linear.A))
+
+
+@pytest.mark.parametrize("direction", list(Direction))
+@pytest.mark.parametrize("reference", [0.0, 0.02])
+def test_margins_count_slopes_at_the_operating_point(
+    second_order: System, direction: Direction, reference: float
+) -> None:
+    """The loop's poles by `open_loop` are those of the whole system's Jacobian."""
+    parts = (FrictionFeedforward(direction), COMPENSATORS["dead_zone_inverse"]())
+    loop = ClosedLoop(second_order, PID(), compensators=parts)
+    values = {"pid.Kp": 0.2, "pid.Ki": 1.2, "pid.Kd": 0.01}
+    values |= {"friction_feedforward.level": 2e-3, "friction_feedforward.smoothing": 0.03}
+    values |= {"dead_zone_inverse.width": 2e-3, "dead_zone_inverse.smoothing": 4e-3}
+    p = loop.parameters.with_values(values)
+    command = reference * 86.34 / 1270.12
+    opened = open_loop(loop, p, np.array([reference, 0.0]), {"valve_voltage": command})
+    closed = np.sort_complex(np.linalg.eigvals(opened.A - opened.B @ opened.C / (1 + opened.D[0, 0])))
+    np.testing.assert_allclose(closed, closed_poles(loop, p, reference), rtol=1e-6)
+    at = loop.parameter_vector(p)[None], np.array([[reference, 0.0]]), np.array([command])
+    found, batch = margins(opened), batch_margin_function(loop, np.geomspace(0.01, 1e5, 400))
+    in_search = batch(*at, ["MaxSensitivity", "PhaseMargin"])
+    assert in_search["MaxSensitivity"][0] == pytest.approx(found.max_sensitivity, rel=1e-3)
+    assert in_search["PhaseMargin"][0] == pytest.approx(found.phase_margin, abs=0.1)
+    bare = closed_poles(ClosedLoop(second_order, PID()), p, reference)
+    assert np.abs(closed - bare).max() > 0.1
+    assert not is_linear(loop)
+    with pytest.raises(ModelError, match="FrictionFeedforward, DeadZoneInverse: its slope"):
+        sensitivity_terms(loop, [1.0], p)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda plant: ClosedLoop(plant, PID(), compensators=(part("knocker"),)), "give the PID a sample_time"),
+        (lambda plant: ClosedLoop(plant, PID(H), compensators=(part("knocker"),) * 2), "has Knocker twice"),
+        (
+            lambda plant: ClosedLoop(plant, PID(H), compensators=part("knocker")),  # type: ignore[arg-type]
+            "compensators is a tuple of parts",
+        ),
+        (
+            lambda plant: ClosedLoop(plant, PID(H), compensators=(COMPENSATORS["knocker"],)),  # type: ignore[arg-type]
+            "is a tuple of parts",
+        ),
+        (
+            lambda _: ClosedLoop(
+                ForceDrive(Stribeck()).system(), PID(), measured="position", compensators=(FrictionFeedforward(),)
+            ),
+            "takes the sign of a speed",
+        ),
+        (
+            lambda _: FrictionFeedforward("measured"),  # type: ignore[arg-type]
+            "direction is one of Direction.REFERENCE, Direction.MEASURED",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(second_order: System, make: Callable[[System], object], said: str) -> None:
+    with pytest.raises((ModelError, InputError), match=said):
+        make(second_order)
