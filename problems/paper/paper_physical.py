@@ -9,7 +9,8 @@ Ye, Wang, Chen (IJRES 3(7), 2015) print eq. (16), 1270.12/(s^2 + 17.5 s + 86.34)
 assumes, is no legal assumption; what lets the second order stand is K_cb = m K_ca. Equation (15) drops a constant.
 
 Then the nonlinear closed loop beside eq. (16) (rows beside.*), and with LuGre friction (rows friction.*): friction does
-not make the overshoot of a P loop, it takes it away; with an integral it does. Rows dither.*: see paper_dither.py.
+not make the overshoot of a P loop, it takes it away; with an integral it does. Rows dither.*: see
+paper_dither.py; rows stroke.*, whether mid stroke is the worst position: paper_stroke.py.
 """
 
 import sys
@@ -27,7 +28,7 @@ from scipy import optimize, signal
 
 import pneuopt as po
 from pneuopt.plotting import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
-from problems.paper import paper_dither
+from problems.paper import paper_dither, paper_stroke
 from problems.shared.arrays import Array, names, parameter_vector
 from problems.shared.claims import Claim, arguments, finish, frame
 from problems.shared.paper2015 import (
@@ -64,7 +65,7 @@ LEAK_FREE = {"load.mass": 10.069647123928888, "friction.viscous": 176.2188246687
 
 def main() -> "pd.DataFrame":
     chain = [*_orifices(), *_coefficients(), *_balances(), *_linear_chambers(), *_one_pressure(), *_equation_15()]
-    return frame([*chain, *_equation_16(), *_alternatives(), *_beside(), *_friction(), *paper_dither.claims()])
+    return frame([*chain, *_equation_16(), *_alternatives(), *_beside(), *_friction(), *_parts()])
 
 
 def figures() -> "Mapping[str, Figure]":
@@ -72,7 +73,12 @@ def figures() -> "Mapping[str, Figure]":
         "paper_physical_steps": _draw_sizes(),
         "paper_physical_friction": _draw_friction(),
         "paper_physical_dither": paper_dither.figure(),
+        "paper_physical_stroke": paper_stroke.figure(),
     }
+
+
+def _parts() -> list[Claim]:
+    return [*paper_stroke.claims(), *paper_dither.claims()]
 
 
 def near(name: str, value: float, reference: float, relative: float, unit: str = "1") -> Claim:
