@@ -86,6 +86,10 @@ def tune_command(
     tuning: Annotated[
         Path, typer.Argument(metavar="TUNING", help="tuning.toml: controller, references, requirements.")
     ],
+    rig: Annotated[
+        Path | None,
+        typer.Option("--rig", metavar="FILE", help="rig.toml: certify with its stick-slip, valve and sensors too."),
+    ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write tuned.toml.")] = None,
     json: Json = None,
     plot: Plot = None,
@@ -96,7 +100,7 @@ def tune_command(
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.tune import run_tune
 
-        raise typer.Exit(run_tune(fit, tuning, Outputs(output, json, plot), quiet))
+        raise typer.Exit(run_tune(fit, tuning, rig, Outputs(output, json, plot), quiet))
 
 
 @app.command("simulate")

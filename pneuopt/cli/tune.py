@@ -37,7 +37,8 @@ from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate, final_operating_point, respond
 from pneuopt.evaluation.expected_plants import expected_plants
 from pneuopt.evaluation.response import linearise_open_loop
-from pneuopt.files.drive import read_covariance
+from pneuopt.files.drive import read_covariance, read_drive
+from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import Tuning, write_tuned
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
@@ -53,9 +54,10 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
+def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet: bool) -> int:
     """Tune a loop; returns the exit status."""
-    outputs.check([fit, tuning], "bode")
+    inputs = [fit, tuning, *([rig] if rig is not None else [])]
+    outputs.check(inputs, "bode")
     task, parameters = read_fit_and_tuning(fit, tuning)
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
     require(bool(task.specification.weights), f"{tuning}: has nothing to minimise; {remedy}")
@@ -70,12 +72,13 @@ def run_tune(fit: Path, tuning: Path, outputs: Outputs, quiet: bool) -> int:
             minimise=task.specification,
             scenarios=task.scenarios(parameters),
             plants=plants,
+            rig=None if rig is None else read_rig(rig, read_drive(fit)[0], task.loop),
             max_steps=task.max_steps,
             method=task.method,
             throw=False,
             progress=report_progress,
         )
-    result = replace(result, provenance={**result.provenance, **file_hashes(fit, tuning)})
+    result = replace(result, provenance={**result.provenance, **file_hashes(*inputs)})
     console, shown = make_console(), dict[str, Any]()
     show_status(console, result.status)
     if result.status.converged:

@@ -83,6 +83,8 @@ class TuningResult:
         All that the independent evaluation found; None where its simulation stopped.
     validation : DesignValidation, optional
         On how many plants like the model the design holds, and what would help; `tune` tries what it has certified.
+    on_rig : DataFrame, optional
+        Metrics on the rig's model, where one was given: a row a metric, a column a reference.
     """
 
     parameters: ParameterSet
@@ -96,6 +98,7 @@ class TuningResult:
     provenance: Mapping[str, str]
     certificate: Certificate | None = None
     validation: DesignValidation | None = None
+    on_rig: "pd.DataFrame | None" = None
 
     def __repr__(self) -> str:
         free = self.parameters.select(self.parameters.free_names)

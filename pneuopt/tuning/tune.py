@@ -18,6 +18,7 @@ from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
 from pneuopt.evaluation.requirements import PeakControl, Requirement
+from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.quantities.arguments import as_tuple, check_parameters
@@ -27,6 +28,7 @@ from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import choose_method
+from pneuopt.tuning.on_rig import certify_on_rig, check_rig
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, relax
 from pneuopt.tuning.space import Space, clip_level, search_space
@@ -47,6 +49,7 @@ def tune(
     scenarios: Scenarios = NO_SCENARIOS,
     accept: Defect | Sequence[Defect] = (),
     plants: ExpectedPlants | Scenarios | None = None,
+    rig: Rig | None = None,
     max_steps: float = MAX_STEPS,
     method: Method | None = None,
     throw: bool = True,
@@ -76,6 +79,9 @@ def tune(
         Plants that no search sees, on which the certified design is tried: the result's `validation` says on how many
         it holds. By default those of `expected_plants`, with usual tolerances; after a fit give
         ``expected_plants(parameters, fit.covariance)``. ``{}``: none.
+    rig : Rig, optional
+        The event-accurate model of the rig that the design is for, with its own friction, sensors and actuator: what
+        breaks a limit there is not certified. The result's `on_rig` has its figures.
     max_steps : float
         Steps of one certificate's simulations together that are refused as too many; the search takes about as long.
     method : TwoPhase, Racing or another Method, optional
@@ -113,6 +119,8 @@ def tune(
     """
     begun = time.perf_counter()
     task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios, accept, max_steps)
+    if rig is not None:
+        check_rig(rig, task)
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
@@ -130,6 +138,9 @@ def tune(
         status=result.status.with_remedies(note),
         stats={**result.stats, "seconds": time.perf_counter() - begun},
     )
+    if result.status.converged and rig is not None:
+        search.progress("certifying on the rig's model")
+        result = certify_on_rig(task, result, rig)
     if result.status.converged:
         result = _try_on_plants(task, result, plants, search.progress)
     if throw and not result.status.converged:

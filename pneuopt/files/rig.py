@@ -1,0 +1,110 @@
+"""rig.toml: the hardware around a loop that its model does not have, on which `tune` certifies a design once more.
+
+[actuator]                       # all sections are optional: without any, the plant sticks and slips, and no more
+hysteresis = "0.04 V"            # width of the loop, as catalogues give it
+dead_zone = "0.1 V"              # of an amplifier; a valve's overlap belongs into drive.toml
+
+[sensors.position]               # by the plant's output
+resolution = "10 um"
+noise = "5 um"
+lag = "1 ms"
+
+[encoder]                        # by which the controller gets a speed out of the measured position
+resolution = "10 um"
+filter = "5 ms"
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.evaluation.rig import Actuator, Rig, Sensor
+from pneuopt.files.loop import construct_at, read_fixed_value
+from pneuopt.files.toml import read_toml
+from pneuopt.models.declaration import Drive
+from pneuopt.models.drive_kinds import DRIVE_KINDS
+from pneuopt.models.karnopp import Karnopp
+from pneuopt.quantities.errors import ModelError, check_names, require
+
+Part = TypeVar("Part", Actuator, Sensor, Encoder)
+_SECTIONS = ("actuator", "sensors", "encoder")
+_TIMES = ("lag", "filter")
+
+
+def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
+    """Read the rig around a loop; its dry friction sticks and slips, its sensors stand in for the loop's own.
+
+    Parameters
+    ----------
+    path : str or Path
+        A rig.toml.
+    drive : Drive
+    loop : ClosedLoop
+        Of that drive. Where the file has no sensors, the loop's own is taken.
+
+    Returns
+    -------
+    Rig
+
+    Raises
+    ------
+    InputError
+        Or its kind; the message names file, section and key.
+    """
+    table = read_toml(path).unwrap()
+    check_names("section", table, _SECTIONS, str(path))
+    for name, entry in table.items():
+        require(isinstance(entry, dict), f"{path}: {name} must be a section, [{name}]")
+    own = construct_at(lambda: replace(loop, plant=stick_slip_drive(drive).system(), sensor=None), str(path))
+    actuator = _read_numbers(table.get("actuator", {}), Actuator(), loop.command.unit, f"{path}: [actuator]")
+    encoder = _read_encoder(table.get("encoder", {}), loop, f"{path}: [encoder]")
+    sensors = _read_sensors(table.get("sensors", {}), loop, f"{path}: [sensors") or _own_sensors(loop)
+    return construct_at(lambda: Rig(own, sensors, actuator, encoder), str(path))
+
+
+def stick_slip_drive(drive: Drive) -> Drive:
+    """The drive with Karnopp's friction where its own is a static map with a Coulomb level; else as it is."""
+    friction = getattr(drive, "friction", None)
+    if friction is None or not DRIVE_KINDS[drive.kind].any_friction:
+        return drive
+    try:
+        sticking: Any = Karnopp(friction)
+    except ModelError:  # bristles stick by themselves; viscous friction never does
+        return drive
+    same: Any = drive
+    return replace(same, friction=sticking)  # type: ignore[no-any-return]
+
+
+def _read_sensors(table: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Sensor]:
+    units = {q.name: q.unit for q in loop.plant.outputs}
+    check_names("output", table, units, f"{where}]")
+    for name, entry in table.items():
+        require(isinstance(entry, dict), f"{where}] must hold sections, [sensors.{name}]")
+    return {n: _read_numbers(entry, Sensor(), units[n], f"{where}.{n}]") for n, entry in table.items()}
+
+
+def _read_encoder(table: Mapping[str, Any], loop: ClosedLoop, where: str) -> Encoder:
+    axis = loop.plant.axis
+    usual = loop.sensor if isinstance(loop.sensor, Encoder) else Encoder()
+    usual = replace(usual, position=axis.position) if axis is not None else usual
+    unit = {q.name: q.unit for q in loop.plant.outputs}.get(usual.position, "m")
+    return _read_numbers(table, usual, unit, where)
+
+
+def _own_sensors(loop: ClosedLoop) -> dict[str, Sensor]:
+    """The sensor of the loop as the rig's."""
+    if isinstance(loop.sensor, Encoder):
+        return {loop.sensor.position: Sensor()}
+    return {loop.feedback.name: Sensor(lag=loop.sensor.lag if isinstance(loop.sensor, SensorLag) else 0.0)}
+
+
+def _read_numbers(table: Mapping[str, Any], usual: Part, unit: str, where: str) -> Part:
+    """A copy of a part with the numbers that a section holds, in the unit of its signal, or in seconds."""
+    keys = [n for n in (*_TIMES, "noise", "resolution", "hysteresis", "dead_zone") if hasattr(usual, n)]
+    check_names("key", table, keys, where)
+    plain = unit.partition("(")[0]
+    read: dict[str, Any] = {n: read_fixed_value(table, n, "s" if n in _TIMES else plain, where) for n in table}
+    return construct_at(lambda: replace(usual, **read), where)
