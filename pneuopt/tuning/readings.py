@@ -36,7 +36,7 @@ class ReferenceGrid:
     t : ndarray, shape (n,)
     u : ndarray, shape (n, n_inputs)
     spacing : float
-        [s]
+        The largest distance between two samples [s]; under dither and of sampled loops it is that of all.
     sample_time : float or None
         The controller's, if it is sampled [s].
     """
@@ -66,7 +66,11 @@ class ReferenceGrid:
     def pad(self, n: int) -> tuple[Array, Array, Array]:
         """Inputs, instants and steps, the last sample repeated up to n samples with steps of 0: there a run ends."""
         k = np.minimum(np.arange(n), len(self.t) - 1)
-        return self.u[k], self.t[k], np.where(np.arange(n) < len(self.t) - 1, self.spacing, 0.0)
+        return self.u[k], self.t[k], np.append(np.diff(self.t), 0.0)[k]
+
+    def at(self, t: Array) -> "ReferenceGrid":
+        """The same inputs, held as before, at other instants between the first and the last."""
+        return replace(self, t=t, u=self.u[np.searchsorted(self.t, t, side="right") - 1])
 
 
 def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:

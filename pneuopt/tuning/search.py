@@ -33,6 +33,11 @@ MAX_CERTIFIED_POINTS = 5
 # Rounds in which the neighbours of the best rounded design are simulated. Fewer miss a rounding that loses next to
 # nothing; more move the design away from the one that was found.
 ROUNDING_ROUNDS = 3
+# Searches on closer samples, at most: fewer claim figures of responses that are not resolved; more cost a search each.
+MAX_REFINED_SEARCHES = 3
+# Relative change of a requirement on closer samples above which a search is repeated on them. A smaller one repeats
+# searches for digits that no ranking needs; a larger one claims figures that the certificate refuses.
+SAMPLING_TOLERANCE = 5e-3
 # Margin of the search for the least relaxation of a limit, a fraction. A larger one reports more than is needed; at
 # zero the design found does not survive its certificate.
 RELAXATION_MARGIN = 0.002
@@ -73,9 +78,10 @@ class Search:
         for attempt in range(MARGINS_TO_TRY):
             margin = min(self.method.margin * 2**attempt, 0.5)
             try:
-                found = self.method.find(self.task, simulator, self.tighten(margin), start, attempt, self.progress)
+                found = self._find(margin, start, attempt)
             except KeyboardInterrupt:  # in a method that holds no best point yet
                 found = _interruption_result(start)
+            simulator = self.simulator
             counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
             found = replace(found, stats={**found.stats, **counts, "margin": margin})
             if not found.is_complete:
@@ -94,6 +100,29 @@ class Search:
         """The compiled simulation of all cases, which reads the requirements asked for."""
         task = self.task
         return Simulator(task.loop, task.references, task.space, task.scenarios, task.spec)
+
+    def _find(self, margin: float, start: Array, attempt: int) -> SearchResult:
+        """Search, and search again on closer samples where the response found is too fast for those of the search."""
+        spec = self.tighten(margin)
+        found = self.method.find(self.task, self.simulator, spec, start, attempt, self.progress)
+        for _ in range(MAX_REFINED_SEARCHES):
+            finer = self.simulator.refine(found.point)
+            if not found.is_complete or finer is self.simulator or self._agree(finer, found.point):
+                break
+            vars(self)["simulator"] = finer
+            if "simulations" in found.stats:  # otherwise the method has samples of its own
+                self.progress("the response is too fast for the samples of the search; searching again on closer ones")
+                found = self.method.find(self.task, finer, spec, found.point, attempt, self.progress)
+        return found
+
+    def _agree(self, finer: Simulator, point: Array) -> bool:
+        """Whether the requirements have the same values on closer samples."""
+        coarse, fine = (to_records(s.respond(point[None], self.spec.band).values)[0] for s in (self.simulator, finer))
+        return all(
+            bool(np.isclose(coarse[n], fine[n], rtol=SAMPLING_TOLERANCE, equal_nan=True))
+            for n in self.spec.kinds
+            if n in fine
+        )
 
     def _report_start(self, simulator: Simulator) -> None:
         """Report cases in which the loop never settles with the given gains: one of them may be mistyped."""

@@ -14,12 +14,20 @@ from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.meter import check_channels, needed_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS
+from pneuopt.evaluation.resolution import refine_instants, spread_instants
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, loop_inputs, readings_a_sample, sample_spacing
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, has_integral, loop_pieces, read_metrics
+from pneuopt.tuning.readings import (
+    CONTROL_OUTPUT,
+    SIGNAL_OUTPUT,
+    ReferenceGrid,
+    has_integral,
+    loop_pieces,
+    read_metrics,
+)
 from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, is_sound, to_records
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
@@ -34,6 +42,12 @@ MAX_CHUNK_LANES = 128
 # Samples of a dither period during a search. Fewer shift settling times by more: at ten by 0.1 ms on the drive of
 # problems/speed/t32.py, 3 ms at worst; more cost time in proportion.
 COARSE_SAMPLES_A_PERIOD = 10
+# Multiple of the tolerances of a certificate's readings that a search's samples keep. A smaller one searches on more
+# samples than a ranking of designs needs; a larger one claims figures that the certificate refuses.
+SEARCH_TOLERANCE = 5.0
+# Times that samples are added to a response, eight times as close each time. Fewer leave fast responses unresolved;
+# more cost time.
+MAX_REFINEMENTS = 4
 # Corners of the gains' box, the fastest on the nominal plant, at which the fastest mode is sought on the scenarios'
 # plants. Fewer may miss a stiff one, on which RK4 is then unstable; each more costs an eigenvalue problem a plant.
 STIFFEST_CORNERS = 8
@@ -78,6 +92,7 @@ class Simulator:
         self.margin_metrics = tuple(dict.fromkeys((*BASE_MARGINS, *(k for k in kinds if k in linearised))))
         self._envelope = spec.envelope if spec else ()
         self._wider: tuple[float, ...] = ()
+        self._is_refined = False
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
         self._rest = _rests(self.cases, loop, space)
@@ -105,9 +120,10 @@ class Simulator:
         part.response_metrics = tuple(
             dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.kinds if n in self.response_metrics)))
         )
-        part.grids = _grids(
-            self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE_SAMPLES_A_PERIOD
-        )
+        if not self._is_refined:
+            part.grids = _grids(
+                self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE_SAMPLES_A_PERIOD
+            )
         part.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in part.grids]
         return part
 
@@ -120,6 +136,47 @@ class Simulator:
         part = copy.copy(self)
         part.grids = [grid.cut(duration) for grid in self.grids]
         return part
+
+    def refine(self, point: Array) -> "Simulator":
+        """A copy whose samples are close enough for responses as fast as those of a point; itself where they are.
+
+        A dither's samples are close anyway, and a sampled loop is no faster than its samples.
+        """
+        if self.loop.pid.sample_time is not None or any(self.dither_periods()):
+            return self
+        part = copy.copy(self)
+        part.grids = [
+            grid.at(spread_instants(grid.t, self._needed_instants(point, g), grid.reference.at))
+            for g, grid in enumerate(self.grids)
+        ]
+        part._is_refined = any(len(new.t) > len(old.t) for new, old in zip(part.grids, self.grids, strict=True))
+        return part if part._is_refined else self
+
+    def _needed_instants(self, point: Array, g: int) -> Array:
+        """The instants that the responses of a point need, the cases of one grid together [s]."""
+        found = [self._resolve_response(point, case).t for case in np.flatnonzero(self._grid_of == g).tolist()]
+        t = np.unique(np.concatenate(found))
+        least = 1e-6 * self.grids[g].spacing  # the same instant, but for rounding
+        return np.asarray(t[np.append(True, np.diff(t) > least)])
+
+    def _resolve_response(self, point: Array, case: int) -> ReferenceGrid:
+        """The samples of a case, with others where the response of a point changes fast."""
+        grid: ReferenceGrid = self.grids[self._grid_of[case]]
+        p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
+        for _ in range(MAX_REFINEMENTS):
+            u, t, h = (a[None] for a in grid.pad(len(grid.t)))
+            with np.errstate(all="ignore"):
+                found = self.rollout.run(start, u, p, t, h, substeps=rk4_substeps(self._rate, grid.spacing))
+            signal, reference = found.y[0, :, SIGNAL_OUTPUT], grid.reference
+            if not is_sound(found.y, found.x_end)[0]:
+                return grid
+            finer = refine_instants(
+                grid.t, signal, reference.final, reference.nominal_size, reference.at, SEARCH_TOLERANCE
+            )
+            if finer is None:
+                return grid
+            grid = grid.at(finer)
+        return grid
 
     def select_cases(self, chosen: Sequence[int]) -> "Simulator":
         """A copy with some of the cases."""

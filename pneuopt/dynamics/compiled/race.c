@@ -61,7 +61,7 @@ static double read_error(const Race *r, const Runner *run, Count k) {
 
 /* The bounds that grow with the sample just put out; whether the candidate has lost by them. */
 static int has_lost(const Race *r, Runner *run, double *exits) {
-  const double *set = r->settings + run->which * SETTINGS, h = set[SPACING], period = r->period[run->pair];
+  const double *set = r->settings + run->which * SETTINGS, period = r->period[run->pair];
   const double *y = r->y + (run->pair * r->samples + run->sample) * NY;
   double *worst = r->worst + run->candidate * VALUES, *sums = run->sums;
   const Count after = run->sample - r->first[run->which], k = after - (period == 0 ? 0 : run->half + 1);
@@ -70,14 +70,15 @@ static int has_lost(const Race *r, Runner *run, double *exits) {
   if (after < 0) return 0;
   if (fabs(y[CONTROL]) > worst[PEAK]) worst[PEAK] = fabs(y[CONTROL]);
   if (k >= 0) {
-    const double error = read_error(r, run, k), size = fabs(error), t = set[OFFSET] + k * h;
+    const double *at = r->t + r->grid[run->which] * r->samples + r->first[run->which];
+    const double error = read_error(r, run, k), size = fabs(error), t = set[OFFSET] + at[k] - at[0];
     double settling = 0;
     for (Count b = 0; b < r->bands; b++) {
       if (size > r->band[b]) exits[b] = t - period / 2; /* the ripple may carry it back that much sooner */
       settling += exits[b] / r->bands;
     }
     if (k > 0) {
-      const double before = run->error, last = t - h;
+      const double before = run->error, last = set[OFFSET] + at[k - 1] - at[0], h = t - last;
       sums[IAE] += h / 2 * (fabs(before) + size);
       sums[ISE] += h / 2 * (before * before + error * error);
       sums[ITAE] += h / 2 * (last * fabs(before) + t * size);

@@ -1,0 +1,58 @@
+"""The samples of a search follow the response, and a claim holds on them before it is certified or refused."""
+
+import numpy as np
+import pytest
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import IAE, ITAE, MaxSensitivity, Overshoot, Requirement, SettlingTime
+from pneuopt.evaluation.specification import specify
+from pneuopt.models.linear import SecondOrder
+from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import search_space
+from pneuopt.tuning.tune import tune
+
+STEP = Step(1.0, horizon=20.0)
+FREE = {"pid.Kp": (0.01, 20.0), "pid.Ki": (0.1, 400.0), "pid.Kd": (0.0, 1.0), "pid.Tf": (1e-3, 0.05)}
+GAINS = {"pid.Kp": 7.502, "pid.Ki": 394.9, "pid.Kd": 0.4313, "pid.Tf": 0.001003}
+
+
+def problem(step: Step = STEP) -> tuple[ClosedLoop, Simulator]:
+    loop = ClosedLoop(SecondOrder().system(), PID(limits=False))
+    plant = {"plant.gain": 1.0, "plant.natural_frequency": 30.0, "plant.damping": 0.3}
+    given = loop.parameters.with_values(plant | GAINS).with_bounds(FREE).freed(*FREE)
+    return loop, Simulator(loop, [step], search_space(loop, given), spec=specify(ITAE(), [IAE(1.0)]))
+
+
+def test_samples_are_added_where_the_response_is() -> None:
+    _, simulator = problem()
+    start, spec = simulator.space.start, specify(ITAE(), [IAE(1.0)])
+    finer = simulator.refine(start)
+    assert len(finer.grids[0].t) < 4 * len(simulator.grids[0].t)
+    assert np.diff(finer.grids[0].t)[0] < 1e-3
+    assert np.all(np.diff(finer.grids[0].t) > 0)
+    assert simulator.values(start[None], spec)["ITAE"][0] < 0.1 * 5.088e-6
+    assert finer.values(start[None], spec)["ITAE"][0] == pytest.approx(5.088e-6, rel=5e-3)  # tests/evaluation
+    assert finer.values(start[None], spec)["SettlingTime"][0] == pytest.approx(0.00592, rel=5e-3)
+    assert len(finer.coarse(spec).grids[0].t) == len(finer.grids[0].t)
+
+
+def test_slow_responses_need_no_more_samples() -> None:
+    _, simulator = problem(Step(1.0, horizon=2.0))
+    assert simulator.refine(np.array([0.1, 5.0, 0.01, 0.01])) is simulator
+    assert simulator.refine(simulator.space.start) is not simulator
+
+
+@pytest.mark.parametrize("minimise", [SettlingTime(), ITAE()])
+def test_a_fast_loop_in_a_long_horizon_is_claimed_as_it_is(minimise: Requirement) -> None:
+    loop, simulator = problem()
+    small = Screening(12, 8, (), 60)
+    limits = [Overshoot(0.05), MaxSensitivity(2.0)]
+    given = simulator.space.parameters
+    found = tune(loop, STEP, given, minimise=minimise, subject_to=limits, method=small, throw=False)
+    claimed, certified = found.requirements["claimed"], found.requirements["certified"]
+    assert found.status.converged
+    np.testing.assert_allclose(claimed, certified, rtol=5e-3, atol=1e-3)
+    assert found.certified.loc["SettlingTime"].max() < 0.1
