@@ -41,7 +41,7 @@ def test_samples_are_added_where_the_response_is() -> None:
 
 def test_slow_responses_need_no_more_samples() -> None:
     _, simulator = problem(Step(1.0, horizon=2.0))
-    assert simulator.refine(np.array([0.1, 5.0, 0.01, 0.01])) is simulator
+    assert simulator.refine(np.array([0.05, 1.0, 0.0, 0.01])) is simulator
     assert simulator.refine(simulator.space.start) is not simulator
 
 
