@@ -20,7 +20,7 @@ from pneuopt.evaluation.margins import margins, noise_gain
 from pneuopt.evaluation.meter import meter_metrics
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.record import record
-from pneuopt.evaluation.resolution import refine_instants
+from pneuopt.evaluation.resolution import MAX_REFINEMENTS, refine_instants
 from pneuopt.evaluation.response import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare")
-# Times that points are added where a response changes fast: each brings them eight times as close. Fewer leave the peak
-# of a fast response in a long horizon unread; more cost a simulation each.
-MAX_REFINEMENTS = 4
 
 
 def evaluate(

@@ -17,7 +17,10 @@ LINE_TOLERANCE = 1e-4
 INTEGRAL_TOLERANCE = 1e-3
 # Parts into which a distance between readings is divided at a time: fewer take more simulations; more add readings
 # where they are not needed.
-DIVISIONS = 8
+PARTS_AT_A_TIME = 8
+# Times that points are added where a response changes fast: each brings them eight times as close. Fewer leave the peak
+# of a fast response in a long horizon unread; more cost a simulation each.
+MAX_REFINEMENTS = 4
 # Factor on the time after a step within which responses of different gains are taken to change equally fast: a smaller
 # one misses those that are faster than the first; a larger one adds readings where nothing happens.
 SPREAD = 3.0
@@ -60,7 +63,7 @@ def refine_instants(
         coarse |= _is_inexact(t, integrand, tolerance)
     fine = np.diff(t) > 8 * np.spacing(t[-1])
     chosen = np.flatnonzero(coarse & fine)
-    if not len(chosen) or len(t) + (DIVISIONS - 1) * len(chosen) > MAX_INSTANTS:
+    if not len(chosen) or len(t) + (PARTS_AT_A_TIME - 1) * len(chosen) > MAX_INSTANTS:
         return None
     return _divide(t, chosen)
 
@@ -93,7 +96,7 @@ def spread_instants(even: Array, needed: Array, start: float) -> Array:
 
 def _divide(t: Array, chosen: Indices) -> Array:
     """Instants with those added that divide the chosen intervals."""
-    added = t[chosen, None] + np.diff(t)[chosen, None] * np.arange(1, DIVISIONS) / DIVISIONS
+    added = t[chosen, None] + np.diff(t)[chosen, None] * np.arange(1, PARTS_AT_A_TIME) / PARTS_AT_A_TIME
     return np.sort(np.concatenate([t, added.ravel()]))
 
 

@@ -1,25 +1,24 @@
 """`Simulator`: compiled simulation of many candidates at once, on every reference and scenario."""
 
 import copy
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.dynamics.system import names
 from pneuopt.evaluation.batch_margins import batch_margin_function
-from pneuopt.evaluation.cases import TuningCase, cases
+from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.meter import check_channels, needed_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS
-from pneuopt.evaluation.resolution import refine_instants, spread_instants
-from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, loop_inputs, readings_a_sample, sample_spacing
+from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.grids import reference_grids, refine_grids
 from pneuopt.tuning.readings import (
     CONTROL_OUTPUT,
     SIGNAL_OUTPUT,
@@ -29,6 +28,7 @@ from pneuopt.tuning.readings import (
     read_metrics,
 )
 from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, is_sound, to_records
+from pneuopt.tuning.rests import starts_before_step
 from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, Space, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
 
 HEADLINES = {name: metric.source is Source.LINEAR_LOOP for name, metric in METRICS.items() if metric.headline}
@@ -42,12 +42,6 @@ MAX_CHUNK_LANES = 128
 # Samples of a dither period during a search. Fewer shift settling times by more: at ten by 0.1 ms on the drive of
 # problems/speed/t32.py, 3 ms at worst; more cost time in proportion.
 COARSE_SAMPLES_A_PERIOD = 10
-# Multiple of the tolerances of a certificate's readings that a search's samples keep. A smaller one searches on more
-# samples than a ranking of designs needs; a larger one claims figures that the certificate refuses.
-SEARCH_TOLERANCE = 5.0
-# Times that samples are added to a response, eight times as close each time. Fewer leave fast responses unresolved;
-# more cost time.
-MAX_REFINEMENTS = 4
 # Corners of the gains' box, the fastest on the nominal plant, at which the fastest mode is sought on the scenarios'
 # plants. Fewer may miss a stiff one, on which RK4 is then unstable; each more costs an eigenvalue problem a plant.
 STIFFEST_CORNERS = 8
@@ -95,11 +89,11 @@ class Simulator:
         self._is_refined = False
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
-        self._rest = _rests(self.cases, loop, space)
+        self._rest = starts_before_step(self.cases, loop, space)
         check_channels(loop.plant, self.response_metrics)
         self.meter_channels = needed_channels(self.response_metrics)
         self.rollout = Rollout(loop_pieces(loop, self.meter_channels))
-        self.grids = _grids(loop, references, space.parameters)
+        self.grids = reference_grids(loop, references, space.parameters)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
         self.substeps = [rk4_substeps(rate, grid.spacing) for grid in self.grids]
@@ -121,7 +115,7 @@ class Simulator:
             dict.fromkeys(("SettlingTime", "Excess", *(n for n in spec.kinds if n in self.response_metrics)))
         )
         if not self._is_refined:
-            part.grids = _grids(
+            part.grids = reference_grids(
                 self.loop, [g.reference for g in self.grids], self.space.parameters, COARSE_SAMPLES_A_PERIOD
             )
         part.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in part.grids]
@@ -145,38 +139,17 @@ class Simulator:
         if self.loop.pid.sample_time is not None or any(self.dither_periods()):
             return self
         part = copy.copy(self)
-        part.grids = [
-            grid.at(spread_instants(grid.t, self._needed_instants(point, g), grid.reference.at))
-            for g, grid in enumerate(self.grids)
-        ]
-        part._is_refined = any(len(new.t) > len(old.t) for new, old in zip(part.grids, self.grids, strict=True))
+        part.grids = refine_grids(self.grids, self.cases_by_grid(), partial(self._signal, point))
+        part._is_refined = part.grids is not self.grids
         return part if part._is_refined else self
 
-    def _needed_instants(self, point: Array, g: int) -> Array:
-        """The instants that the responses of a point need, the cases of one grid together [s]."""
-        found = [self._resolve_response(point, case).t for case in np.flatnonzero(self._grid_of == g).tolist()]
-        t = np.unique(np.concatenate(found))
-        least = 1e-6 * self.grids[g].spacing  # the same instant, but for rounding
-        return np.asarray(t[np.append(True, np.diff(t) > least)])
-
-    def _resolve_response(self, point: Array, case: int) -> ReferenceGrid:
-        """The samples of a case, with others where the response of a point changes fast."""
-        grid: ReferenceGrid = self.grids[self._grid_of[case]]
+    def _signal(self, point: Array, case: int, grid: ReferenceGrid) -> Array | None:
+        """The measured signal of a case at the samples of a grid; None where it runs away."""
         p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
-        for _ in range(MAX_REFINEMENTS):
-            u, t, h = (a[None] for a in grid.pad(len(grid.t)))
-            with np.errstate(all="ignore"):
-                found = self.rollout.run(start, u, p, t, h, substeps=rk4_substeps(self._rate, grid.spacing))
-            signal, reference = found.y[0, :, SIGNAL_OUTPUT], grid.reference
-            if not is_sound(found.y, found.x_end)[0]:
-                return grid
-            finer = refine_instants(
-                grid.t, signal, reference.final, reference.nominal_size, reference.at, SEARCH_TOLERANCE
-            )
-            if finer is None:
-                return grid
-            grid = grid.at(finer)
-        return grid
+        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
+        with np.errstate(all="ignore"):
+            found = self.rollout.run(start, u, p, t, h, substeps=rk4_substeps(self._rate, grid.spacing))
+        return found.y[0, :, SIGNAL_OUTPUT] if is_sound(found.y, found.x_end)[0] else None
 
     def select_cases(self, chosen: Sequence[int]) -> "Simulator":
         """A copy with some of the cases."""
@@ -424,42 +397,3 @@ class Simulator:
 def _select_rows(y: Array, rows: Mask) -> Array:
     """Select rows of responses without changing the memory order, in which time is contiguous."""
     return y if rows.all() else np.moveaxis(np.moveaxis(y, 2, 0)[:, rows], 0, 2)
-
-
-def _rests(cases: Sequence[TuningCase], loop: ClosedLoop, space: Space) -> list[Array | None]:
-    """Of each case the state before the step; references that begin alike share it, as a rest takes milliseconds."""
-    found = dict[tuple[Hashable, ...], Array | None]()
-    keys = [(case.scenario, case.reference.initial, *sorted(case.reference.start.items())) for case in cases]
-    for key, case in zip(keys, cases, strict=True):
-        if key not in found:
-            found[key] = _gain_independent_rest(case, loop, space)
-    return [found[key] for key in keys]
-
-
-def _gain_independent_rest(case: TuningCase, loop: ClosedLoop, space: Space) -> Array | None:
-    """The state before the step, shape (n_states,); None where it depends on the gains."""
-    if not space.names:
-        return case.initial(loop, space.parameters)
-    other = space.from_unit(np.full(len(space.names), 0.7))
-    first, second = (case.initial(loop, space.parameters_at(point)) for point in (space.start, other))
-    scale = np.array([q.nominal for q in loop.states])
-    return first if bool(np.all(np.abs(first - second) <= 1e-9 * scale)) else None
-
-
-def _grids(
-    loop: ClosedLoop,
-    references: Sequence[Step],
-    parameters: ParameterSet,
-    samples_a_period: int = SAMPLES_A_DITHER_PERIOD,
-) -> list[ReferenceGrid]:
-    """The samples of each reference, with so many samples in the period of a continuous dither."""
-    found = []
-    for reference in references:
-        h = sample_spacing(loop, reference, parameters, samples_a_period)
-        run, k = loop_inputs(loop, reference, h), readings_a_sample(loop, reference)
-        number = np.arange(k * (len(run) - 1) + 1)
-        t: Array = np.asarray(number * (h / k), dtype=np.float64)
-        found.append(
-            ReferenceGrid(reference, t, run.matrix(names(loop.inputs))[number // k], h / k, loop.pid.sample_time)
-        )
-    return found
