@@ -189,7 +189,9 @@ def _respond(loop: ClosedLoop, rig: Rig | None, reference: Step, parameters: Par
     if rig is not None:
         return record(rig, run, parameters, initial=start).truth
     count = POINTS_PER_READING * readings_a_sample(loop, reference) * (len(run) - 1) + 1
-    response = simulate(loop, run, parameters, initial=start, t_out=np.linspace(run.t[0], run.t[-1], count), max_steps=inf)
+    response = simulate(
+        loop, run, parameters, initial=start, t_out=np.linspace(run.t[0], run.t[-1], count), max_steps=inf
+    )
     for _ in range(MAX_REFINEMENTS if loop.dither_period(parameters) is None else 0):
         signal, size = response[loop.feedback.name], reference.nominal_size
         finer = refine_instants(response.t, signal, reference.final, size, reference.at)
