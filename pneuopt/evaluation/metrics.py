@@ -86,7 +86,8 @@ def step_metrics(
     -------
     dict of str to float
         RiseTime
-            From 10 to 90 % of the change from `initial` to the final value [s].
+            From 10 to 90 % of the step from `initial` to the reference [s], so that a response that hardly moves has
+            none; NaN where 90 % is never reached. python-control's counts to the final value.
         SettlingTime
             From `start` until the response stays in the band, interpolated linearly [s]. NaN if it never settles: it
             ends outside the band, or enters it for good only in the last 5 % of the record after `start`, where a
@@ -96,7 +97,7 @@ def step_metrics(
             The same of the signal as it is, with a dither's ripple [s]: what an oscilloscope shows. NaN where the
             ripple leaves the band.
         SettlingMin, SettlingMax
-            Range after 90 % is reached [unit].
+            Range after 90 % of the change to the final value is reached [unit].
         Overshoot, OvershootFinal
             Beyond the reference, in % of the step; beyond the final value, in % of the change (python-control's).
         Undershoot
@@ -211,7 +212,7 @@ def batch_metrics(
         is_step=scale is None,
     )
     return {
-        **_rise_metrics(smooth, initial, steady, only),
+        **_rise_metrics(smooth, initial, reference_final, steady, only),
         "SettlingTime": np.where(only_mean, nan, settled),
         "SettlingTimeRaw": settled_raw,
         **(_overshoot_metrics(smooth, steady, reference_final, initial, only) if scale is None else {}),
@@ -312,19 +313,22 @@ def _period_averages(record: _Samples, initial: float, period: float) -> Array:
     return period_mean(record.t, record.y, initial, period, record.t[record.t <= last])
 
 
-def _rise_metrics(record: _Samples, initial: float, steady: Array, only: Collection[str] | None) -> dict[str, Array]:
-    """Time from 10 to 90 % and the range after it; NaN where 90 % is never reached."""
+def _rise_metrics(
+    record: _Samples, initial: float, reference: float, steady: Array, only: Collection[str] | None
+) -> dict[str, Array]:
+    """Time from 10 to 90 % of the step, and the range after 90 % of the change to the final value; NaN without."""
     if not _wants(only, "RiseTime", "SettlingMin", "SettlingMax"):
         return {}
     change = steady - initial
     with np.errstate(all="ignore"):
         z = (record.y - initial) / np.where(change == 0, nan, change)[:, None]
-    reached = (z >= 0.9).any(axis=1)
+        share = (record.y - initial) / np.where(reference == initial, nan, reference - initial)
+    reached, rises = (z >= 0.9).any(axis=1), (share >= 0.9).any(axis=1)
     after = np.arange(len(record.t)) >= np.argmax(z >= 0.9, axis=1)[:, None]
-    rise = _first_crossing_times(record.t, z, 0.9) - _first_crossing_times(record.t, z, 0.1)
+    rise = _first_crossing_times(record.t, share, 0.9) - _first_crossing_times(record.t, share, 0.1)
     lowest, highest = np.where(after, record.y, np.inf).min(axis=1), np.where(after, record.y, -np.inf).max(axis=1)
     return {
-        "RiseTime": np.where(reached, rise, nan),
+        "RiseTime": np.where(rises, rise, nan),
         "SettlingMin": np.where(reached, np.minimum(lowest, steady), nan),
         "SettlingMax": np.where(reached, np.maximum(highest, steady), nan),
     }

@@ -41,7 +41,7 @@ class Row(NamedTuple):
 
 ROWS = {
     "SettlingTime": Row(0.78, '{ band = "2 %", max = "300 ms" }', 0.3),
-    "RiseTime": Row(0.8 * 0.99 / 2, '"200 ms"', 0.2),
+    "RiseTime": Row(0.8 / 2, '"200 ms"', 0.2),
     "Overshoot": Row(20.0, '"5 %"', 0.05),
     "SteadyStateError": Row(1.0, '"2 %"', 0.02),
     "StepEnvelope": Row(0.7, '{ bounds = [["0 s", "-50 %", "150 %"]], max = 0.9 }', 0.9),

@@ -64,8 +64,8 @@ def test_agreement_with_python_control_where_definitions_coincide() -> None:
     for key in ("SettlingMin", "SettlingMax", "Peak", "PeakTime", "SteadyStateValue", "Undershoot"):
         assert ours[key] == pytest.approx(theirs[key], abs=1e-12), key
     assert ours["OvershootFinal"] == pytest.approx(theirs["Overshoot"], abs=1e-9)
-    for key in ("RiseTime", "SettlingTime"):
-        assert ours[key] == pytest.approx(theirs[key], abs=step), key
+    assert ours["SettlingTime"] == pytest.approx(theirs["SettlingTime"], abs=step)
+    assert step_metrics(T, y, 0.9, 0.0)["RiseTime"] == pytest.approx(theirs["RiseTime"], abs=step)
     assert ours["Overshoot"] == pytest.approx(100 * max(0.0, y.max() - 1.0))
 
 
@@ -102,6 +102,14 @@ def test_settling_does_not_hang_on_the_grid(stride: int) -> None:
     y = response()
     fine, coarse = (step_metrics(T[::k], y[::k], 0.9, 0.0, final=0.9) for k in (1, stride))
     assert coarse["SettlingTime"] == pytest.approx(fine["SettlingTime"], abs=0.02 * stride * T[1])
+
+
+def test_the_rise_counts_to_the_reference_so_that_a_design_that_hardly_moves_has_none() -> None:
+    y = 1 - np.exp(-T)
+    assert step_metrics(T, y, 1.0, 0.0)["RiseTime"] == pytest.approx(np.log(9), abs=1e-5)
+    assert step_metrics(T, 0.95 * y, 1.0, 0.0)["RiseTime"] == pytest.approx(np.log(0.85 / 0.05), abs=1e-4)
+    for share in (0.89, 1e-3):
+        assert np.isnan(step_metrics(T, share * y, 1.0, 0.0)["RiseTime"])
 
 
 def test_the_band_lies_where_it_was_asked_for() -> None:

@@ -67,7 +67,7 @@ def column(table: pd.DataFrame, case: str = "0 to 1") -> dict[str, float]:
 @pytest.mark.parametrize(
     "limit",
     [
-        RiseTime(0.12),
+        RiseTime(0.15),
         Ripple(0.002),
         IAE(0.16),
         ISE(0.1),
