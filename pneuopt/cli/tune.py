@@ -74,6 +74,7 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
             plants=plants,
             rig=None if rig is None else read_rig(rig, read_drive(fit)[0], task.loop),
             max_steps=task.max_steps,
+            accept=task.accept,
             method=task.method,
             throw=False,
             progress=report_progress,

@@ -12,6 +12,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
@@ -42,6 +43,9 @@ TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
 _TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method", "budget")
+ACCEPT_KEY = "accept"
+"""Top-level key of the defects with which a design is certified all the same."""
+
 SCENARIO_KINDS = ("corners", "samples", "tolerances")
 _SAMPLE_DEFAULTS = (("count", 20), ("seed", 0))
 _EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
@@ -67,6 +71,8 @@ class Tuning:
         None: the first that suits the loop.
     max_steps : float
         Steps of the simulations that are refused as too many.
+    accept : tuple of Defect
+        Defects with which a design is certified all the same.
     """
 
     loop: ClosedLoop
@@ -77,6 +83,7 @@ class Tuning:
     validation_scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
     method: Method | None = None
     max_steps: float = MAX_STEPS
+    accept: tuple[Defect, ...] = ()
 
 
 def read_tuning(path: str | Path, plant: System) -> Tuning:
@@ -98,7 +105,7 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
         UnitError, UnknownNameError, ModelError or other; the message names file, section and key.
     """
     table = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in TUNED_SECTIONS}
-    check_names("section", table, _TUNING_SECTIONS, str(path))
+    check_names("section", table, (*_TUNING_SECTIONS, ACCEPT_KEY), str(path))
     for name in (n for n in _TUNING_SECTIONS if n != "reference"):
         require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
     require("pid" in table, f"{path}: no controller; add a section [pid]")
@@ -110,7 +117,8 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     method = read_method(table.get("method", {}), f"{path}: [method]")
     references = _references(table, loop, path)
     max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
-    return Tuning(loop, references, parameters, spec, scenarios, validation, method, max_steps)
+    accept = _read_accept(table.get(ACCEPT_KEY, []), f"{path}: {ACCEPT_KEY}")
+    return Tuning(loop, references, parameters, spec, scenarios, validation, method, max_steps, accept)
 
 
 def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") -> None:
@@ -184,6 +192,12 @@ def _read_budget(table: Mapping[str, Any], where: str) -> float:
     steps = read_fixed_value(table, "steps", "1", where) if "steps" in table else MAX_STEPS
     require(steps > 0, f"{where} steps must be positive, got {steps:g}; {MAX_STEPS:g} is usual")
     return steps
+def _read_accept(words: Any, where: str) -> tuple[Defect, ...]:
+    """Read the defects that the user accepts by name."""
+    proper = isinstance(words, list) and all(isinstance(word, str) for word in words)
+    require(proper, f'{where}: write defects in a list before the first section, {ACCEPT_KEY} = ["hunts"]')
+    check_names("defect", words, [defect.value for defect in Defect], where)
+    return tuple(Defect(word) for word in words)
 
 
 def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
