@@ -27,7 +27,8 @@ from .control.sensor import Encoder, SensorLag
 from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
 from .dynamics.stick_slip import EventKind
 from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
-from .evaluation.certificate import Certificate, Defect, Finding, certificate
+from .evaluation.certificate import Certificate, certificate
+from .evaluation.defects import Defect, Finding
 from .evaluation.dither_effect import dither_effect
 from .evaluation.dither_verdict import DitherVerdict, Usefulness, judge_dither
 from .evaluation.energy import EnergyUse

@@ -146,6 +146,31 @@ def simulate_stick_slip(
     return StickSlipResult(run.trajectory(), run.events)
 
 
+def continue_simulation(
+    model: Runnable | HasSystem,
+    inputs: Trajectory,
+    parameters: ParameterSet,
+    initial: Array,
+    *,
+    t_out: ArrayLike | None = None,
+    rtol: float = 1e-10,
+    atol: float = 1e-12,
+) -> tuple[Trajectory, tuple[Contact, ...]]:
+    """Continue a run from the state in which `simulate` ended, to the inputs' end or to the first contact.
+
+    Parameters are those of `simulate`, and a sampled controller has already acted at ``inputs.t[0]``.
+
+    Returns
+    -------
+    trajectory : Trajectory
+        It ends before the instant of a contact with a validity limit.
+    contacts : tuple of Contact
+        What it met there; empty otherwise.
+    """
+    run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), continues=True)
+    return run.trajectory(), met
+
+
 def contacts(trajectory: Trajectory, model: Runnable | HasSystem, parameters: ParameterSet) -> tuple[Contact, ...]:
     """The validity limits that a response reaches, such as an end stop, found between the trajectory's instants.
 
@@ -211,6 +236,8 @@ def _integrate(
     initial: Mapping[str, float] | ArrayLike | None,
     t_out: ArrayLike | None,
     tolerances: tuple[float, float],
+    *,
+    continues: bool = False,
 ) -> tuple[Integration, tuple[Contact, ...]]:
     model = as_runnable(model, "model")
     check_argument("inputs", inputs, Trajectory, "a Trajectory; a log's is its .trajectory")
@@ -218,9 +245,11 @@ def _integrate(
     motion = model.motion()
     system, update = motion.system, compile_function(motion.update) if motion.update is not None else None
     u, grid = input_rows(system.inputs, inputs), _report_times(t_out, inputs.t)
-    x, p = initial_state(model, parameters, initial), parameter_vector(system.parameters, parameters)
+    x = np.array(initial, dtype=float) if continues else initial_state(model, parameters, initial)
+    p = parameter_vector(system.parameters, parameters)
     slack = _time_tolerance(inputs.t)
     breaks, is_sample = _restart_times(inputs.t, u, motion.sample_time, slack)
+    is_sample[0] &= not continues
     rows = u[np.searchsorted(inputs.t, breaks + slack, side="right") - 1]
     run, done = new_integration(system, p, grid, *tolerances), 0
     watch = LimitMonitor(model.plant, parameters, inputs.t[0], x)
@@ -230,6 +259,8 @@ def _integrate(
             until = int(np.searchsorted(grid, end - slack))
             for t in grid[done:until]:
                 watch.advance(run, t)
+                if continues and watch.contacts:
+                    return run, watch.contacts
                 run.record()
             if until == len(grid):
                 break

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.continuation import continue_response
+from pneuopt.evaluation.defects import Defect as Defect  # noqa: PLC0414 - who reads a certificate finds it here
+from pneuopt.evaluation.defects import Ending, Finding, correct_metrics, describe_ending, find_defects
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.metrics import Envelope
@@ -20,36 +22,6 @@ if TYPE_CHECKING:
 
 AT_THE_END = "at the end"
 MARGIN_COLUMNS = tuple(metric.name for metric in METRICS.values() if metric.source is Source.LINEAR_LOOP)
-
-
-class Defect(Enum):
-    """What can be wrong with gains whatever was asked of them; the value is the word that files use."""
-
-    UNSTABLE = "unstable"
-    GROWS = "grows"
-    HUNTS = "hunts"
-    CREEPS = "creeps"
-    NEVER_SETTLES = "never settles"
-    STANDS_STILL = "stands still"
-    MISSES_REFERENCE = "misses reference"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A defect in one case.
-
-    Attributes
-    ----------
-    defect : Defect
-    case : str
-        The case's label, a column of `evaluate`.
-    sentence : str
-        The defect in words, with its figures.
-    """
-
-    defect: Defect
-    case: str
-    sentence: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,16 +72,36 @@ def certificate(
     """
     check_closed_loop(loop)
     found = evaluate_cases(loop, references, parameters, scenarios=scenarios, band=band, envelope=envelope)
-    return judge_evaluations(tuple(found))
+    return judge_evaluations(tuple(found), band)
 
 
-def judge_evaluations(evaluations: Sequence[CaseEvaluation]) -> Certificate:
-    """The certificate of gains that have been evaluated on every case."""
+def judge_evaluations(
+    evaluations: Sequence[CaseEvaluation], band: float, rest_error: float = 0.0, *, continues: bool = True
+) -> Certificate:
+    """The certificate of gains that have been evaluated on every case.
+
+    Parameters
+    ----------
+    evaluations : sequence of CaseEvaluation
+    band : float
+        Half width of the settling band, a fraction of the step.
+    rest_error : float
+        Distance from the reference at which the loop may rest outside the band, a fraction of the step.
+    continues : bool
+        Whether to continue the responses beyond their horizons. Without, the certificate is of the linear loop only,
+        for gains that are refused already.
+    """
     import pandas as pd
 
     margins = [row for found in evaluations for row in _margin_rows(found)]
-    findings = [finding for row in margins for finding in _find_instability(row)]
-    return Certificate(tabulate_metrics(evaluations), tuple(findings), (), pd.DataFrame(margins))
+    findings, notes = [finding for row in margins for finding in _find_instability(row)], list[str]()
+    metrics = tabulate_metrics(evaluations)
+    for found in evaluations if continues else ():
+        ending = Ending(continue_response(found, band), band, found.case.label)
+        findings += find_defects(ending, rest_error)
+        notes += describe_ending(ending, found.metrics)
+        metrics[ending.case] = pd.Series(correct_metrics(ending, found.metrics))
+    return Certificate(metrics, tuple(findings), tuple(notes), pd.DataFrame(margins))
 
 
 def _margin_rows(found: CaseEvaluation) -> Iterator[dict[str, Any]]:

@@ -91,7 +91,9 @@ def margins(open_loop: Linearisation) -> Margins:
 
     omega = frequency_grid(open_loop)
     L = frequency_response(open_loop, omega)
-    gain = _crossing_frequencies(lambda w: float(np.log(abs(response(w)))), omega, np.log(np.abs(L)))
+    with np.errstate(divide="ignore"):  # a controller without gains
+        sizes = np.log(np.abs(L))
+    gain = _crossing_frequencies(lambda w: float(np.log(abs(response(w)))), omega, sizes)
     real = _crossing_frequencies(lambda w: response(w).imag, omega, L.imag)
     phases = [((float(np.angle(response(w), deg=True)) % 360) - 180, w) for w in gain]
     gains = [(1 / abs(z), w) for w in real if (z := response(w)).real < 0]

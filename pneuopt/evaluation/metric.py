@@ -49,6 +49,9 @@ class Metric:
         Remedy that is added to the message about a limit outside them.
     floor : float
         Smaller values count as this one in an objective.
+    resolution : float
+        Difference on the scale of `requirement_value` below which two simulations agree, whatever the value: a share of
+        a measured signal that no instrument shows, and more than the rounding of an integration.
     cost : callable, optional
         Maps the metric to a value that shall be small; needed where the metric itself shall be large.
     headline : bool
@@ -77,6 +80,7 @@ class Metric:
     limits: tuple[float, float] = (0.0, inf)
     advice: str = ""
     floor: float = -inf
+    resolution: float = 1e-6
     cost: Callable[[Any], Any] | None = None
     headline: bool = False
     slope: RowReader | None = None

@@ -64,7 +64,7 @@ class SettlingTime(Requirement):
 
 @final
 class RiseTime(AtMost):
-    """Time from 10 to 90 % of the change to the final value [s]."""
+    """Time from 10 to 90 % of the step [s]; a response that never reaches 90 % of the reference has none."""
 
     metric = Metric("RiseTime", "s", Source.RESPONSE)
 
@@ -81,6 +81,7 @@ class Overshoot(AtMost):
         limits=(0.0, 1.0),
         advice="5 % is 0.05",
         floor=0.0,
+        resolution=1e-5,
         headline=True,
         slope=overshoot_rows,
         exact=True,
@@ -99,6 +100,7 @@ class SteadyStateError(AtMost):
         limits=(0.0, 1.0),
         advice="2 % is 0.02",
         floor=0.0,
+        resolution=1e-5,
         headline=True,
         slope=steady_state_rows,
         exact=True,
@@ -141,21 +143,21 @@ class StepEnvelope(Requirement):
 class IAE(AtMost):
     """Integral of the absolute error from the step to the end of the horizon, over the step's size [s]."""
 
-    metric = Metric("IAE", "s", Source.RESPONSE, slope=iae_rows)
+    metric = Metric("IAE", "s", Source.RESPONSE, resolution=1e-7, slope=iae_rows)
 
 
 @final
 class ISE(AtMost):
     """Integral of the squared error from the step to the end of the horizon, over the square of the step's size [s]."""
 
-    metric = Metric("ISE", "s", Source.RESPONSE, slope=ise_rows)
+    metric = Metric("ISE", "s", Source.RESPONSE, resolution=1e-7, slope=ise_rows)
 
 
 @final
 class ITAE(AtMost):
     """Integral of the absolute error times the time since the step, over the step's size [s^2]."""
 
-    metric = Metric("ITAE", "s^2", Source.RESPONSE, slope=itae_rows)
+    metric = Metric("ITAE", "s^2", Source.RESPONSE, resolution=1e-8, slope=itae_rows)
 
 
 @final
@@ -176,7 +178,7 @@ class ControlRate(AtMost):
 class Ripple(AtMost):
     """Peak to peak of the raw signal over the last 5 % of the record, or of a dither's ripple if larger [its unit]."""
 
-    metric = Metric("Ripple", "{measured}", Source.RESPONSE)
+    metric = Metric("Ripple", "{measured}", Source.RESPONSE, resolution=1e-8)
 
 
 @final

@@ -102,6 +102,11 @@ class Specification:
         """Weighted sum of values by metric, as `requirement_values` gives them."""
         return sum(weight * values[metric_name(q)] for q, weight in self.weights.items())
 
+    @property
+    def resolution(self) -> float:
+        """Difference of the objective below which two simulations agree: its terms' resolutions, weighted."""
+        return sum(weight * q.metric.resolution for q, weight in self.weights.items())
+
     def violations(self, values: Mapping[str, float], slack: float = 0.0) -> tuple[Requirement, ...]:
         """Limits that `values` violate, which a NaN does too; `slack` is relative to the limit."""
         return tuple(q for q in self.limits if not values[metric_name(q)] <= upper_limit(q) * (1 + slack))

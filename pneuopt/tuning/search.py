@@ -10,16 +10,11 @@ from pneuopt.evaluation.requirements import metric_name
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.tuning.certifier import MAX_CERTIFIED_EXCESS, Certifier
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.relaxation import relax_all, relaxation_row, relaxation_specification
 from pneuopt.tuning.responses import to_records
-from pneuopt.tuning.result import (
-    MAX_CERTIFIED_EXCESS,
-    Certifier,
-    TuningResult,
-    relaxation_share,
-    with_relaxations,
-)
+from pneuopt.tuning.result import TuningResult, relaxation_share, with_relaxations
 from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space

@@ -1,18 +1,44 @@
-"""What a certificate refuses, whatever was asked of a design."""
+"""What a certificate refuses, whatever was asked of a design, and the figures of designs that it certifies."""
 
+from collections.abc import Mapping
+from functools import cache
+
+import casadi as ca
 import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.simulate import continue_simulation, simulate
+from pneuopt.dynamics.system import System, define
+from pneuopt.evaluation import continuation
 from pneuopt.evaluation.certificate import Certificate, Defect, certificate
-from pneuopt.models.linear import SecondOrder
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.evaluation.continuation import continue_response
+from pneuopt.evaluation.evaluate import evaluate_cases
+from pneuopt.evaluation.response import loop_inputs
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.models.linear import FirstOrder, SecondOrder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+from pneuopt.quantities.trajectories import Trajectory
+
+Signals = Mapping[str, ca.SX]
+GAIN, TIME_CONSTANT = 1.0, 0.1  # of the first-order plants below [m/s/V], [s]
 
 
 def second_order(Kp: float, Ki: float) -> tuple[ClosedLoop, ParameterSet]:
     loop = ClosedLoop(SecondOrder().system(), PID(limits=False))
     return loop, loop.parameters.with_values({"pid.Kp": Kp, "pid.Ki": Ki})
+
+
+def first_order(Kp: float, Ki: float, sample_time: float | None = None) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=sample_time, limits=False))
+    values = {"plant.gain": GAIN, "plant.time_constant": TIME_CONSTANT, "pid.Kp": Kp, "pid.Ki": Ki}
+    return loop, loop.parameters.with_values(values)
 
 
 def routh_limit(parameters: ParameterSet, Kp: float) -> float:
@@ -21,15 +47,145 @@ def routh_limit(parameters: ParameterSet, Kp: float) -> float:
     return float(2 * d * w * (1 + K * Kp) / K)
 
 
+def with_a_hidden_mode(rate: float) -> System:
+    """A lag with a second, weakly excited mode that grows at this rate [1/s]: nothing of it shows within a second."""
+
+    def ode(_t: ca.SX, x: Signals, u: Signals, _p: Signals) -> tuple[Signals, Signals]:
+        rates = {"lag": (u["command"] - x["lag"]) / 0.02, "mode": rate * x["mode"] + 1e-5 * u["command"]}
+        return rates, {"speed": x["lag"] + x["mode"]}
+
+    states = (Quantity("lag", "m/s"), Quantity("mode", "m/s"))
+    return define(states, (Quantity("command", "V"),), (Quantity("speed", "m/s"),), ParameterSet(), ode)
+
+
+def position_loop(Kp: float, Ki: float, Kd: float) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(), measured="position")
+    gains = {"pid.Kp": Kp, "pid.Ki": Ki, "pid.Kd": Kd, "pid.Tf": 2e-3, "pid.lower": -500.0, "pid.upper": 500.0}
+    return loop, loop.parameters.with_values(gains)
+
+
 def defects(found: Certificate) -> list[Defect]:
     return [finding.defect for finding in found.findings]
+
+
+@cache
+def hunting() -> Certificate:
+    return certificate(position_loop(1, 1, 1)[0], Step(0.05), position_loop(2000.0, 20000.0, 100.0)[1])
 
 
 def test_a_loop_on_either_side_of_the_limit_of_stability() -> None:
     loop, values = second_order(0.5, 1.0)
     limit = routh_limit(values, 0.5)
-    found = [certificate(loop, Step(1.0), second_order(0.5, share * limit)[1]) for share in (0.3, 1.05)]
-    assert Defect.UNSTABLE not in defects(found[0])
-    assert Defect.UNSTABLE in defects(found[1])
-    assert "unstable" in found[1].findings[0].sentence
-    assert np.array_equal([bool(np.all(f.margins["stable"])) for f in found], [True, False])
+    stable, unstable = (certificate(loop, Step(1.0), second_order(0.5, share * limit)[1]) for share in (0.3, 1.05))
+    assert defects(stable) == []
+    assert defects(unstable) == [Defect.UNSTABLE, Defect.GROWS]
+    assert "unstable" in unstable.findings[0].sentence
+    assert [bool(np.all(f.margins["stable"])) for f in (stable, unstable)] == [True, False]
+
+
+def test_what_grows_beyond_the_horizon_is_found() -> None:
+    loop = ClosedLoop(with_a_hidden_mode(2.0), PID(limits=False))
+    values = loop.parameters.with_values({"pid.Kp": 0.5, "pid.Ki": 40.0})
+    found = certificate(loop, Step(1.0), values)
+    assert Defect.GROWS in defects(found)
+    assert np.isnan(found.metrics["0 to 1"]["SettlingTime"])
+    assert next(evaluate_cases(loop, Step(1.0), values)).metrics["SettlingTime"] < 0.3
+
+
+@pytest.mark.parametrize(
+    ("Kp", "Ki", "defect", "words"),
+    [
+        (0.0, 0.0, Defect.STANDS_STILL, "moved by 0 % of the step"),
+        (1.0, 0.0, Defect.MISSES_REFERENCE, "rests 50 % of the step away"),
+        (1.0, 0.05, Defect.CREEPS, "still moving"),
+    ],
+)
+def test_a_loop_that_does_not_arrive(Kp: float, Ki: float, defect: Defect, words: str) -> None:
+    found = certificate(*_at(Step(1.0), first_order(Kp, Ki)))
+    assert defects(found) == [defect]
+    assert words in found.findings[0].sentence
+
+
+def _at(step: Step, case: tuple[ClosedLoop, ParameterSet]) -> tuple[ClosedLoop, Step, ParameterSet]:
+    return case[0], step, case[1]
+
+
+def test_a_disturbance_that_hardly_moves_the_loop_is_no_standstill() -> None:
+    loop, values = first_order(20.0, 200.0)
+    push = Step(0.0, initial=1.0, disturbance={"valve_voltage": 0.5})
+    assert defects(certificate(loop, push, values)) == []
+
+
+def test_a_drive_that_sticks_and_slips_hunts() -> None:
+    assert defects(hunting()) == [Defect.HUNTS]
+    assert "limit cycle" in hunting().findings[0].sentence
+    assert np.isnan(hunting().metrics["0 to 0.05"]["SettlingTime"])
+
+
+def test_an_undecided_response_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(continuation, "MAX_CONTINUATION_INSTANTS", 1500)
+    found = certificate(*_at(Step(0.05), position_loop(2000.0, 20000.0, 100.0)))
+    assert defects(found) == [Defect.UNDECIDED]
+    assert "budget" in found.findings[0].sentence
+
+
+def test_a_response_that_settles_later_says_so() -> None:
+    loop, values = first_order(1.0, 10.0)  # a pole-zero cancellation: 1/(0.1 s), settled after ln(50)/10 s
+    short, long = (certificate(loop, Step(1.0, horizon=h), values) for h in (0.2, 1.0))
+    assert defects(short) == defects(long) == []
+    assert "beyond the horizon" in short.notes[0]
+    assert long.notes == ()
+
+
+def test_a_settled_linear_loop_is_not_simulated_any_longer() -> None:
+    loop, step, values = _at(Step(1.0), first_order(2.0, 20.0))
+    course = continue_response(next(evaluate_cases(loop, step, values)), 0.02)
+    assert course.t[-1] == pytest.approx(1.0)
+    assert course.is_decided(0.02)
+
+
+def test_the_stroke_may_end_first() -> None:
+    loop = ClosedLoop(PneumaticDrive(friction=Stribeck()).system(), PID())
+    gains = {"pid.Kp": 1.0, "pid.Ki": 20.0, "pid.Kd": 0.03, "pid.Tf": 3e-3, "pid.lower": -5.0, "pid.upper": 5.0}
+    values = loop.parameters.with_values(gains)
+    found = certificate(loop, Step(0.2, horizon=0.4, start={"position": 0.05}), values)
+    ends = [note for note in found.notes if "end stop" in note]
+    assert len(ends) == 1
+    assert "position 199.9 mm" in ends[0]
+
+
+@pytest.mark.parametrize("sample_time", [None, 5e-3])
+def test_a_continued_run_is_the_run_that_was_not_cut(sample_time: float | None) -> None:
+    loop, values = first_order(1.0, 8.0, sample_time)
+    full = loop.complete(values)
+    run = loop_inputs(loop, Step(1.0, horizon=0.4), 5e-3)
+    whole = simulate(loop, run, full)
+    half = len(run) // 2
+    first = Trajectory(run.t[: half + 1], {n: run[n][: half + 1] for n in run})
+    second = Trajectory(run.t[half:], {n: run[n][half:] for n in run})
+    state = np.array([simulate(loop, first, full)[q.name][-1] for q in loop.states])
+    rest, met = continue_simulation(loop, second, full, state)
+    assert met == ()
+    for n in ("speed", "control"):
+        assert rest[n] == pytest.approx(whole[n][half:], abs=1e-8)
+
+
+@pytest.mark.parametrize(("Kp", "Ki"), [(2.0, 40.0), (1.0, 40.0), (0.4, 9.0)])
+def test_certified_figures_are_those_of_a_plain_integration(Kp: float, Ki: float) -> None:
+    """The plant and the controller are written out here, and SciPy's DOP853 integrates them."""
+
+    def rates(_t: float, x: Array) -> list[float]:
+        error = 1.0 - x[0]
+        command = Kp * error + x[1]
+        return [(GAIN * command - x[0]) / TIME_CONSTANT, Ki * error, abs(error), _t * abs(error)]
+
+    t = np.linspace(0.0, 1.0, 20001)
+    run = solve_ivp(rates, (0.0, 1.0), np.zeros(4), method="DOP853", t_eval=t, rtol=1e-11, atol=1e-13)
+    error = run.y[0] - 1.0
+    found = certificate(*_at(Step(1.0), first_order(Kp, Ki)))
+    assert found.findings == ()
+    ours = found.metrics["0 to 1"]
+    assert ours["SettlingTime"] == pytest.approx(t[np.flatnonzero(np.abs(error) > 0.02)[-1]], abs=1e-4)
+    assert ours["Overshoot"] == pytest.approx(100 * max(0.0, error.max()), abs=1e-4)
+    assert ours["IAE"] == pytest.approx(run.y[2, -1], abs=1e-6)
+    assert ours["ITAE"] == pytest.approx(run.y[3, -1], abs=1e-6)

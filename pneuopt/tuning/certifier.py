@@ -1,0 +1,189 @@
+"""`Certifier`: the certificate of a search's point, its independent figures beside the search's claim."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pneuopt.evaluation.certificate import Certificate, judge_evaluations
+from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
+from pneuopt.evaluation.requirements import (
+    METRICS,
+    REQUIREMENT_KINDS,
+    SteadyStateError,
+    describe_value,
+    metric_name,
+    requirement_values,
+)
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.provenance import provenance
+from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.method import Method, SearchResult, TuningTask
+from pneuopt.tuning.responses import worst_values
+from pneuopt.tuning.result import RELAXATION_COLUMNS, TuningResult, requirement_table
+from pneuopt.tuning.simulator import Simulator
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Relative difference of the certified from the claimed objective that a certificate allows, up or down. A smaller one
+# refuses designs for the search's coarser samples; a larger one certifies designs whose response grazes the band, and
+# claims that the search has misread.
+MAX_CERTIFIED_EXCESS = 0.01
+# Defects that a status tells: fewer hide that there are several; more bury the remedy.
+MAX_DEFECTS_TOLD = 3
+TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.metric.headline)
+
+
+@dataclass(frozen=True, eq=False)
+class Certifier:
+    """Make the certificate of a point: its independent simulation, beside the claim of the search.
+
+    Parameters
+    ----------
+    task : TuningTask
+    method : Method
+        Named in the provenance.
+    """
+
+    task: TuningTask
+    method: Method
+
+    def certify(self, simulator: Simulator, found: SearchResult, point: Array) -> TuningResult:
+        """Simulate a point by both simulations; the result has its gains where the certificate holds."""
+        import pandas as pd
+
+        parameters = self.task.space.parameters_at(point)
+        ripple = ("SettlingTimeRaw", "Ripple") if self.task.loop.dither_period(parameters) else ()
+        shown = [n for n in METRICS if n in (*TABLE_METRICS, *ripple, *self.task.spec.kinds)]
+        rows = zip(simulator.cases, simulator.table(point, self.task.spec), strict=True)
+        claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
+        try:
+            evaluations, contacts = self._evaluate(parameters)
+            first = self._compare(found, claimed, tabulate_metrics(evaluations).loc[shown])
+            proof = self._judge(evaluations, continues=first.converged and not contacts)
+            slopes, certified = _friction_slopes(proof.metrics), proof.metrics.loc[shown]
+            status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, proof)
+        except ConvergenceError as error:
+            proof, certified, contacts, slopes = None, claimed * np.nan, [], {}
+            status = Status(Code.NOT_CERTIFIED, (str(error),))
+        deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
+        values = dict(zip(self.task.space.names, point.tolist(), strict=True))
+        contact_count = {"contacts": float(len(contacts))} if contacts else {}
+        rejected = {} if status.converged else {f"rejected.{n}": v for n, v in values.items()}
+        return TuningResult(
+            self.task.space.parameters.with_values(values) if status.converged else self.task.space.parameters,
+            claimed,
+            certified,
+            requirement_table(self.task.spec, claimed, certified, found.active),
+            pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.task.space.names], dtype=float),
+            found.active,
+            status,
+            {**found.stats, **deviation, **contact_count, **rejected, **slopes},
+            provenance(
+                self.method,
+                *self.task.spec.weights,
+                *self.task.spec.limits,
+                *self.task.references,
+                *self.task.scenarios.items(),
+            ),
+            proof,
+        )
+
+    def _evaluate(self, parameters: ParameterSet) -> tuple[tuple[CaseEvaluation, ...], list[str]]:
+        """Every case over its horizon, and the warnings of end stops and emptied chambers that the responses met."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", PhysicsWarning)
+            found = evaluate_cases(
+                self.task.loop,
+                self.task.references,
+                parameters,
+                scenarios=self.task.scenarios,
+                band=self.task.spec.band,
+                envelope=self.task.spec.envelope,
+            )
+            return tuple(found), [str(w.message) for w in caught if issubclass(w.category, PhysicsWarning)]
+
+    def _judge(self, evaluations: Sequence[CaseEvaluation], *, continues: bool) -> Certificate:
+        """The certificate; a rest off the reference is allowed as far as a limit on SteadyStateError says."""
+        allowed = self.task.spec.limit(SteadyStateError)
+        rest_error = allowed if np.isfinite(allowed) else 0.0
+        return judge_evaluations(evaluations, self.task.spec.band, rest_error, continues=continues)
+
+    def _certificate_status(self, found: SearchResult, claimed: "pd.DataFrame", proof: Certificate) -> Status:
+        """Whether the independent evaluation confirms the search, and finds no defect that is not accepted."""
+        status = self._compare(found, claimed, proof.metrics.loc[claimed.index])
+        defects = dict.fromkeys(f.sentence for f in proof.findings if f.defect not in self.task.accept)
+        if not found.status.converged or not defects:
+            return status if status.converged else status.with_details(*proof.notes[:MAX_DEFECTS_TOLD])
+        words = dict.fromkeys(f.defect.value for f in proof.findings if f.defect not in self.task.accept)
+        remedy = f"limit SettlingTime or MaxSensitivity, or accept it by name: {', '.join(map(repr, words))}"
+        broken = () if status.converged else status.sentences[:1]
+        return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_DEFECTS_TOLD], *broken, remedy))
+
+    def _compare(self, found: SearchResult, claimed: "pd.DataFrame", certified: "pd.DataFrame") -> Status:
+        """Whether the certified metrics keep the limits and agree with the claimed objective."""
+        if not found.status.converged:
+            return found.status
+        spec = self.task.spec
+        claim, proof = (worst_values([requirement_values(dict(f[r])) for r in f]) for f in (claimed, certified))
+        for q in spec.violations(proof):
+            n, (value, allowed) = metric_name(q), describe_value(q, proof[metric_name(q)])
+            claim_text = f"claimed {describe_value(q, claim[n])[0]}"
+            verdict = f"{n} is {value}{self._worst_case(certified, n)}, {allowed}, {claim_text}"
+            return Status(Code.NOT_CERTIFIED, (verdict, f"give {n} more room"))
+        for n in (metric_name(q) for q in spec.weights if np.isnan(proof[metric_name(q)])):
+            verdict = f"{n} has no value{self._worst_case(certified, n)}, claimed {claim[n]:.6g}"
+            return Status(Code.NOT_CERTIFIED, (verdict, "give the limits more room, or lengthen the horizon"))
+        ours, theirs = spec.objective(proof), spec.objective(claim)
+        if not objectives_agree(ours, theirs, found.stats["optimum"], spec.resolution):
+            verdict = f"the objective is {ours:.6g}, claimed {min(theirs, found.stats['optimum']):.6g}"
+            cause = "the optimum grazes the band, or does not survive rounding, or the search misread it"
+            return Status(Code.NOT_CERTIFIED, (verdict, cause, "ask for more digits or a wider band"))
+        agreeing = (
+            f", {found.stats['starts_agreeing']:.0f} of {found.stats['starts']:.0f} starts agree"
+            if "starts" in found.stats
+            else ""
+        )
+        return Status(Code.CONVERGED, (f"certified objective {ours:.6g}, claimed {theirs:.6g}{agreeing}",))
+
+    def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
+        """The words " at" and the worst case of a metric, where there are several cases."""
+        values = requirement_values({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
+        k = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
+        return f" at {certified.columns[k]}" if len(values) > 1 else ""
+
+
+def objectives_agree(certified: float, claimed: float, optimum: float, resolution: float) -> bool:
+    """Whether a certified objective is no worse than the claim and the optimum before rounding, and not far better.
+
+    A claim far above the certificate is as wrong as one far below: the search has then compared other figures than
+    those of the response. Near zero, where no relative difference counts, `resolution` decides.
+
+    Examples
+    --------
+    >>> objectives_agree(4e-16, 0.0, 0.0, 1e-6)
+    True
+    >>> objectives_agree(0.3, 0.4, 0.4, 1e-6), objectives_agree(0.4, 0.3, 0.3, 1e-6)
+    (False, False)
+    """
+    lowest, highest = claimed, min(claimed, optimum)
+    above = lowest - MAX_CERTIFIED_EXCESS * abs(lowest) - resolution
+    below = highest + MAX_CERTIFIED_EXCESS * abs(highest) + resolution
+    return above <= certified <= below
+
+
+def _friction_slopes(certified: "pd.DataFrame") -> dict[str, float]:
+    """The slope of friction with which each case's margins are read [N s/m, or N m s/rad]."""
+    rows = certified.loc[[n for n in certified.index if n == "FrictionSlope"]]
+    return {f"friction_slope[{case}]": float(v) for case, column in rows.items() for v in column}
+
+
+def _contact_status(contacts: Sequence[str]) -> Status:
+    """The status of a design whose response meets an end stop or empties a chamber, where the model no longer holds."""
+    remedy = "shorten the horizon, take a smaller step, or start elsewhere, Step(..., start={'position': ...})"
+    return Status(Code.NOT_CERTIFIED, (*dict.fromkeys(contacts), remedy))
