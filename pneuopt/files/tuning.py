@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
-_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method", "budget")
 ACCEPT_KEY = "accept"
 """Top-level key of the defects with which a design is certified all the same."""
 
+_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method", "budget")
 SCENARIO_KINDS = ("corners", "samples", "tolerances")
 _SAMPLE_DEFAULTS = (("count", 20), ("seed", 0))
 _EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
@@ -192,6 +192,8 @@ def _read_budget(table: Mapping[str, Any], where: str) -> float:
     steps = read_fixed_value(table, "steps", "1", where) if "steps" in table else MAX_STEPS
     require(steps > 0, f"{where} steps must be positive, got {steps:g}; {MAX_STEPS:g} is usual")
     return steps
+
+
 def _read_accept(words: Any, where: str) -> tuple[Defect, ...]:
     """Read the defects that the user accepts by name."""
     proper = isinstance(words, list) and all(isinstance(word, str) for word in words)
