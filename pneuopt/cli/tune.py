@@ -44,7 +44,7 @@ from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bo
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import Code
+from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import TuningResult, tune
 
@@ -62,23 +62,8 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     remedy = 'add [minimise] with settling_time = { band = "2 %" }'
     require(bool(task.specification.weights), f"{tuning}: has nothing to minimise; {remedy}")
     require(len(task.parameters.free_names) > 0, f"{tuning}: no gain is free; mark what to tune with free = true")
-    complete, covariance = task.loop.complete(parameters), read_covariance(fit)
-    plants = expected_plants(complete, covariance, scenarios=task.validation_scenarios(parameters))
     with progress("tuning", quiet=quiet) as report_progress:
-        result = tune(
-            task.loop,
-            task.references,
-            parameters,
-            minimise=task.specification,
-            scenarios=task.scenarios(parameters),
-            plants=plants,
-            rig=None if rig is None else read_rig(rig, read_drive(fit)[0], task.loop),
-            max_steps=task.max_steps,
-            accept=task.accept,
-            method=task.method,
-            throw=False,
-            progress=report_progress,
-        )
+        result = _tune_task(task, parameters, fit, rig, report_progress)
     result = replace(result, provenance={**result.provenance, **file_hashes(*inputs)})
     console, shown = make_console(), dict[str, Any]()
     show_status(console, result.status)
@@ -99,6 +84,27 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
         before_gains = parameters if result.status.converged else None
         writers |= figure_writers(outputs.plot, _loop_figures(task, result.parameters, before_gains))
     return finish(outputs, writers, _tuning_tables(result) | shown | stats_and_provenance(result), result.status)
+
+
+def _tune_task(
+    task: Tuning, parameters: ParameterSet, fit: Path, rig: Path | None, report_progress: ProgressCallback
+) -> TuningResult:
+    """Tune what a file describes, for the plants to be expected of its fit."""
+    complete, covariance = task.loop.complete(parameters), read_covariance(fit)
+    return tune(
+        task.loop,
+        task.references,
+        parameters,
+        minimise=task.specification,
+        scenarios=task.scenarios(parameters),
+        plants=expected_plants(complete, covariance, scenarios=task.validation_scenarios(parameters)),
+        rig=None if rig is None else read_rig(rig, read_drive(fit)[0], task.loop),
+        max_steps=task.max_steps,
+        accept=task.accept,
+        method=task.method,
+        throw=False,
+        progress=report_progress,
+    )
 
 
 def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
