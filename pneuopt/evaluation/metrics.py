@@ -173,6 +173,7 @@ def batch_metrics(
     averaged: Array | None = None,
     scale: float | None = None,
     meter: Mapping[str, Array] | None = None,
+    wider: Sequence[float] = (),
 ) -> dict[str, Array]:
     """Compute the metrics of many step responses on one grid at once; see `step_metrics`.
 
@@ -187,6 +188,8 @@ def batch_metrics(
         Means over the dither's period at the first k samples from the step on, where they are known already.
     meter : mapping of str to ndarray, shape (m, n), optional
         Channels of the plant's meter.
+    wider : sequence of float, optional
+        Further settling bands, whose times are "SettlingTimes", shape (m, len(wider)).
 
     Returns
     -------
@@ -219,6 +222,7 @@ def batch_metrics(
         **({} if scale is None else _deviation_metrics(smooth, reference_final, scale)),
         "SteadyStateValue": steady,
         **({"Ripple": np.maximum(ripple, np.ptp(tail(raw.t, raw.y), axis=1))} if _wants(only, "Ripple") else {}),
+        **({"SettlingTimes": _times_in_bands(smooth, centre, width, np.divide(wider, band))} if wider else {}),
         **{name: _largest(name, record) for name in ROW_METRICS if _wants(only, name) and _is_shown(name, record)},
     }
 
@@ -342,6 +346,11 @@ def _first_crossing_times(t: Array, z: Array, level: float) -> Array:
     with np.errstate(all="ignore"):
         between = t[before] + (t[k] - t[before]) * (level - low) / (high - low)
     return np.asarray(np.where(k == 0, t[0], between))
+
+
+def _times_in_bands(record: _Samples, centre: Array, width: Array, factors: Array) -> Array:
+    """Settling times in bands wider by some factors, shape (m, n_factors)."""
+    return np.stack([_settling_times(record, centre, factor * width) for factor in factors], axis=1)
 
 
 def _settling_times(record: _Samples, centre: Array, width: Array) -> Array:

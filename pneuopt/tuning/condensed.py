@@ -15,15 +15,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.requirements import ROBUSTNESS_REQUIREMENTS, metric_name
+from pneuopt.evaluation.requirements import ROBUSTNESS_REQUIREMENTS
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
-from pneuopt.tuning.linearised import SMOOTH_REQUIREMENTS, LinearisedProblem, sensitivity_rollout
+from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.polish import PROGRAM_MARGIN, nonsmooth_terms
 from pneuopt.tuning.responses import to_records
 from pneuopt.tuning.screening import (
     SIMULATION_PEAK_MARGIN,
@@ -40,19 +40,12 @@ from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 from pneuopt.tuning.sqp import SQP, LinearisedPoint, descend
 
-# Free parameters that no gradient serves: the averaging time moves with the frequency, and a clip that no response
-# meets has derivative zero.
-NONSMOOTH_PARAMETERS = ("dither.frequency", "pid.Tt", "pid.lower", "pid.upper")
-QUANTISER_PARAMETERS = ("sensor.resolution",)  # an encoder's: its counts make responses piecewise flat
 # Gains up to which one plant is tuned without gradients. A lower number sends small problems, which a screening solves
 # as well, to the gradients; a higher one costs time: with eight gains on a drive with friction it takes twice as long.
 MAX_SCREENING_GAINS = 6
 # Distance below which two points count as one, a fraction of each gain's range. A smaller one lets one optimum take
 # several of the places in `keep`; a larger one merges optima that differ in the dither.
 MIN_POINT_DISTANCE = 0.03
-# Share by which the programs' band and limits are tighter than the search's. With less, a solution, which lies on its
-# limits, breaks them between the nodes; more gives performance away.
-PROGRAM_MARGIN = 0.005
 MAX_PENALTY_RAISES = 2  # times that the penalties are raised tenfold where limits stay broken; more slow each program
 # Points by which the scenarios are ranked. Fewer rank them by chance; each more costs a simulation of every case.
 RANKING_POINTS = 12
@@ -135,13 +128,13 @@ class Condensed:
 
     def check(self, task: TuningTask) -> None:
         """Refuse requirements and parameters without a gradient: `InputError` names them and the remedy."""
-        strange = _nonsmooth_terms(task)
+        strange = nonsmooth_terms(task.loop, task.space, task.spec)
         require(not strange, f"Condensed has no gradient for {', '.join(strange)}; use method=Racing()")
 
     def suits(self, task: TuningTask) -> bool:
         """Whether there are scenarios or many gains, and gradients of all requirements to all that is free."""
         many = bool(task.scenarios) or len(task.space.names) > MAX_SCREENING_GAINS
-        return many and not _nonsmooth_terms(task)
+        return many and not nonsmooth_terms(task.loop, task.space, task.spec)
 
     def find(
         self,
@@ -162,21 +155,6 @@ class Condensed:
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
         """No path: each set of limits needs a new search."""
-
-
-def _nonsmooth_terms(task: TuningTask) -> list[str]:
-    """The names of requirements without a gradient, and of free parameters to which there is none."""
-    return [*_nonsmooth_requirements(task.spec), *_nonsmooth_parameters(task.space, task.loop)]
-
-
-def _nonsmooth_requirements(spec: Specification) -> list[str]:
-    return [metric_name(q) for q in (*spec.weights, *spec.limits) if not isinstance(q, SMOOTH_REQUIREMENTS)]
-
-
-def _nonsmooth_parameters(space: Space, loop: ClosedLoop) -> list[str]:
-    jumping = {f"{c.section}.{n}" for c in loop.compensators for n in c.without_gradient}
-    counted = [f"{n} (an encoder's counts)" for n in QUANTISER_PARAMETERS if n in space.parameters]
-    return [n for n in space.names if n in NONSMOOTH_PARAMETERS or n in jumping] + counted
 
 
 def run_gradient_search(

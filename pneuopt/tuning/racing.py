@@ -15,10 +15,11 @@ import numpy as np
 
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.specification import Specification
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race, may_be_cut
 from pneuopt.tuning.screening import (
     SIMULATION_PEAK_MARGIN,
@@ -29,15 +30,25 @@ from pneuopt.tuning.screening import (
 from pneuopt.tuning.shade import SuccessHistory
 from pneuopt.tuning.simulator import Simulator
 
-# Shares of the trials that the phases get: wide bands and the band asked for on coarse samples, then fine samples. Less
-# for the first ends in the nearest optimum; less for the last leaves an optimum of the coarse samples.
-PHASE_SHARES = (0.5, 0.3, 0.2)
+# Shares of the trials that the starts get on coarse samples; the rest is for fine ones. Less for the first ends in the
+# nearest optimum, less for the second is no second opinion, less for the rest leaves an optimum of the coarse samples.
+START_SHARES = (0.5, 0.35)
+# Shares of a start's trials over all bands, and over the nearest wider one. Less ends in the nearest optimum; more
+# leaves the band asked for too few.
+BAND_SHARES = (0.4, 0.25)
 # Generations over which the best merit must improve by this share for a phase to go on, and the spread of the whole
 # population, a share of its best, below which it ends. Shorter or larger ends a search that still advances.
 PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 25, 1e-3, 1e-4
-# Share of the population that the phase on fine samples keeps. Fewer lose the optimum where coarse and fine samples
-# rank points differently; each more costs fine simulations.
-FINE_SHARE = 0.5
+# Members of the phase on fine samples. Fewer lose the optimum where coarse and fine samples rank points differently;
+# each more costs fine simulations.
+FINE_MEMBERS = 20
+# Best points of the first start from which the second one begins, and its amplitudes, a share of their range: hardly
+# any dither, where optima lie that a population with dither does not see.
+FEW_BEST, NO_DITHER = 6, 0.02
+# Points, as far from each other as this share of a gain's range, that gradients improve at a time. Fewer or farther
+# ones miss basins; each more costs a descent, and closer ones end in the same point.
+POLISHED, MIN_DISTANCE = 4, 0.03
+AGREEMENT = 0.01  # relative difference of two starts' merits that count as one: larger ones hide a second optimum
 # Best settling times, and shares of the horizon, that a race sees of each response, whichever is longer. Less takes for
 # settled what leaves the band later; more simulates what seldom changes a merit. Each new best is proved on the whole.
 CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15
@@ -56,6 +67,8 @@ class Racing:
         Trials for each free gain, at most: a search ends sooner where it no longer advances.
     bands : tuple of float
         Settling bands over which the first phase takes the mean settling time, as multiples of the one asked for.
+    polish : int
+        Iterations by gradients from each of the best points, where there are gradients of all that is asked for.
     margin : float
         How much tighter the search's limits are than those asked for, a fraction.
     seed : int
@@ -65,8 +78,9 @@ class Racing:
     """
 
     members: int = 40
-    trials: int = 900
+    trials: int = 600
     bands: tuple[float, ...] = (1.5, 2.5, 5.0)
+    polish: int = 20
     margin: float = 0.015
     seed: int = 0
     digits: int | None = 4
@@ -77,6 +91,7 @@ class Racing:
     def __post_init__(self) -> None:
         require(self.members >= 5, f"Racing: members must be at least 5, got {self.members}")
         require(self.trials >= 1, f"Racing: trials must be at least 1, got {self.trials}")
+        require(self.polish >= 0, f"Racing: polish must not be negative, got {self.polish}")
         require(all(b > 1 for b in self.bands), f"Racing: bands are multiples of the one asked for, got {self.bands}")
         require(0 <= self.margin < 1, f"Racing: margin is a fraction below 1, got {self.margin}")
         require(self.digits is None or self.digits >= 2, f"Racing: digits must be at least 2, got {self.digits}")
@@ -104,22 +119,46 @@ class Racing:
         """Search for the best point, from one that is close where a certificate has failed; see `Method.find`."""
         method = replace(self, bands=(), trials=max(1, self.trials // 3)) if attempt else self
         best = run_racing(task, simulator, spec, method, start, progress)
-        return screening_result(task, simulator, spec, best)
+        result = screening_result(task, simulator, spec, BestPoint(best.point, best.count, best.is_complete))
+        starts = {"starts": float(best.starts), "starts_agreeing": float(best.agreeing)}
+        return replace(result, stats={**result.stats, **starts})
 
     def shorten(self, margin: float) -> "Racing":
         """The method for a short search from a point that is close."""
-        return Racing(24, max(1, self.trials // 6), (), margin, digits=self.digits)
+        return Racing(24, max(1, self.trials // 6), (), self.polish, margin, digits=self.digits)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
         """No path: each set of limits needs a new search."""
 
 
+@dataclass(frozen=True, eq=False)
+class RacingResult:
+    """What a search found.
+
+    Parameters
+    ----------
+    point : ndarray, shape (n,)
+        The gains with the least merit.
+    count : int
+        Candidates simulated.
+    is_complete : bool
+        False where Ctrl-C cut the search short.
+    starts, agreeing : int
+        Starts, and how many of them ended within 1 % of the best.
+    """
+
+    point: Array
+    count: int
+    is_complete: bool
+    starts: int
+    agreeing: int
+
+
 class _Phase(NamedTuple):
-    """A part of a search: what it reads, on which samples, how many members it keeps and trials it may take."""
+    """A part of a search: what it reads, on which samples, and how many trials it may take."""
 
     name: str
     simulator: Simulator
-    members: int
     trials: int
 
 
@@ -130,8 +169,8 @@ def run_racing(
     method: Racing,
     start: Array,
     progress: ProgressCallback,
-) -> BestPoint:
-    """Search in phases; Ctrl-C ends the search with the best point so far.
+) -> RacingResult:
+    """Search in phases from starts that differ in kind; Ctrl-C ends the search with the best point so far.
 
     Parameters
     ----------
@@ -148,38 +187,40 @@ def run_racing(
     """
     rng, space = np.random.default_rng(method.seed), simulator.space
     search = _RacingSearch(simulator, spec, task.horizon, space.to_unit(start), rng, progress)
-    population = first_population(method.members, search.best, rng)
-    if not method.bands:
-        population[1:] = _near(search.best, population[1:], rng)
     try:
-        for phase in _phases(simulator, spec, method):
-            population = search.evolve(population, phase)
+        search.run(method)
     except KeyboardInterrupt:
-        return BestPoint(space.from_unit(search.best), search.count, is_complete=False)
-    return BestPoint(space.from_unit(search.best), search.count, is_complete=True)
+        return RacingResult(space.from_unit(search.best), search.count, False, search.starts, search.agreeing)
+    return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing)
 
 
-def _phases(simulator: Simulator, spec: Specification, method: Racing) -> Iterator[_Phase]:
-    """The phases of a search; the wide bands only where a settling time is asked for."""
-    trials, (wide, narrow, fine) = method.trials * len(simulator.space.names), PHASE_SHARES
-    bands = [spec.band * b for b in method.bands if spec.band * b < 1] if spec.concerns(SettlingTime) else []
-    if bands:
-        yield _Phase("wide bands", simulator.coarse(spec, bands), method.members, round(wide * trials))
-    else:
-        narrow += wide
-    yield _Phase("coarse samples", simulator.coarse(spec), method.members, round(narrow * trials))
-    few = max(5, round(FINE_SHARE * method.members))
-    yield _Phase("fine samples", simulator, few, round(fine * trials))
+def _phases(simulator: Simulator, spec: Specification, method: Racing, share: float) -> Iterator[_Phase]:
+    """The phases of a start on coarse samples; wider bands only where a settling time is asked for."""
+    trials = share * method.trials * len(simulator.space.names)
+    wider = [spec.band * b for b in sorted(method.bands) if spec.band * b < 1] if spec.concerns(SettlingTime) else []
+    stages = [bands for bands in (wider, wider[:1]) if bands]
+    for bands, part in zip(stages, BAND_SHARES, strict=False):
+        yield _Phase("wide bands", simulator.coarse(spec, bands), round(part * trials))
+    yield _Phase("coarse samples", simulator.coarse(spec), round((1 - sum(BAND_SHARES[: len(stages)])) * trials))
 
 
-def _near(best: Array, others: Array, rng: np.random.Generator) -> Array:
-    """Points about the best one, in place of half of the others."""
-    close = np.clip(best + NEARBY * rng.standard_normal(others.shape), 0.0, 1.0)
-    return np.where((np.arange(len(others)) % 2 == 0)[:, None], close, others)
+def _other_population(method: Racing, names: Sequence[str], best: Array, rng: np.random.Generator) -> Array:
+    """A population of another kind than the one that found `best`: with hardly any dither, where it is free.
+
+    Its gains are those of the first one's best points, its offset is drawn anew; without a free dither all is.
+    """
+    if "dither.amplitude" not in names:
+        return first_population(method.members, rng.random(len(names)), rng)
+    population = best[np.arange(method.members) % min(FEW_BEST, len(best))]
+    population = np.clip(population + NEARBY * rng.standard_normal(population.shape), 0.0, 1.0)
+    population[:, names.index("dither.amplitude")] = NO_DITHER * rng.random(method.members)
+    if "dither.offset" in names:
+        population[:, names.index("dither.offset")] = rng.random(method.members)
+    return np.asarray(population)
 
 
 class _RacingSearch:
-    """A search in progress: the best point of the present phase, and the number of trials simulated."""
+    """A search in progress: the best point so far, the number of trials simulated, and how many starts agree."""
 
     def __init__(
         self,
@@ -191,14 +232,63 @@ class _RacingSearch:
         progress: ProgressCallback,
     ) -> None:
         self._simulator, self._space, self._spec, self._scale = simulator, simulator.space, spec, scale
-        self._rng, self._progress = rng, progress
-        self.best, self.count = np.clip(start, 0.0, 1.0), 0
+        self._rng, self._progress, self._coarse = rng, progress, simulator.coarse(spec)
+        self._polisher = Polish(simulator, spec)
+        self.best, self.count, self.starts, self.agreeing = np.clip(start, 0.0, 1.0), 0, 0, 0
 
-    def evolve(self, population: Array, phase: _Phase) -> Array:
-        """Evolve a population through a phase; the points in which it ends, the best first."""
+    def run(self, method: Racing) -> None:
+        """Search from each start on coarse samples, then from the best of all on fine ones."""
+        names, given = self._space.names, self.best
+        population = first_population(method.members, given, self._rng)
+        if not method.bands:
+            population[1:] = _near(given, population[1:], self._rng)
+        ends, bests = list[Array](), list[float]()
+        for share in START_SHARES:
+            best = self.best
+            population, merits = self._search(population, method, share)
+            ends.append(population)
+            bests.append(float(merits[0]))
+            if bests[-1] > min(bests):
+                self.best = best
+            self.starts, self.agreeing = len(bests), sum(b <= min(bests) * (1 + AGREEMENT) for b in bests)
+            population = _other_population(method, names, population, self._rng)
+        trials = (1 - sum(START_SHARES)) * method.trials * len(names)
+        fine = _Phase("fine samples", self._simulator, round(trials))
+        population, merits = self.evolve(np.vstack([*ends, given]), fine, FINE_MEMBERS)
+        self._polish(population, merits, self._simulator, method.polish)
+
+    def _search(self, population: Array, method: Racing, share: float) -> tuple[Array, Array]:
+        """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for."""
+        *wide, last = _phases(self._simulator, self._spec, method, share)
+        for phase in wide:
+            population, _ = self.evolve(population, phase)
+        if wide:
+            merits = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(population))[0]
+            order = np.argsort(merits, kind="stable")
+            population = self._polish(population[order], merits[order], self._coarse, method.polish)[0]
+        return self.evolve(population, last)
+
+    def _polish(self, population: Array, merits: Array, simulator: Simulator, iterations: int) -> tuple[Array, Array]:
+        """Improve the best points of a population, apart from each other, by gradients; the best first."""
+        if not iterations or not self._polisher.is_possible:
+            return population, merits
+        chosen = _distinct_points(population)[:POLISHED]
+        self.best = population[0].copy()
+        unit, count = self._polisher.improve(population[chosen], self._cut_simulator(simulator), iterations)
+        self.count += count
+        found = Race(simulator, self._spec, self._scale).merits(self._space.from_unit(unit))[0]
+        better = found < merits[chosen]
+        population[chosen[better]], merits[chosen[better]] = unit[better], found[better]
+        order = np.argsort(merits, kind="stable")
+        self.best = population[order[0]].copy()
+        self._progress(f"gradients from {len(chosen)} points: best {merits[order[0]]:.4g}")
+        return population[order], merits[order]
+
+    def evolve(self, population: Array, phase: _Phase, members: int | None = None) -> tuple[Array, Array]:
+        """Evolve the best members of a population through a phase; where it ends, the best first, and their merits."""
         race, before, bests = Race(phase.simulator, self._spec, self._scale), self.count, list[float]()
-        merits, worst = race.merits(self._space.from_unit(population))
-        order = np.argsort(merits, kind="stable")[: phase.members]
+        merits, worst = self._rank(race, population, members)
+        order = np.argsort(merits, kind="stable")[:members]
         history, worst = SuccessHistory(population[order], merits[order], self._rng), worst[order]
         self.best, best = history.population[0].copy(), float(history.merits[0])
         self._cut(race)
@@ -215,7 +305,19 @@ class _RacingSearch:
             self._progress(f"{phase.name}, generation {number + 1}: best {best:.4g}")
             if _is_done(bests, history.merits):
                 break
-        return history.population[np.argsort(history.merits, kind="stable")]
+        order = np.argsort(history.merits, kind="stable")
+        return history.population[order], history.merits[order]
+
+    def _rank(self, race: Race, population: Array, members: int | None) -> tuple[Array, Indices]:
+        """Merits and worst cases of a population, or of that half of it which is best on coarse samples."""
+        points = self._space.from_unit(population)
+        if members is None or members >= len(population):
+            return race.merits(points)
+        coarse, _ = Race(self._coarse, self._spec, self._scale).merits(points)
+        merits, worst = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.intp)
+        few = np.argsort(coarse, kind="stable")[:members]
+        merits[few], worst[few] = race.merits(points[few])
+        return merits, worst
 
     def _prove(self, race: Race, trials: Array, merits: Array, best: float) -> Array:
         """Merits, those that beat the best one on responses cut short replaced by those on whole responses."""
@@ -225,13 +327,35 @@ class _RacingSearch:
         return merits
 
     def _cut(self, race: Race) -> None:
-        """Cut the responses of a race to a multiple of the best settling time, where that changes no merit."""
+        """Cut the responses of a race."""
+        race.cut(self._cut_time())
+
+    def _cut_time(self) -> float:
+        """A multiple of the best settling time [s], where later samples change no merit; elsewhere infinity."""
         if not may_be_cut(self._spec):
-            return
-        values = self._simulator.coarse(self._spec).respond(self._space.from_unit(self.best[None]), self._spec.band)
+            return np.inf
+        values = self._coarse.respond(self._space.from_unit(self.best[None]), self._spec.band)
         settled = float(values.values["SettlingTime"][0])
-        if np.isfinite(settled):
-            race.cut(max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale))
+        return max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf
+
+    def _cut_simulator(self, simulator: Simulator) -> Simulator:
+        time = self._cut_time()
+        return simulator.cut(time) if time < np.inf else simulator
+
+
+def _distinct_points(unit: Array) -> Indices:
+    """Indices of points in their order; one that lies close to one before it is left out."""
+    found = list[int]()
+    for k in range(len(unit)):
+        if all(np.max(np.abs(unit[k] - unit[other])) > MIN_DISTANCE for other in found):
+            found.append(k)
+    return np.array(found)
+
+
+def _near(best: Array, others: Array, rng: np.random.Generator) -> Array:
+    """Points about the best one, in place of half of the others."""
+    close = np.clip(best + NEARBY * rng.standard_normal(others.shape), 0.0, 1.0)
+    return np.where((np.arange(len(others)) % 2 == 0)[:, None], close, others)
 
 
 def _is_done(bests: Sequence[float], merits: Array) -> bool:

@@ -164,12 +164,12 @@ def read_metrics(
     settings["scale"] = None if reference.is_step else reference.nominal_size
     given = (grid.t, signal, reference.final, reference.initial)
     settings["control"], meter = y[:, :, CONTROL_OUTPUT], meter_values(y, channels)
+    settings["wider"] = bands[1:]
     found = batch_metrics(*given, band=bands[0], envelope=envelope, only=only, meter=meter, **settings)
     if len(bands) > 1:
-        more = (batch_metrics(*given, band=band, only=("SettlingTime",), **settings) for band in bands[1:])
-        times = [found["SettlingTime"], *(wider["SettlingTime"] for wider in more)]
-        most = penalty_settling_time(reference.horizon - reference.at, excess)
-        found["SettlingTime"] = np.mean([np.where(np.isnan(t), most, t) for t in times], axis=0)
+        times = np.column_stack([found["SettlingTime"], found["SettlingTimes"]])
+        most = penalty_settling_time(reference.horizon - reference.at, excess)[:, None]
+        found["SettlingTime"] = np.where(np.isnan(times), most, times).mean(axis=1)
     found["Excess"] = excess
     return {n: found[n] for n in only}
 

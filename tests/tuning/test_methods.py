@@ -25,7 +25,7 @@ from pneuopt.tuning.tune import prepare_search, tune
 STEP, LIMITS = Step(1.0, horizon=1.0), (Overshoot(0.05),)
 SMALL: dict[str, dict[str, object]] = {  # options with which each one takes a second
     "two_phase": {"starts": 1, "nodes": [20, 20]},
-    "racing": {"members": 8, "trials": 40, "bands": [4.0]},
+    "racing": {"members": 8, "trials": 40, "bands": [4.0], "polish": 2},
     "condensed": {"members": 8, "generations": 2, "restarts": 0, "polish": 2, "keep": 1},
     "screening": {"members": 8, "generations": 3, "bands": [0.1], "refinements": 20},
 }
