@@ -30,13 +30,14 @@ from pneuopt.cli.show_loops import (
     show_validation,
 )
 from pneuopt.cli.terminal import make_console, progress, show_status
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.dither_verdict import judge_dither
-from pneuopt.evaluation.evaluate import evaluate, final_operating_point, respond
+from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.expected_plants import expected_plants
-from pneuopt.evaluation.response import linearise_open_loop
+from pneuopt.evaluation.operating_points import worst_open_loop
 from pneuopt.files.drive import read_covariance, read_drive
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import Tuning, write_tuned
@@ -217,16 +218,19 @@ def _simulate_initial_response(loop: ClosedLoop, reference: Step, parameters: Pa
 
 
 def _loop_figures(task: Tuning, parameters: ParameterSet, before: ParameterSet | None) -> dict[str, "Figure"]:
-    """The steps, and the Bode plot about the state in which the first one ends, before about where that one did."""
+    """The steps, and the Bode plot at the first one's operating point with the largest sensitivity, before likewise."""
     responses = _simulate_responses(task, parameters, before)
     first = responses[0]
-    earlier = None if first.before is None or before is None else _open_loop(task.loop, before, first.before)
-    bode = plot_bode(_open_loop(task.loop, parameters, first.run), earlier)
+    step, earlier = first.reference, None
+    if first.before is not None and before is not None:
+        earlier = _open_loop(task.loop, before, step, first.before)
+    bode = plot_bode(_open_loop(task.loop, parameters, step, first.run), earlier)
     return {"": plot_steps(responses, band=task.specification.band), "bode": bode}
 
 
-def _open_loop(loop: ClosedLoop, parameters: ParameterSet, run: Trajectory) -> Linearisation:
-    return linearise_open_loop(loop, parameters, *final_operating_point(loop, parameters, run))
+def _open_loop(loop: ClosedLoop, parameters: ParameterSet, reference: Step, run: Trajectory) -> Linearisation:
+    disturbed = add_disturbances(loop, [reference])
+    return worst_open_loop(disturbed, loop.complete(parameters), reference, run)[1]
 
 
 def number_paths(path: Path, count: int) -> list[Path]:

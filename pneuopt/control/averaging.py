@@ -165,7 +165,7 @@ class _DitheredSystem:
 
     def mean_system(self, unit: NDArray[np.complex128], nodes: int) -> System:
         """The system of the means, for a ripple of `unit` per amplitude."""
-        system, (phases, weights) = self.system, _phase_quadrature(nodes, self.waveform)
+        system, (phases, weights) = self.system, phase_quadrature(nodes, self.waveform)
         waves, swings = (
             self.waveform.at(phases),
             np.outer(np.sin(phases), unit.real) + np.outer(np.cos(phases), unit.imag),
@@ -192,7 +192,7 @@ class _DitheredSystem:
         a, b, x = (ca.SX.sym(k, n) for k in "abx")
         u, p = symbols(self.system.inputs), {n: ca.SX.sym(n) for n in self.parameters}
         inphase, quadrature = ca.SX(n, 1), ca.SX(n, 1)
-        for phase, weight in zip(*_phase_quadrature(nodes, self.waveform), strict=True):
+        for phase, weight in zip(*phase_quadrature(nodes, self.waveform), strict=True):
             sine, cosine, wave = np.sin(phase), np.cos(phase), float(self.waveform.at(phase))
             rate = self.rates(ca.SX(0), x + a * sine + b * cosine, u, p, p[DITHER_AMPLITUDE] * wave)[0]
             inphase, quadrature = inphase + 2 * weight * sine * rate, quadrature + 2 * weight * cosine * rate
@@ -301,7 +301,7 @@ def _newton_root(function: Callable[[Array], Sequence[ca.DM]], scale: Array, z: 
     return None
 
 
-def _phase_quadrature(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
+def phase_quadrature(nodes: int, waveform: Waveform) -> tuple[Array, Array]:
     """Phases of a period, and their weights: for a sine evenly, on no turning point; for a triangle on either slope."""
     if waveform is Waveform.SINE:
         return (2 * np.arange(1, nodes + 1) - 1) * pi / nodes, np.full(nodes, 1 / nodes)

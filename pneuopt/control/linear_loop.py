@@ -1,18 +1,15 @@
 """The loop linearised: `linear_plant`, the plant as the controller sees it; `open_loop`, whose margins count."""
 
 from collections.abc import Mapping
-from typing import Any
+from functools import lru_cache
 
-import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.compensation import acting_always, compensation_slopes
+from pneuopt.control.averaged_plant import AveragedPlant
+from pneuopt.control.linear_controller import linear_controller, operating_point
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.rest import find_rest
-from pneuopt.dynamics.system import Linearisation, names, parameter_vector
+from pneuopt.dynamics.system import Linearisation
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 
 
@@ -21,13 +18,15 @@ def linear_plant(
 ) -> Linearisation:
     """The plant from command to measured output, or to the reading of a sensor with a lag, linearised.
 
+    Under dither it is the mean over the ripple (`AveragedPlant`), which is what a signal slower than the dither meets.
+
     Parameters
     ----------
     loop : ClosedLoop
     parameters : ParameterSet
     x : ndarray, shape (n_plant_states,), optional
-        The plant's operating point, an equilibrium or not; by default the closed loop's rest. Dry friction makes a
-        resting plant look stiff: linearise such a plant in motion.
+        The plant's operating point, an equilibrium or not, under dither its means; by default the closed loop's rest.
+        Dry friction makes a resting plant look stiff: linearise such a plant in motion.
     u : mapping of str to float, optional
         The plant's inputs there, zero where absent; at rest the command is solved for.
 
@@ -36,11 +35,16 @@ def linear_plant(
     Linearisation
     """
     loop.check(parameters)
-    x, u = _operating_point(loop, parameters, x, u)
+    x, u = operating_point(loop, parameters, x, u)
     plant = loop.plant.linearise(x, u, parameters)
     j, i = plant.inputs.index(loop.command.name), plant.outputs.index(loop.feedback.name)
     A, B, C, D = plant.A, plant.B[:, j : j + 1], plant.C[i : i + 1], plant.D[i : i + 1, j : j + 1]
-    states, lag = plant.states, loop.sensor_lag(loop.parameter_vector(parameters))
+    p = loop.parameter_vector(parameters)
+    if loop.dither_period(parameters):
+        at = np.array([[u.get(n, 0.0) for n in plant.inputs]])
+        A, B, C, D, _ = (M[0] for M in _averaged_plant(loop)(p[None], np.asarray(x, dtype=float)[None], at))
+        B, C, D = B[:, None], C[None], np.array([[D]])
+    states, lag = plant.states, loop.sensor_lag(p)
     if lag:
         n = len(A)
         A = np.block([[A, np.zeros((n, 1))], [C / lag, np.array([[-1 / lag]])]])
@@ -52,8 +56,9 @@ def linear_plant(
 def open_loop(
     loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
 ) -> Linearisation:
-    """``L(s) = C(s) P(s)`` under negative feedback, cut at the measured output, without saturation and dither.
+    """``L(s) = C(s) P(s)`` under negative feedback, cut at the measured output, without saturation.
 
+    P is the `linear_plant`, averaged under dither.
     A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé form,
     its integral as one without a dead band. Compensators that act always count by their slopes at the operating point;
     a knocker's pulses do not. Parameters as for `linear_plant`.
@@ -63,8 +68,8 @@ def open_loop(
     Linearisation
         From the control error, input "error", to the measured output; the plant's states come first.
     """
-    x, u = _operating_point(loop, parameters, x, u)
-    plant, controller = linear_plant(loop, parameters, x, u), _linear_controller(loop, parameters, x, u)
+    x, u = operating_point(loop, parameters, x, u)
+    plant, controller = linear_plant(loop, parameters, x, u), linear_controller(loop, parameters, x, u)
     m, n = len(controller.A), len(plant.A)
     return Linearisation(
         np.block([[plant.A, plant.B @ controller.C], [np.zeros((m, n)), controller.A]]),
@@ -77,102 +82,7 @@ def open_loop(
     )
 
 
-def linear_gains(loop: ClosedLoop, p: Any, measured: ArrayLike = 0.0, command: ArrayLike = 0.0) -> Any:
-    """Kp, Ki, Kd, Tf of the controller's continuous equivalent, shape (4, m).
-
-    Backward Euler puts ``(1 - e^(-s h))/h``, nearly ``s/(1 + s h/2)``, for s: a sampled controller is the continuous
-    one with ``Kp + Ki h/2`` and ``Tf + h/2``. Compensators that act always multiply the gains by their slope, and what
-    they feed back of the measured signal is taken from Kp.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-    p : array or casadi.SX, shape (n_parameters, m)
-        In the order of ``loop.parameters``; numbers where compensators act always.
-    measured, command : float or array_like, shape (m,)
-        The measured signal and the command at the operating point, which only such compensators feel.
-
-    Returns
-    -------
-    casadi.DM or casadi.SX, shape (4, m)
-    """
-    gains, half = loop.gains(p), 0.5 * (loop.pid.sample_time or 0.0)
-    found = ca.vertcat(gains[0, :] + half * gains[1, :], gains[1:3, :], gains[3, :] + half)
-    if not acting_always(loop):
-        return found
-    slope, feedback = compensation_slopes(loop, np.asarray(p, dtype=float), measured, command)
-    scaled = [ca.DM(slope).T * found[k, :] for k in range(3)]
-    return ca.vertcat(scaled[0] - ca.DM(feedback).T, *scaled[1:], found[3, :])
-
-
-def operating_gains(
-    loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
-) -> tuple[float, float, float, float]:
-    """Kp, Ki, Kd, Tf of `linear_gains` at an operating point of the plant. Parameters as for `linear_plant`."""
-    x, u = _operating_point(loop, parameters, x, u)
-    p, command = loop.parameter_vector(parameters), u.get(loop.command.name, 0.0)
-    y = loop.plant.ode(
-        0, x, [u.get(n, 0.0) for n in names(loop.plant.inputs)], parameter_vector(loop.plant.parameters, parameters)
-    )[1]
-    measured = float(y[names(loop.plant.outputs).index(loop.feedback.name)])
-    Kp, Ki, Kd, Tf = linear_gains(loop, p, measured, command).full().ravel().tolist()
-    return Kp, Ki, Kd, Tf
-
-
-def pade_delay_response(omega: ArrayLike, dead_time: float) -> NDArray[np.complex128]:
-    """``e^(-jw dead_time)`` as Padé's approximant of second order has it, shape (n,); omega [rad/s].
-
-    Examples
-    --------
-    >>> round(float(np.angle(pade_delay_response([1.0], 1.0), deg=True)[0]), 2)
-    -57.22
-    """
-    s = 1j * np.asarray(omega, dtype=float) * dead_time
-    return np.asarray((1 - s / 2 + s**2 / 12) / (1 + s / 2 + s**2 / 12))
-
-
-def controller_matrices(gains: Any, dead_time: float) -> tuple[Array, Array, Array, Array]:
-    """A, B, C and D of m PIDs from the control error to the command, with the loop's dead time in Padé form.
-
-    Parameters
-    ----------
-    gains : array_like, shape (4, m)
-        Kp, Ki, Kd, Tf > 0 of each, as `linear_gains` has them.
-    dead_time : float
-        [s]
-
-    Returns
-    -------
-    tuple of ndarray, shapes (m, k, k), (m, k, 1), (m, 1, k), (m, 1, 1)
-        With k = 2 states, integral and filter, or 4 with a dead time.
-    """
-    Kp, Ki, Kd, Tf = np.reshape(gains, (4, -1, 1))
-    zero, one, rate = np.zeros_like(Tf), np.ones_like(Tf), 1 / Tf
-    A = np.stack([np.hstack([zero, zero]), np.hstack([zero, -rate])], axis=1)
-    B, C, D = np.stack([Ki, rate], axis=1), np.stack([one, -Kd * rate], axis=2), (Kp + Kd * rate)[..., None]
-    if dead_time:  # `pade_delay_response` is 1 - (12 s/T)/(s^2 + 6 s/T + 12/T^2), here with states of one size
-        m, root = len(Kp), np.sqrt(12) / dead_time
-        lags, fed = np.array([[0.0, root], [-root, -6 / dead_time]]), np.array([[0.0], [1.0]])
-        taken = np.array([[0.0, -12 / dead_time]])
-        A = np.block([[A, np.zeros((m, 2, 2))], [fed @ C, np.broadcast_to(lags, (m, 2, 2))]])
-        B = np.concatenate([B, fed @ D], axis=1)
-        C = np.concatenate([C, np.broadcast_to(taken, (m, 1, 2))], axis=2)
-    return A, B, C, D
-
-
-def _operating_point(
-    loop: ClosedLoop, parameters: ParameterSet, x: Array | None, u: Mapping[str, float] | None
-) -> tuple[Array, Mapping[str, float]]:
-    """The plant's state and inputs; without a state those of the closed loop's rest."""
-    if x is not None:
-        return x, u or {}
-    found, command = find_rest(loop, parameters, 0.0, {})
-    return found, {loop.command.name: command, **(u or {})}
-
-
-def _linear_controller(loop: ClosedLoop, parameters: ParameterSet, x: Array, u: Mapping[str, float]) -> Linearisation:
-    gains = np.reshape(operating_gains(loop, parameters, x, u), (4, 1))
-    require(gains[3, 0] > 0, "a continuous derivative needs a filter, Tf > 0")
-    A, B, C, D = (matrix[0] for matrix in controller_matrices(gains, loop.dead_time))
-    own = ("pid.integral", "pid.filter", "pid.held", "pid.held_before")[: len(A)]
-    return Linearisation(A, B, C, D, own, ("error",), ("control",))
+@lru_cache(maxsize=8)
+def _averaged_plant(loop: ClosedLoop) -> AveragedPlant:
+    """The function of a loop, kept for the cases and operating points of one evaluation."""
+    return AveragedPlant(loop)

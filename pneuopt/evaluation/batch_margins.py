@@ -4,15 +4,16 @@ from collections.abc import Callable, Collection
 from math import inf, nan
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pneuopt.control.linear_loop import controller_matrices, linear_gains, pade_delay_response
+from pneuopt.control.averaged_plant import AveragedPlant
+from pneuopt.control.linear_controller import controller_matrices, linear_gains, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.margins import ComplexArray, are_stable, batch_frequency_response, controller_parts
+from pneuopt.evaluation.operating_points import counted_points
+from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arrays import Array
 
 Matrices = tuple[Array, Array, Array]  # A, B, C of m plants, shapes (m, n, n), (m, n, 1), (m, 1, n)
@@ -36,19 +37,25 @@ def batch_margin_function(
     Returns
     -------
     callable
-        ``(p, x, command, only) -> found``, shapes (m, n_parameters) in the order of ``loop.parameters``,
-        (m, n_plant_states) and (m,); the plant's other inputs are zero. The result has an array of shape (m,) for each
-        name in `only`: "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as in
-        `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's frequencies. Where a
-        closed loop is unstable, its margins are NaN, its sensitivities and noise gain infinite. Arguments are not
+        ``(p, x, u, only) -> found``: parameters, shape (m, n_parameters), in the order of ``loop.parameters``, and
+        the plant's states and inputs at k operating points of each, shapes (k, m, n_plant_states) and
+        (k, m, n_plant_inputs), means under dither. The result has an array of shape (m,) for each name in `only`, the
+        worst over the points: "MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin" [deg] as
+        in `Margins`, and "NoiseGain". Crossings are interpolated, peaks refined between the grid's frequencies. Where
+        a closed loop is unstable, its margins are NaN, its sensitivities and noise gain infinite. Arguments are not
         checked.
     """
     w = np.asarray(omega, dtype=float)
-    plants = _plant_responses(loop, w)
+    plants, command = _plant_responses(loop, w), names(loop.plant.inputs).index(loop.command.name)
 
-    def read_margins(p: Array, x: Array, commands: Array, only: Collection[str]) -> dict[str, Array]:
-        response, matrices, measured = plants(p, x, commands)
-        gains = linear_gains(loop, p.T, measured, commands).full()
+    def read_margins(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
+        k, m = x.shape[:2]
+        found = read_points(np.tile(p, (k, 1)), x.reshape(k * m, -1), u.reshape(k * m, -1), only)
+        return {n: _worst_in_columns(n, v.reshape(k, m)[-counted_points(n, k) :]) for n, v in found.items()}
+
+    def read_points(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
+        response, matrices, measured = plants(p, x, u)
+        gains = linear_gains(loop, p.T, measured, u[:, command]).full()
         Kp, Ki, Kd, Tf = gains[..., None]
 
         def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
@@ -69,6 +76,12 @@ def batch_margin_function(
         return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
 
     return read_margins
+
+
+def _worst_in_columns(metric: str, values: Array) -> Array:
+    """The worst of each column; NaN where a loop is unstable."""
+    cost = np.where(np.isnan(values), inf, METRICS[metric].requirement_value(values))
+    return np.asarray(values[np.argmax(cost, axis=0), np.arange(values.shape[1])])
 
 
 def _refine_peaks(
@@ -105,29 +118,15 @@ def _plant_responses(
     The responses are functions of frequencies of shape (n,) or (m, n); on the frequencies `w` it is checked that
     partial fractions are exact enough.
     """
-    plant = loop.plant
-    x, u, q = (ca.SX.sym(n, plant.ode.size1_in(i)) for i, n in enumerate("xuq", 1))
-    command, output = names(plant.inputs).index(loop.command.name), names(plant.outputs).index(loop.feedback.name)
-    xdot, y = plant.ode(0, x, u, q)
-    scale = ca.DM([s.nominal for s in plant.states])  # scaled states make the matrix of eigenvectors well conditioned
-    inward, outward = ca.diag(1 / scale), ca.diag(scale)
-    A, B = (inward @ ca.jacobian(xdot, v) for v in (x, u[command]))
-    C, D = (ca.jacobian(y[output], v) for v in (x, u[command]))
-    matrices = compile_function(ca.Function("matrices", [x, u, q], [A @ outward, B, C @ outward, D, y[output]]))
-    n, position = x.numel(), {name: k for k, name in enumerate(loop.parameters)}
-    shapes, columns = ((n, n), (n,), (n,), (1,), ()), [position[name] for name in plant.parameters]
+    average, scale = AveragedPlant(loop, compiled=True), np.array([s.nominal for s in loop.plant.states])
 
-    def linearise(p: Array, x: Array, commands: Array) -> tuple[Callable[[Array], ComplexArray], Matrices, Array]:
-        us = np.zeros((len(p), u.numel()))
-        us[:, command] = commands
-        found = [matrices(*row) for row in zip(x, us, p[:, columns], strict=True)]
-        A, B, C, D, measured = (
-            np.array([row[k] for row in found]).reshape(len(p), *shape) for k, shape in enumerate(shapes)
-        )
+    def linearise(p: Array, x: Array, u: Array) -> tuple[Callable[[Array], ComplexArray], Matrices, Array]:
+        A, B, C, D, measured = average(p, x, u)
+        A, B, C = A * scale / scale[:, None], B / scale, C * scale  # so the matrix of eigenvectors is well conditioned
         plant, lag = _partial_fraction_response(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
 
         def response(w: Array) -> ComplexArray:
-            return np.asarray((plant(w) + D) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
+            return np.asarray((plant(w) + D[:, None]) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
 
         return response, _add_sensor((A, B[..., None], C[:, None]), lag), measured
 

@@ -1,6 +1,5 @@
 """`certificate`: what an independent simulation and the linear loop say about gains, and what is wrong with them."""
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,17 +10,12 @@ from pneuopt.evaluation.continuation import continue_response
 from pneuopt.evaluation.defects import Defect as Defect  # noqa: PLC0414 - who reads a certificate finds it here
 from pneuopt.evaluation.defects import Ending, Finding, correct_metrics, describe_ending, find_defects
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
-from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.metrics import Envelope
-from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     import pandas as pd
-
-AT_THE_END = "at the end"
-MARGIN_COLUMNS = tuple(metric.name for metric in METRICS.values() if metric.source is Source.LINEAR_LOOP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +87,7 @@ def judge_evaluations(
     """
     import pandas as pd
 
-    margins = [row for found in evaluations for row in _margin_rows(found)]
+    margins = [{"case": found.case.label, **row} for found in evaluations for row in found.margins]
     findings, notes = [finding for row in margins for finding in _find_instability(row)], list[str]()
     metrics = tabulate_metrics(evaluations)
     for found in evaluations if continues else ():
@@ -104,13 +98,6 @@ def judge_evaluations(
     return Certificate(metrics, tuple(findings), tuple(notes), pd.DataFrame(margins))
 
 
-def _margin_rows(found: CaseEvaluation) -> Iterator[dict[str, Any]]:
-    """Margins of a case at its operating points."""
-    values = {n: found.metrics[n] for n in MARGIN_COLUMNS if n in found.metrics}
-    stable = math.isfinite(found.metrics["MaxSensitivity"])
-    yield {"case": found.case.label, "point": AT_THE_END, **values, "stable": stable}
-
-
 def _find_instability(row: dict[str, Any]) -> Iterator[Finding]:
     if not row["stable"]:
-        yield Finding(Defect.UNSTABLE, row["case"], f"the linear loop is unstable {row['point']} of {row['case']}")
+        yield Finding(Defect.UNSTABLE, row["case"], f"the linear loop is unstable {row['point']} in {row['case']}")

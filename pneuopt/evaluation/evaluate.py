@@ -3,29 +3,26 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf, nan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.linear_loop import operating_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step, as_steps
 from pneuopt.dynamics.simulate import MAX_STEPS, simulate
 from pneuopt.evaluation.budget import POINTS_PER_READING, check_steps
 from pneuopt.evaluation.cases import TuningCase, cases
-from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
-from pneuopt.evaluation.margins import margins, noise_gain
 from pneuopt.evaluation.meter import meter_metrics
 from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.operating_points import margin_rows, worst_margins
 from pneuopt.evaluation.record import record
 from pneuopt.evaluation.resolution import MAX_REFINEMENTS, refine_instants
-from pneuopt.evaluation.response import linearise_open_loop, loop_inputs, measure, readings_a_sample, sample_spacing
+from pneuopt.evaluation.response import loop_inputs, measure, readings_a_sample, sample_spacing
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.quantities.arguments import check_argument, check_parameters
-from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -74,11 +71,11 @@ def evaluate(
         A row for each metric, a column for each reference ("0 to 0.25"), then one for each reference and scenario
         ("0 to 0.25 [load.mass high]"). The rows: those of `step_metrics`; LimitCycleAmplitude [measured unit], 0
         without hunting, LimitCycleFrequency [Hz] and StickShare; the metrics that the plant's meter shows, AirUse
-        [l(ANR)], ValveTravel [half travels] and EnergyUse [J]; and, not for a rig, those of the loop linearised about
-        the state and command in which the response ends, under dither about their means over its last period:
+        [l(ANR)], ValveTravel [half travels] and EnergyUse [J]; and, not for a rig, the worst over the response's
+        operating points (`operating_point_margins`: at rest, sliding, at the end) of the linearised loop's
         MaxSensitivity, MaxComplementarySensitivity, GainMargin, PhaseMargin [deg], NoiseGain [command's unit/measured
-        unit], and FrictionSlope [N s/m] for drives with a load. Where that loop is unstable, its margins are NaN, its
-        sensitivities and noise gain infinite.
+        unit], and FrictionSlope [N s/m] for drives with a load. Where the loop is unstable at one of them, its margins
+        are NaN, its sensitivities and noise gain infinite.
 
     Raises
     ------
@@ -131,6 +128,8 @@ class CaseEvaluation:
     metrics : dict of str to float
     response : Trajectory
         States and outputs up to the horizon; a rig's truth.
+    margins : tuple of dict
+        The rows of `operating_point_margins`; none for a rig.
     """
 
     loop: ClosedLoop
@@ -138,6 +137,7 @@ class CaseEvaluation:
     parameters: ParameterSet
     metrics: dict[str, float]
     response: Trajectory
+    margins: tuple[dict[str, Any], ...] = ()
 
 
 def tabulate_metrics(evaluations: Iterable[CaseEvaluation]) -> "pd.DataFrame":
@@ -209,25 +209,8 @@ def _evaluate_case(
     metrics = measure(loop, parameters, case.reference, response, band, envelope)
     metrics |= limit_cycle_metrics(loop, parameters, case.reference, response)
     metrics |= meter_metrics(loop, parameters, response, case.reference.at)
-    if rig is None:
-        x, command = final_operating_point(loop, parameters, response)
-        metrics |= friction_slope(loop, parameters, x, command)
-        metrics |= _margin_metrics(loop, parameters, x, command, case.reference)
-    return CaseEvaluation(loop, case, parameters, metrics, response)
-
-
-def final_operating_point(loop: ClosedLoop, parameters: ParameterSet, response: Trajectory) -> tuple[Array, float]:
-    """State of the plant, shape (n_plant_states,), and command in which a response ends.
-
-    Under dither they are means over its last period, since at an instant they depend on the dither's phase.
-    """
-    rows = np.array([response[n] for n in (*(q.name for q in loop.plant.states), "control")])
-    period = loop.dither_period(parameters) or np.inf
-    if period <= response.t[-1] - response.t[0]:
-        ends = period_mean(response.t, rows, 0.0, period, np.array([response.t[-1] - period / 2]))[:, 0]
-    else:
-        ends = rows[:, -1]
-    return ends[:-1], float(ends[-1])
+    rows = margin_rows(loop, parameters, case.reference, response) if rig is None else ()
+    return CaseEvaluation(loop, case, parameters, metrics | worst_margins(rows), response, rows)
 
 
 def limit_cycle_metrics(
@@ -246,36 +229,6 @@ def limit_cycle_metrics(
     found = find_limit_cycle(response.t, signal, start=start, dither_period=period, min_amplitude=least)
     values = (found.amplitude, found.frequency, found.stick_share) if found else (0.0, nan, 0.0)
     return dict(zip(LIMIT_CYCLE_METRICS, values, strict=True))
-
-
-def friction_slope(loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float) -> dict[str, float]:
-    """FrictionSlope: derivative of the steady friction force to speed at a plant state [N s/m]; for drives with a load.
-
-    This is the viscous friction of the linearised loop at low frequencies, where the bristles follow the speed. A
-    negative slope makes crawl likely.
-    """
-    states, axis = [q.name for q in loop.plant.states], loop.plant.axis
-    if axis is None or not any(n.startswith("friction.") for n in loop.plant.parameters):
-        return {}
-    A = loop.plant.linearise(x, {loop.command.name: command}, parameters).A
-    v, z = states.index(axis.speed), [k for k, n in enumerate(states) if n.startswith("friction.")]
-    bristles = A[v, z] @ np.linalg.solve(A[np.ix_(z, z)], A[z, v]) if z else 0.0
-    return {"FrictionSlope": float(-parameters.value(axis.inertia) * (A[v, v] - bristles))}
-
-
-def _margin_metrics(
-    loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step
-) -> dict[str, float]:
-    open_loop = linearise_open_loop(loop, parameters, x, command, reference)
-    robust = margins(open_loop)
-    found = {
-        "MaxSensitivity": robust.max_sensitivity,
-        "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
-        "GainMargin": robust.gain_margin,
-        "PhaseMargin": robust.phase_margin,
-        "NoiseGain": noise_gain(open_loop, operating_gains(loop, parameters, x, {loop.command.name: command})),
-    }
-    return found if robust.stable else {n: nan if n.endswith("Margin") else inf for n in found}
 
 
 def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Step]) -> tuple[ClosedLoop, Rig | None]:

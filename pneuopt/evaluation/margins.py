@@ -19,7 +19,8 @@ from scipy.linalg import eigvals
 from scipy.optimize import brentq, minimize_scalar
 
 from pneuopt.control.compensation import acting_always
-from pneuopt.control.linear_loop import linear_gains, linear_plant, pade_delay_response
+from pneuopt.control.linear_controller import linear_gains, pade_delay_response
+from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.quantities.arrays import Array

@@ -1,16 +1,12 @@
-"""A loop's response to a reference: its inputs, its sampling, its metrics and the operating point of its margins."""
+"""A loop's response to a reference: its inputs, its sampling and its metrics."""
 
 import math
 
 import numpy as np
 
-from pneuopt.control.disturbance import add_disturbances
-from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbance_input
-from pneuopt.dynamics.system import Linearisation
+from pneuopt.control.reference import Step
 from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
-from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -54,16 +50,6 @@ def measure(
         sample_time=loop.pid.sample_time,
         envelope=envelope,
         scale=None if reference.is_step else reference.nominal_size,
-    )
-
-
-def linearise_open_loop(
-    loop: ClosedLoop, parameters: ParameterSet, x: Array, command: float, reference: Step | None = None
-) -> Linearisation:
-    """Open loop for margins, linearised about a plant state x, a command and the final disturbances of a reference."""
-    others = {} if reference is None else {disturbance_input(n): v for n, v in reference.disturbance.items()}
-    return open_loop(
-        add_disturbances(loop, [reference] if reference else []), parameters, x, {loop.command.name: command, **others}
     )
 
 

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from pneuopt.control.compensation import acting_always
-from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
 from pneuopt.evaluation.requirements import (
@@ -23,7 +23,8 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.tuning.readings import CONTROL_OUTPUT, loop_pieces
+from pneuopt.tuning.passage import Passage
+from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, loop_pieces
 from pneuopt.tuning.responses import is_sound
 from pneuopt.tuning.rows import Lanes, reading_times
 from pneuopt.tuning.simulator import Simulator
@@ -245,16 +246,23 @@ class LinearisedProblem:
             if kind.metric.slope is not None and self._spec.concerns(kind)
         }
         if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
-            ends = self._simulator.operating_points(
-                p[sound], case[sound], found.x_end[sound], found.y[sound, -1, CONTROL_OUTPUT]
-            )
-            rows_of |= self._robustness_rows(p, sound, ends, points[rows], case)
+            rows_of |= self._robustness_rows(p, sound, self._points(grid, p, case, starts, found), points[rows], case)
         return LinearisedResponse(
             np.where(sound[:, None], error, np.inf),
             by_gain,
             {kind: np.where(sound[:, None], value, np.inf) for kind, (value, _) in rows_of.items()},
             {kind: slopes for kind, (_, slopes) in rows_of.items()},
         )
+
+    def _points(
+        self, grid: ReferenceGrid, p: Array, case: Indices, starts: Array, found: RolloutResult
+    ) -> tuple[Array, Array]:
+        """The operating points of lanes on one grid, states and inputs."""
+        fastest = np.zeros(len(p), dtype=np.intp)
+        for period, rows in self._simulator.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
+            fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
+        passage = Passage(starts, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
+        return self._simulator.operating_points(p, case, passage)
 
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:
         """Derivatives of the start states, where they depend on the gains, and the parameters to the unknowns.
@@ -279,9 +287,9 @@ class LinearisedProblem:
         return np.stack(columns, axis=-1)
 
     def _robustness_rows(
-        self, p: Array, sound: Mask, ends: tuple[Array, Array], points: Array, case: Indices
+        self, p: Array, sound: Mask, at: tuple[Array, Array], points: Array, case: Indices
     ) -> dict[type, tuple[Array, Array]]:
-        """Margins and peaks of the linearised loop, and their derivatives by differences at a fixed operating point."""
+        """Margins and peaks of the linearised loop, and their derivatives by differences at fixed operating points."""
         names, n, kinds = (
             self._space.names,
             len(self._wrt),
@@ -298,9 +306,9 @@ class LinearisedProblem:
             return found
         steps = DIFFERENCE_STEP * np.diff(self._space.bounds, axis=1)[:, 0]
         nudged = [p, *(p + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping)]
-        tiled = np.tile(ends[0], (len(nudged), 1)), np.tile(ends[1], len(nudged))
+        x, u = (np.tile(a[:, sound], (1, len(nudged), 1)) for a in at)
         stacked = np.concatenate([q[sound] for q in nudged])
-        metrics = requirement_values(self._simulator.robustness(stacked, *tiled, [k.metric.name for k in kinds]))
+        metrics = requirement_values(self._simulator.robustness(stacked, x, u, [k.metric.name for k in kinds]))
         factors = np.array([c.slopes(names) for c in self._simulator.cases])[case[sound]]
         rates = self._space.from_unit_slope(points[sound]) * factors
         for kind, (values, slopes) in found.items():

@@ -116,8 +116,8 @@ class Race:
         outcome = race(simulator.rollout, self._course, merit, field, y)
         merits, worst, through = np.full(m, np.inf), outcome.loser.copy(), outcome.loser < 0
         if through.any():
-            run = y[through].reshape(-1, n, outputs), outcome.x_end[through].reshape(-1, starts.shape[1])
             lanes = through[row]
+            run = starts[lanes], y[through].reshape(-1, n, outputs), outcome.x_end[through].reshape(-1, starts.shape[1])
             responses = simulator.read(p[lanes], case[lanes], run, (int(through.sum()), C), self._spec.band)
             merits[through], worst[through] = self._complete_merits(responses, rivals[through])
         return merits, worst

@@ -76,7 +76,8 @@ class ReferenceGrid:
 def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
     """Build the loop's sampled step with the measured signal, the command and channels of the meter as its outputs.
 
-    Under dither the signal's integral, zero at the start, is one more state and the last output.
+    The axis's speed follows, where there is an axis (`speed_output`); under dither the signal's integral, zero at the
+    start, is one more state and the last output.
     """
     discrete, outputs = loop.discrete(), names(loop.outputs)
     ode = (loop.system() if loop.pid.sample_time is None else loop.hold_system()).ode
@@ -92,6 +93,8 @@ def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
         if channels:
             shown = ca.vertcat(shown, *meter_outputs(loop, channels, x, u, p, shown[CONTROL_OUTPUT]))
         grown = [] if total.is_empty() else [shown[SIGNAL_OUTPUT]]
+        if loop.plant.axis is not None:
+            shown = ca.vertcat(shown, x[names(loop.states).index(loop.plant.axis.speed)])
         return ca.vertcat(xdot, *grown), ca.vertcat(shown, z[len(loop.states) :])
 
     y = rates(t, z)[1]
@@ -101,6 +104,11 @@ def loop_pieces(loop: ClosedLoop, channels: Sequence[str] = ()) -> Pieces:
         "update", [t, z, u, p], [ca.vertcat(_update_at_sample(loop, t, x, u, p), total)]
     )
     return Pieces(step, update, ca.Function("ode", [t, z, u, p], [rates(t, z)[0], y]))
+
+
+def speed_output(loop: ClosedLoop, channels: Sequence[str]) -> int | None:
+    """Index of the axis's speed among the outputs of `loop_pieces`; None without an axis."""
+    return None if loop.plant.axis is None else METER_OUTPUT + len(channels)
 
 
 def _update_at_sample(loop: ClosedLoop, t: ca.SX, x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:

@@ -7,6 +7,7 @@ import numpy as np
 
 from pneuopt.evaluation.requirements import larger_is_better, requirement_values
 from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.tuning.passage import Passage
 
 # Size of an output [its unit] from which a response counts as running away. A lower level may be reached by sound
 # signals in small units (pressures in Pa); beyond a higher one the metrics of a diverging response lose their digits.
@@ -58,8 +59,7 @@ class Responses:
         row, case = np.nonzero(self._lanes)
         wanted = measured.sound & rows[row]
         if wanted.any():
-            ends = measured.x_end[wanted], measured.command[wanted]
-            for n, value in self._margins.read(self._p[wanted], case[wanted], *ends).items():
+            for n, value in self._margins.read(self._p[wanted], case[wanted], measured.passage.select(wanted)).items():
                 found[n][wanted] = value
         return {n: self.to_table(value)[rows] for n, value in found.items()}
 
@@ -72,7 +72,7 @@ class Responses:
 
 @dataclass(frozen=True, eq=False)
 class LaneMetrics:
-    """The metrics of m lanes and the points in which they end.
+    """The metrics of m lanes and their passage.
 
     Attributes
     ----------
@@ -81,23 +81,17 @@ class LaneMetrics:
         graded; infinite where the response runs away.
     sound : ndarray of bool, shape (m,)
         False where the response runs away.
-    x_end : ndarray, shape (m, n_states)
-        The states in which the responses end.
-    command : ndarray, shape (m,)
-        The commands in which they end.
+    passage : Passage
     """
 
     metrics: dict[str, Array]
     sound: Mask
-    x_end: Array
-    command: Array
+    passage: Passage
 
     @staticmethod
     def empty(m: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
         """Metrics of m lanes to be filled in; until then they read as running away."""
-        return LaneMetrics(
-            {n: np.full(m, np.inf) for n in read}, np.zeros(m, dtype=bool), np.empty((m, n_states)), np.empty(m)
-        )
+        return LaneMetrics({n: np.full(m, np.inf) for n in read}, np.zeros(m, dtype=bool), Passage.empty(m, n_states))
 
 
 def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:
@@ -120,15 +114,15 @@ def is_sound(y: Array, x_end: Array) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class MarginReader:
-    """A function that computes margins and peaks of loops linearised about the end of their responses.
+    """A function that computes margins and peaks of loops, the worst over their operating points.
 
     Attributes
     ----------
     names : tuple of str
         The metrics that `read` gives.
     read : callable
-        Of parameters, shape (m, n_parameters), cases, shape (m,), and the states and commands in which the lanes end.
+        Of parameters, shape (m, n_parameters), cases, shape (m,), and the lanes' passage.
     """
 
     names: tuple[str, ...]
-    read: Callable[[Array, Indices, Array, Array], Mapping[str, Array]]
+    read: Callable[[Array, Indices, Passage], Mapping[str, Array]]

@@ -14,11 +14,11 @@ from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.meter import check_channels, needed_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS
-from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.grids import reference_grids, refine_grids
+from pneuopt.tuning.passage import Passage, PointFinder, fastest_samples
 from pneuopt.tuning.readings import (
     CONTROL_OUTPUT,
     SIGNAL_OUTPUT,
@@ -26,6 +26,7 @@ from pneuopt.tuning.readings import (
     has_integral,
     loop_pieces,
     read_metrics,
+    speed_output,
 )
 from pneuopt.tuning.responses import LaneMetrics, MarginReader, Responses, is_sound, to_records
 from pneuopt.tuning.rests import starts_before_step
@@ -45,6 +46,10 @@ COARSE_SAMPLES_A_PERIOD = 10
 # Corners of the gains' box, the fastest on the nominal plant, at which the fastest mode is sought on the scenarios'
 # plants. Fewer may miss a stiff one, on which RK4 is then unstable; each more costs an eigenvalue problem a plant.
 STIFFEST_CORNERS = 8
+# Highest frequency at which a sampled loop is read, times its sample time [rad]: below ten, its last crossings are
+# missed; more thin out the grid.
+MAX_SAMPLE_ANGLE = 20.0
+LaneRun = tuple[Array, Array, Array]  # start states, outputs and end states of lanes
 
 
 class Simulator:
@@ -66,7 +71,7 @@ class Simulator:
     ----------
     cases : tuple of Case
     response_metrics, margin_metrics : tuple of str
-        The metrics read off the responses, and off the loop linearised about their ends.
+        The metrics read off the responses, and off the loop linearised at their operating points.
     meter_channels : tuple of str
         Channels of the plant's meter that are run for them.
     rollout : Rollout
@@ -95,13 +100,10 @@ class Simulator:
         self.rollout = Rollout(loop_pieces(loop, self.meter_channels))
         self.grids = reference_grids(loop, references, space.parameters)
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
-        self._rate = rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
-        self.substeps = [rk4_substeps(rate, grid.spacing) for grid in self.grids]
-        slowest = 1 / max(r.horizon for r in references)
-        omega = np.geomspace(0.3 * slowest, max(rate, 1e3 * slowest), 150)
-        if len(self.margin_metrics) > 1:  # unlike the sensitivity's peak, crossings lie where a slow integral puts them
-            omega = np.concatenate([np.geomspace(3e-5, 0.29, 60) * slowest, omega])
-        self.robustness = batch_margin_function(loop, omega)  # about what `operating_points` gives
+        self._rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
+        self.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in self.grids]
+        self.robustness = batch_margin_function(loop, self._frequencies(references))  # about `operating_points`
+        self._find_points = PointFinder(loop, self.rollout, self._rate)
 
     def coarse(self, spec: Specification, bands: Sequence[float] = ()) -> "Simulator":
         """A copy for use during a search, with half as many samples, which reads only what `spec` asks for.
@@ -211,38 +213,14 @@ class Simulator:
         margins = {n: table[0] for n, table in responses.margin_metrics(np.ones(1, dtype=bool)).items()}
         return to_records({n: responses.table(n)[0] for n in self.response_metrics} | margins)
 
-    def _read_margins(self, p: Array, case: Indices, x_end: Array, commands: Array) -> dict[str, Array]:
-        """Margins and peaks of loops linearised about the points in which their lanes end."""
-        return self.robustness(p, *self.operating_points(p, case, x_end, commands), self.margin_metrics)
+    def _read_margins(self, p: Array, case: Indices, passage: Passage) -> dict[str, Array]:
+        """Margins and peaks of loops, the worst over their lanes' operating points."""
+        return self.robustness(p, *self.operating_points(p, case, passage), self.margin_metrics)
 
-    def operating_points(self, p: Array, case: Indices, x_end: Array, commands: Array) -> tuple[Array, Array]:
-        """The plant's states and commands in which lanes end; under dither their means over its last period.
-
-        A search keeps no states along a response, so one more period is run after its end. The change from that
-        period's start to its end is subtracted from the mean, which puts it back by one period.
-        """
-        x, u = x_end[:, : len(self.loop.plant.states)].copy(), commands.copy()
-        for period, rows in self.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
-            for g in np.unique(self._grid_of[case[rows]]).tolist() if period is not None else ():
-                own = np.flatnonzero(rows & (self._grid_of[case] == g))
-                means = self._means_after_end(self.grids[g], x_end[own], p[own], period or 0.0)
-                tame = np.isfinite(means).all(axis=1)
-                x[own[tame]], u[own[tame]] = means[tame, :-1], means[tame, -1]
-        return x, u
-
-    def _means_after_end(self, grid: ReferenceGrid, x_end: Array, p: Array, period: float) -> Array:
-        """Means of the plant's states and the command over one period after the end, minus their change in it."""
-        held = self.loop.pid.sample_time is not None
-        n = max(1, round(period / grid.spacing)) if held else SAMPLES_A_DITHER_PERIOD
-        h = grid.spacing if held else period / n
-        u = np.tile(grid.u[-1], (len(p), n + 1, 1))
-        t, steps = (np.tile(a, (len(p), 1)) for a in (grid.t[-1] + h * np.arange(n + 1), [h] * n + [0.0]))
-        with np.errstate(all="ignore"):
-            found = self.rollout.run(x_end, u, p, t, steps, substeps=rk4_substeps(self._rate, h), states=True)
-            assert found.x is not None
-            plant, control = found.x[:, :, : len(self.loop.plant.states)], found.y[:, :, CONTROL_OUTPUT, None]
-            along = np.concatenate([plant, control], axis=2)
-            return np.asarray(np.trapezoid(along, axis=1) / n - (along[:, -1] - along[:, 0]))
+    def operating_points(self, p: Array, case: Indices, passage: Passage) -> tuple[Array, Array]:
+        """The plant's states and inputs at the lanes' operating points; see `PointFinder`."""
+        lanes = [(self.grids[g], np.flatnonzero(self._grid_of[case] == g)) for g in np.unique(self._grid_of[case])]
+        return self._find_points(lanes, p, self.lane_periods(p), passage)
 
     def lanes(self, points: Array, rows: Indices, case: Indices) -> tuple[Array, Array]:
         """Parameters, shape (m, n_parameters), and start states, shape (m, n_states), of lanes.
@@ -319,37 +297,36 @@ class Simulator:
         u, t, h, steps = self.pad(case)
         with np.errstate(all="ignore"):
             found = self.rollout.run(starts, u, p, t, h, substeps=steps)
-        self._read(out, chunk, case, p, (found.y, found.x_end), band)
+        self._read(out, chunk, case, p, (starts, found.y, found.x_end), band)
 
-    def read(self, p: Array, case: Indices, run: tuple[Array, Array], shape: tuple[int, int], band: float) -> Responses:
+    def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: float) -> Responses:
         """The responses of candidates on every case, of which the outputs and end states are known.
 
         Parameters
         ----------
         p : ndarray, shape (m n_cases, n_parameters)
         case : ndarray of int, shape (m n_cases,)
-        run : tuple of ndarray, shapes (m n_cases, n, n_outputs) and (m n_cases, n_states)
-            Outputs and end states.
+        run : tuple of ndarray, shapes (m n_cases, n_states), (m n_cases, n, n_outputs) and (m n_cases, n_states)
+            Start states, outputs and end states.
         shape : tuple of int
             m and n_cases.
         band : float
         """
-        measured = LaneMetrics.empty(len(p), run[1].shape[1], self.response_metrics)
+        measured = LaneMetrics.empty(len(p), run[0].shape[1], self.response_metrics)
         for chunk in self._chunks(case):
-            self._read(measured, chunk, case[chunk], p[chunk], (run[0][chunk], run[1][chunk]), band)
+            self._read(measured, chunk, case[chunk], p[chunk], (run[0][chunk], run[1][chunk], run[2][chunk]), band)
         return Responses(np.ones(shape, dtype=bool), p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
-    def _read(
-        self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: tuple[Array, Array], band: float
-    ) -> None:
-        """Fill the rows `chunk` of `out` from outputs and end states."""
-        out.x_end[chunk] = run[1]
-        planes = np.ascontiguousarray(np.moveaxis(run[0], 2, 0))  # reading is over time, several times faster so
+    def _read(self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: LaneRun, band: float) -> None:
+        """Fill the rows `chunk` of `out` from start states, outputs and end states."""
+        starts, outputs, ends = run
+        out.passage.starts[chunk], out.passage.ends[chunk] = starts, ends
+        planes = np.ascontiguousarray(np.moveaxis(outputs, 2, 0))  # reading is over time, several times faster so
         for g in np.unique(self._grid_of[case]).tolist():
             own, grid = self._grid_of[case] == g, self.grids[g]
             y = np.moveaxis(planes[:, own, : len(grid.t)], 0, 2)
-            sound = is_sound(y, run[1][own])
-            out.sound[chunk[own]], out.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
+            sound = is_sound(y, ends[own])
+            out.sound[chunk[own]], out.passage.command[chunk[own]] = sound, y[:, -1, CONTROL_OUTPUT]
             for period, rows in self.lanes_by_dither_period(p[own], sound):
                 metrics = read_metrics(
                     grid,
@@ -362,6 +339,18 @@ class Simulator:
                 )
                 for n, value in metrics.items():
                     out.metrics[n][chunk[own][rows]] = value
+                out.passage.fastest[chunk[own][rows]] = self.fastest_samples(grid, y[rows], period)
+
+    def fastest_samples(self, grid: ReferenceGrid, y: Array, period: float | None) -> Indices:
+        """Samples of the largest speed, as `Passage` has them; zeros for a plant without an axis."""
+        k = speed_output(self.loop, self.meter_channels)
+        return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period or 0.0)
+
+    def _frequencies(self, references: Sequence[Step]) -> Array:
+        """Frequencies at which loops are read [rad/s], from where a slow integral swings against a resting drive on."""
+        slowest, h = 1 / max(r.horizon for r in references), self.loop.pid.sample_time
+        fastest = max(self._rate, 1e3 * slowest, MAX_SAMPLE_ANGLE / h if h else 0.0)
+        return np.concatenate([np.geomspace(3e-5, 0.29, 60) * slowest, np.geomspace(0.3 * slowest, fastest, 150)])
 
     def _dither_rates(self, p: Array) -> Array:
         if self.loop.dither is None:

@@ -150,7 +150,7 @@ def test_whatever_its_form_the_same_law_runs(
     np.testing.assert_allclose(terms[0], terms[1], rtol=1e-10)
     only = ("MaxSensitivity", "NoiseGain")
     reads = [
-        batch_margin_function(loop, w)(loop.parameter_vector(p)[None], np.zeros((1, 2)), np.zeros(1), only)
+        batch_margin_function(loop, w)(loop.parameter_vector(p)[None], np.zeros((1, 1, 2)), np.zeros((1, 1, 1)), only)
         for loop, p in pairs
     ]
     for name in only:

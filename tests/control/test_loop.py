@@ -7,7 +7,8 @@ import pytest
 from scipy.linalg import expm
 
 from pneuopt.control.dither import Dither
-from pneuopt.control.linear_loop import open_loop, pade_delay_response
+from pneuopt.control.linear_controller import pade_delay_response
+from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import System, define

@@ -46,7 +46,9 @@ def test_the_open_loop_has_the_sensors_pole() -> None:
     ours = frequency_response(open_loop(loop, p), w)
     assert ours == pytest.approx(np.array([expected(1j * v) for v in w]), rel=1e-9)
     x, numbers = np.zeros((1, len(loop.plant.states))), loop.parameter_vector(p)[None]
-    found = batch_margin_function(loop, np.geomspace(1.0, 1e3, 2000))(numbers, x, np.zeros(1), ("MaxSensitivity",))
+    found = batch_margin_function(loop, np.geomspace(1.0, 1e3, 2000))(
+        numbers, x[None], np.zeros((1, 1, 1)), ("MaxSensitivity",)
+    )
     assert found["MaxSensitivity"][0] == pytest.approx(margins(open_loop(loop, p)).max_sensitivity, rel=1e-4)
 
 
@@ -183,7 +185,9 @@ def test_an_encoders_margins_are_those_of_the_sampled_loop(h: float, filter_time
     ours = open_loop(loop, given)
     assert margins(ours).max_sensitivity == pytest.approx(np.max(1 / np.abs(1 + L)), rel=0.02)
     x, numbers = np.zeros((1, 2)), loop.parameter_vector(given)[None]
-    found = batch_margin_function(loop, np.geomspace(1.0, 1e3, 2000))(numbers, x, np.zeros(1), ("MaxSensitivity",))
+    found = batch_margin_function(loop, np.geomspace(1.0, 1e3, 2000))(
+        numbers, x[None], np.zeros((1, 1, 1)), ("MaxSensitivity",)
+    )
     assert found["MaxSensitivity"][0] == pytest.approx(margins(ours).max_sensitivity, rel=1e-4)
 
 

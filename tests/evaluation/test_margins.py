@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from pneuopt.control.linear_loop import linear_gains, open_loop
+from pneuopt.control.linear_controller import linear_gains
+from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.system import Linearisation, System
@@ -161,7 +162,9 @@ def test_many_sensitivities_are_those_of_one_loop_after_another(measured: str, s
         for Kp in (1.0, 3.0, 10.0, 20.0, 60.0)
     ]
     numbers = np.array([loop.parameter_vector(p) for p in sets])
-    found = batch_margin_function(loop, omega)(numbers, points, commands, ("MaxSensitivity",))["MaxSensitivity"]
+    found = batch_margin_function(loop, omega)(numbers, points[None], commands[None, :, None], ("MaxSensitivity",))[
+        "MaxSensitivity"
+    ]
     fine = np.geomspace(1, 1e4, 20001)
     for p, x, command, Ms in zip(sets, points, commands, found, strict=True):
         L = open_loop(loop, p, x, {loop.command.name: command})
@@ -181,7 +184,9 @@ def test_the_margins_of_unstable_loops_are_none(second_order: System, sample_tim
     loops = [open_loop(loop, p) for p in sets]
     stable = np.array([np.all(control.feedback(control.ss(L.A, L.B, L.C, L.D), 1).poles().real < 0) for L in loops])
     p, only = np.array([loop.parameter_vector(s) for s in sets]), ("MaxSensitivity", "PhaseMargin", "NoiseGain")
-    found = batch_margin_function(loop, np.geomspace(0.1, 1e4, 500))(p, np.zeros((60, 2)), np.zeros(60), only)
+    found = batch_margin_function(loop, np.geomspace(0.1, 1e4, 500))(
+        p, np.zeros((1, 60, 2)), np.zeros((1, 60, 1)), only
+    )
     assert 10 < stable.sum() < 50
     assert (np.isfinite(found["MaxSensitivity"]) == stable).all()
     assert (np.isnan(found["PhaseMargin"]) == ~stable).all()
@@ -236,7 +241,7 @@ def test_margins_on_a_grid_are_those_of_one_loop_after_another(second_order: Sys
     ]
     only = ("MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin", "NoiseGain")
     p, x = np.array([loop.parameter_vector(s) for s in sets]), np.zeros((len(sets), 2))
-    found = batch_margin_function(loop, np.geomspace(0.1, 1e4, 2000))(p, x, np.zeros(len(sets)), only)
+    found = batch_margin_function(loop, np.geomspace(0.1, 1e4, 2000))(p, x[None], np.zeros((1, len(sets), 1)), only)
     exact = [margins(open_loop(loop, s)) for s in sets]
     stable = np.array([m.stable for m in exact])
     assert stable.sum() >= 3
@@ -258,7 +263,7 @@ def test_without_gain_there_is_no_crossing(second_order: System) -> None:
     loop = ClosedLoop(second_order, PID())
     p = loop.parameter_vector(loop.parameters.with_values({"pid.Kp": 0.0, "pid.Ki": 0.0, "pid.Kd": 0.0, "pid.Tf": 0.1}))
     found = batch_margin_function(loop, [1.0, 10.0, 100.0])(
-        p[None], np.zeros((1, 2)), np.zeros(1), ("GainMargin", "PhaseMargin", "NoiseGain")
+        p[None], np.zeros((1, 1, 2)), np.zeros((1, 1, 1)), ("GainMargin", "PhaseMargin", "NoiseGain")
     )
     assert {n: v.tolist() for n, v in found.items()} == {
         "GainMargin": [np.inf],
@@ -277,7 +282,7 @@ def test_the_grids_peaks_are_refined_where_the_loop_rings(damping: float) -> Non
     sets = [loop.parameters.with_values({**plant, **dict(zip(names, row, strict=True))}) for row in rows]
     p, x = np.array([loop.parameter_vector(s) for s in sets]), np.zeros((len(sets), 2))
     only = ("MaxSensitivity", "MaxComplementarySensitivity")
-    found = batch_margin_function(loop, np.geomspace(0.1, 1e3, 150))(p, x, np.zeros(len(sets)), only)
+    found = batch_margin_function(loop, np.geomspace(0.1, 1e3, 150))(p, x[None], np.zeros((1, len(sets), 1)), only)
     exact = [margins(open_loop(loop, s)) for s in sets]
     calm = np.array([m.stable and m.max_sensitivity < 20 for m in exact])
     assert calm.sum() >= 20

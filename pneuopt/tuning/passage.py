@@ -1,0 +1,197 @@
+"""`Passage`: where simulated lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
+
+The points are those of `operating_points` in evaluation/operating_points.py. A search keeps no states along a response:
+the fastest sample is read off the outputs, and the states there come from a second run up to it.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pneuopt.control.averaged_plant import is_affine
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_OFFSET
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.dynamics.system import names
+from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
+from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid
+from pneuopt.tuning.space import rk4_substeps
+
+
+class Passage(NamedTuple):
+    """Where m lanes begin, move fastest and end.
+
+    Attributes
+    ----------
+    starts, ends : ndarray, shape (m, n_states)
+    fastest : ndarray of int, shape (m,)
+        Sample of the largest speed, under dither the first one of the period in which its mean is the largest.
+    command : ndarray, shape (m,)
+        The commands in which they end.
+    """
+
+    starts: Array
+    ends: Array
+    fastest: Indices
+    command: Array
+
+    @staticmethod
+    def empty(m: int, n_states: int) -> "Passage":
+        """Arrays to be filled in."""
+        states = np.zeros((m, n_states)), np.zeros((m, n_states))
+        return Passage(*states, np.zeros(m, dtype=np.intp), np.zeros(m))
+
+    def select(self, rows: Indices | Mask) -> "Passage":
+        """The passage of some lanes."""
+        return Passage(self.starts[rows], self.ends[rows], self.fastest[rows], self.command[rows])
+
+
+def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices:
+    """Samples of the largest speed after the step, shape (m,), as `Passage` has them.
+
+    Parameters
+    ----------
+    grid : ReferenceGrid
+    speed : ndarray, shape (m, n)
+    period : float
+        Of the mean [s]; 0 for none.
+    """
+    first, width = grid.step_index, max(1, round(period / grid.spacing))
+    means = speed[:, first:]
+    if period and means.shape[1] > width + 1:
+        sums = np.cumsum(means, axis=1)
+        means = sums[:, width:] - sums[:, :-width]
+    return np.asarray(first + np.argmax(np.abs(means), axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class PointFinder:
+    """Function that gives the operating points of simulated lanes, by a second run up to the fastest sample.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    rollout : Rollout
+        Of `loop_pieces`.
+    rate : float
+        The fastest eigenvalue that RK4 has to resolve [1/s].
+    """
+
+    loop: ClosedLoop
+    rollout: Rollout
+    rate: float
+
+    def __call__(
+        self, grids: Sequence[tuple[ReferenceGrid, Indices]], p: Array, periods: Array, passage: Passage
+    ) -> tuple[Array, Array]:
+        """Find the points.
+
+        Parameters
+        ----------
+        grids : sequence of (ReferenceGrid, ndarray of int)
+            Each grid and the lanes that run on it.
+        p : ndarray, shape (m, n_parameters)
+        periods : ndarray, shape (m,)
+            Periods over which lanes are averaged [s]; 0: they are not.
+        passage : Passage
+
+        Returns
+        -------
+        x : ndarray, shape (k, m, n_plant_states)
+        u : ndarray, shape (k, m, n_plant_inputs)
+            Of k points: at rest, sliding, at the end; of an affine plant the end alone.
+        """
+        found = [self._points(grid, rows, p, periods, passage) for grid, rows in grids]
+        x, u = (np.empty((len(a), len(p), a.shape[2])) for a in found[0])
+        for (_, rows), (own_x, own_u) in zip(grids, found, strict=True):
+            x[:, rows], u[:, rows] = own_x, own_u
+        return x, u
+
+    def _points(
+        self, grid: ReferenceGrid, rows: Indices, p: Array, periods: Array, passage: Passage
+    ) -> tuple[Array, Array]:
+        """Points of lanes on one grid, states and inputs, shapes (k, m, n)."""
+        own, p = passage.select(rows), p[rows]
+        states = list[Array]()
+        if not is_affine(self.loop.plant):
+            states.append(self._at_start(grid, p, own))
+            if self.loop.plant.axis is not None:
+                states.append(self._sliding(grid, p, periods[rows], own))
+        states.append(self._at_end(grid, p, periods[rows], own))
+        along, plant = np.array(states), self.loop.plant
+        u = np.zeros((len(along), len(p), len(plant.inputs)))
+        disturbances = dict(zip(names(self.loop.inputs), grid.u[-1].tolist(), strict=True))
+        for k, name in enumerate(names(plant.inputs)):
+            u[:, :, k] = along[:, :, -1] if name == self.loop.command.name else disturbances[name]
+            if name != self.loop.command.name and len(along) > 1:
+                u[0, :, k] = 0.0  # the disturbance has not begun
+        return along[:, :, :-1], u
+
+    def _at_start(self, grid: ReferenceGrid, p: Array, own: Passage) -> Array:
+        """The plant's state and the command before the step, shape (m, n_plant_states + 1), dither switched off."""
+        order, quiet = list(self.loop.parameters), p.copy()
+        quiet[:, [order.index(n) for n in (DITHER_AMPLITUDE, DITHER_OFFSET) if n in order]] = 0.0
+        u = np.zeros((len(p), 1, grid.u.shape[1]))
+        u[:, 0, 0] = grid.reference.initial
+        none = np.zeros((len(p), 1))
+        control = self.rollout.run(own.starts, u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
+        return np.column_stack([own.starts[:, : len(self.loop.plant.states)], control])
+
+    def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage) -> Array:
+        """The plant's state and the command at the fastest sample, or their means over the period that begins there."""
+        last, (u, t, h) = int(own.fastest.max()), grid.pad(len(grid.t))
+        k = np.minimum(np.arange(last + 1), own.fastest[:, None])
+        steps = np.where(np.arange(last + 1) < own.fastest[:, None], h[k], 0.0)
+        with np.errstate(all="ignore"):
+            run = self.rollout.run(own.starts, u[k], p, t[k], steps, substeps=rk4_substeps(self.rate, grid.spacing))
+        control = run.y[:, last, CONTROL_OUTPUT]
+        out = np.column_stack([run.x_end[:, : len(self.loop.plant.states)], control])
+        for period, rows in _by_period(periods):
+            along = self._period(grid, run.x_end[rows], p[rows], grid.t[own.fastest[rows]], period)
+            _put_finite(out, rows, _mean(along))
+        return out
+
+    def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage) -> Array:
+        """The plant's state and the command at the end, under dither their means over the last period.
+
+        One more period is run after the end. The change from that period's start to its end is subtracted from the
+        mean, which puts it back by one period.
+        """
+        out = np.column_stack([own.ends[:, : len(self.loop.plant.states)], own.command])
+        for period, rows in _by_period(periods):
+            along = self._period(grid, own.ends[rows], p[rows], np.full(len(rows), grid.t[-1]), period)
+            _put_finite(out, rows, _mean(along) - (along[:, -1] - along[:, 0]))
+        return out
+
+    def _period(self, grid: ReferenceGrid, x: Array, p: Array, t: Array, period: float) -> Array:
+        """The plant's states and the command along one period from t on, shape (m, n, n_plant_states + 1)."""
+        held = self.loop.pid.sample_time is not None
+        n = max(1, round(period / grid.spacing)) if held else SAMPLES_A_DITHER_PERIOD
+        h = grid.spacing if held else period / n
+        u, steps = np.tile(grid.u[-1], (len(p), n + 1, 1)), np.tile([h] * n + [0.0], (len(p), 1))
+        with np.errstate(all="ignore"):
+            run = self.rollout.run(
+                x, u, p, t[:, None] + h * np.arange(n + 1), steps, substeps=rk4_substeps(self.rate, h), states=True
+            )
+        assert run.x is not None
+        plant = run.x[:, :, : len(self.loop.plant.states)]
+        return np.concatenate([plant, run.y[:, :, CONTROL_OUTPUT, None]], axis=2)
+
+
+def _by_period(periods: Array) -> Iterator[tuple[float, Indices]]:
+    """Each period that is averaged over, and its lanes."""
+    for period in np.unique(periods[periods > 0]).tolist():
+        yield period, np.flatnonzero(periods == period)
+
+
+def _mean(along: Array) -> Array:
+    return np.asarray(np.trapezoid(along, axis=1) / (along.shape[1] - 1))
+
+
+def _put_finite(out: Array, rows: Indices, means: Array) -> None:
+    """Put means into their rows, but those of lanes that run away."""
+    tame = np.isfinite(means).all(axis=1)
+    out[rows[tame]] = means[tame]

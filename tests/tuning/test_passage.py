@@ -1,0 +1,71 @@
+"""The margins of a search are those of the certificate, at every operating point, with and without dither."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pneuopt.control.disturbance import add_disturbances
+from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.requirements import GainMargin, MaxSensitivity, PhaseMargin, SettlingTime
+from pneuopt.evaluation.specification import specify
+from pneuopt.models.catalog import t32
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import LuGre, Stribeck
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import search_space
+
+ROWS = ("MaxSensitivity", "GainMargin", "PhaseMargin")
+SPEC = specify(SettlingTime(), [MaxSensitivity(2.0), GainMargin(2.0), PhaseMargin(30.0)])
+
+
+def cylinder() -> tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[float, float]]]:
+    drive, p = t32()
+    loop = ClosedLoop(drive.system(), PID(), Dither(1000 / (2 * np.pi)))
+    ranges = {"pid.Kp": (4.0, 12.0), "pid.Ki": (20.0, 150.0), "pid.Kd": (0.0, 0.1), "dither.amplitude": (0.3, 2.0)}
+    values = {"pid.Tf": 0.003, "pid.lower": -5.0, "pid.upper": 5.0, "dither.offset": -0.3}
+    step = Step(0.2, horizon=0.5, start={"position": 0.05, "pressure_b": 3.5e5})
+    return loop, loop.complete(p).with_values(values), step, ranges
+
+
+def positioner() -> tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[float, float]]]:
+    """A position loop that a load disturbs; its friction's slope is a hundred times smaller sliding than at rest."""
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(2e-3), measured="position")
+    p = loop.parameters.with_values({"friction.smoothing": 2e-3, "pid.Tf": 4e-3, "friction.viscous": 80.0})
+    ranges = {"pid.Kp": (500.0, 4000.0), "pid.Ki": (0.0, 500.0), "pid.Kd": (20.0, 150.0)}
+    return loop, p, Step(0.05, horizon=0.6, disturbance={"load.force": 10.0}), ranges
+
+
+def sampled_axis() -> tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[float, float]]]:
+    """A speed loop with a sampled triangle of 100 Hz, between two speeds."""
+    loop = ClosedLoop(ForceDrive(LuGre()).system(), PID(1e-3), Dither(100.0, waveform=Waveform.TRIANGLE))
+    p = loop.parameters.with_values({"dither.amplitude": 20.0, "pid.Tf": 5e-3})
+    ranges = {"pid.Kp": (50.0, 400.0), "pid.Ki": (500.0, 5000.0), "dither.amplitude": (0.0, 30.0)}
+    return loop, p, Step(0.1, at=0.05, initial=0.05, horizon=0.5), ranges
+
+
+@pytest.mark.parametrize("problem", [cylinder, positioner, sampled_axis])
+def test_search_and_certificate_agree_on_random_gains(
+    problem: Callable[[], tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[float, float]]]],
+) -> None:
+    loop, given, step, ranges = problem()
+    given = given.with_values({n: sum(r) / 2 for n, r in ranges.items()}).with_bounds(ranges).freed(*ranges)
+    loop = add_disturbances(loop, [step])
+    space = search_space(loop, given)
+    simulator = Simulator(loop, [step], space, spec=SPEC)
+    points, compared = space.from_unit(np.random.default_rng(1).random((4, len(ranges)))), 0
+    for point in points:
+        (claimed,) = simulator.table(point, SPEC)
+        certified = evaluate(loop, step, space.parameters_at(point)).iloc[:, 0]
+        peaks = claimed["MaxSensitivity"], certified["MaxSensitivity"]
+        assert 1 / peaks[0] == pytest.approx(1 / peaks[1], abs=0.01)  # infinite where unstable
+        if max(peaks) < 10:
+            compared += 1
+            for name in ROWS:
+                assert claimed[name] == pytest.approx(certified[name], rel=0.01), name
+    assert compared >= 2
