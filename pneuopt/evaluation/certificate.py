@@ -1,4 +1,30 @@
-"""`certificate`: what an independent simulation and the linear loop say about gains, and what is wrong with them."""
+"""`certificate`: what an independent simulation and the linear loop say about gains, and what is wrong with them.
+
+A certificate without findings means, for the gains as printed and on every reference and scenario:
+
+* The loop, integrated by LSODA to 1e-10, has the metrics that are shown; where it was tuned, they keep every limit,
+  without slack, and the objective agrees with the search's claim to 1 %, neither worse nor better, or to the
+  `Metric.resolution` of its terms where it is nearly zero.
+* The linear loop is stable, with the margins that are shown, at every operating point of `Certificate.margins`.
+* The response has come to rest, or to a periodic orbit inside the settling band, at the reference. A horizon can end
+  too early to tell. So the response is continued, its length doubled again and again, until signal and command stand,
+  to sixteen horizons, or to the end of the stroke, which a note then says. Growth, hunting and creep that begin beyond
+  the horizon are findings, and so is a response that a budget of simulated instants leaves undecided. The metrics stay
+  those of the horizon, but for a SettlingTime that the continuation refutes, which is NaN, and an Overshoot that it
+  exceeds.
+
+A design with a finding is never "converged", whatever was asked, unless `tune(..., accept=...)` names the defect. A
+rest off the reference is none where a limit on SteadyStateError allows it.
+
+What it does not mean: other plants than the scenarios may behave otherwise, and the model may be wrong.
+
+The certificate shares the model with the search, its equations, parameters, rest, linearisation and compiled right-hand
+side; the definitions of the metrics, which read both responses; and the formulas of frequency responses and stability.
+It shares no step of the search: the search integrates by steps of RK4 on its own samples and reads the margins of many
+loops at once off a grid; the certificate integrates by SciPy's LSODA with step control on a closer grid, and refines
+each margin to machine precision. That what is shared is right is shown by tests against hand-written plants, SciPy and
+python-control.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,7 +51,7 @@ class Certificate:
     Attributes
     ----------
     metrics : DataFrame
-        As `evaluate` returns them.
+        As `evaluate` returns them, but for what the continuation refutes.
     findings : tuple of Finding
         The defects; empty where the gains hold on every case.
     notes : tuple of str

@@ -191,7 +191,8 @@ def correct_metrics(ending: Ending, metrics: Mapping[str, float]) -> dict[str, f
     continuation where it is larger.
     """
     largest = ending.largest_overshoot
-    refuted = {"SettlingTime": nan} if ending.refutes(metrics["SettlingTime"]) else {}
+    times = [n for n in ("SettlingTime", "SettlingTimeRaw") if n in metrics]
+    refuted = dict.fromkeys(times, nan) if ending.refutes(metrics["SettlingTime"]) else {}
     higher = {"Overshoot": 100 * largest} if largest > metrics["Overshoot"] / 100 + BAND_TOLERANCE * ending.band else {}
     return {**metrics, **refuted, **higher}
 

@@ -1,4 +1,4 @@
-"""`tune`: find PID gains and dither together, and certify them by a simulation that shares nothing with the search.
+"""`tune`: find PID gains and dither together, and certify them by a simulation that shares no step with the search.
 
 A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or sampling, by compiled simulation
 (`Racing`). The gains are rounded first and certified then, so that the printed numbers are proven.
