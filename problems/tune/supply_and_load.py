@@ -4,6 +4,10 @@
 
 A sampled speed PID with dither is tuned on a 32 mm cylinder (catalogue set, LuGre friction) at 6 bar(g) and 5 kg for a
 slow and a fast step, then simulated, gains as printed, over 4 to 8 bar(g) and 2 to 10 kg: `grid`, `sweep`, `plot_map`.
+
+Rows map.*: it keeps the overshoot that it was tuned for in fewer than half of the 25 cases, half of them take half as
+long again to settle, and in the worst one it takes more than five times as long or never settles. A case that never
+settles counts so in the median and in the worst: its settling time is infinite.
 """
 
 import sys
@@ -14,6 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `problems`
+
+import numpy as np
 
 import pneuopt as po
 from problems.shared.claims import Claim, arguments, design, finish, frame
@@ -68,19 +74,28 @@ def run() -> Job:
 def main(job: Job) -> "pd.DataFrame":
     study, good = job.study, job.study[job.study["error"] == ""]
     claims = design("tuned", job.best.parameters, job.best.certified, BOUNDS)
+    fewest = f"<= {len(study) // 2}"
     claims += [
         Claim("map.cases", len(study)),
         Claim("map.failed", len(study) - len(good), "1", None, "<= 0"),
         Claim("map.never_settle", int(good["SettlingTime"].isna().sum())),
-        Claim("map.overshoot_within_5", int((good["Overshoot"] <= 5).sum())),
+        Claim("map.overshoot_within_5", int((good["Overshoot"] <= 5).sum()), "1", None, fewest),
         Claim("map.seconds", job.seconds, "s"),
     ]
+    nominal = float(np.max(job.best.certified.loc["SettlingTime"].to_numpy(dtype=float)))
+    bounds = {"settling_time.median": f">= {1.5 * nominal:.3g}", "settling_time.worst": f">= {5 * nominal:.3g}"}
     for metric, unit in METRICS.items():
-        worst = good.sort_values(metric, na_position="first").iloc[-1]
+        values = good[metric].to_numpy(dtype=float)
+        counted = np.where(np.isnan(values), np.inf, values)
+        worst = good.iloc[int(np.argmax(counted))]
         name = "settling_time" if metric == "SettlingTime" else "overshoot"
-        claims.append(Claim(f"map.{name}.best", good[metric].min(), unit))
-        claims.append(Claim(f"map.{name}.median", good[metric].median(), unit))
-        claims.append(Claim(f"map.{name}.worst", worst[metric], unit))
+        for figure_of, value in {
+            "best": np.min(counted),
+            "median": np.median(counted),
+            "worst": np.max(counted),
+        }.items():
+            row = f"{name}.{figure_of}"
+            claims.append(Claim(f"map.{row}", float(value), unit, None, bounds.get(row, "")))
         claims.append(Claim(f"map.{name}.worst.pressure", worst["supply.pressure"] / 1e5, "bar"))
         claims.append(Claim(f"map.{name}.worst.mass", worst["load.mass"], "kg"))
     return frame(claims)

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from problems.shared.claims import Claim, arguments, finish, frame, table
+from problems.shared.claims import Claim, arguments, finish, frame, table, unbounded_patterns
 
 GOOD = Claim("design.settling", 0.203, "s", 0.503, "<= 0.21")
 SHOWN = Claim("design.Kp", 0.3972, "V/V")
@@ -29,6 +29,15 @@ def test_nan_keeps_no_bound_and_the_exit_status_says_so(tmp_path: Path, capsys: 
     assert (written[0]["holds"], written[1]["value"], written[1]["holds"]) == (True, None, False)
     assert "FAIL" in capsys.readouterr().out
     assert [f.name for f in (tmp_path / "deep").iterdir()] == ["rows.json"]
+
+
+def test_what_the_text_claims_of_rows_has_a_bound(capsys: pytest.CaptureFixture[str]) -> None:
+    text = "Rows design.*: settled. Rows map.*: what it costs. Rows *.Kp: shown. Rows later.*: of another run."
+    rows = frame([GOOD, Claim("map.air", 2.0, "l"), Claim("map.best", 1.0, "s"), SHOWN])
+    assert unbounded_patterns(text, rows) == ["map.*", "*.Kp"]
+    assert finish(rows, arguments(text).parse_args([])) == 1
+    assert "claimed in the text without a bound: map.*, *.Kp" in capsys.readouterr().out
+    assert finish(rows, arguments("Rows design.*: settled.").parse_args([])) == 0
 
 
 def test_figures_are_made_only_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
