@@ -29,7 +29,9 @@ LAWS = {
 }
 SOURCE_HEIGHT, SENSOR_HEIGHT, WIRE_HEIGHT = 1.2, -1.45, -1.15  # [inch] of what is added, of the sensor, without one
 PID_WIDTH, SOURCE_WIDTH, SMALL_WIDTH, PLANT_WIDTH = 2.1, 1.5, 0.8, 1.7  # [inch] of blocks
+COMPENSATOR_WIDTH = 1.15  # [inch]
 OUTPUT_SPACING = 0.32  # [inch] between the outputs of a plant: closer, their labels overlap
+FRAME = 0.12  # [inch] between the controller and the frame around it
 BRANCH = 0.15  # [inch] from an arrow's begin to where it divides
 
 
@@ -60,6 +62,7 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     sheet.draw_arrow("error", loop.feedback.unit)
     _draw_pid(sheet, loop)
     _draw_feedforward(sheet, loop)
+    _draw_compensators(sheet, loop)
     _draw_command(sheet, loop)
     _draw_sampling(sheet, loop, begin)
     sheet.draw_arrow("control", loop.command.unit, least=sheet.above + 0.15 - sheet.x)
@@ -81,6 +84,14 @@ def _draw_feedforward(sheet: Sheet, loop: ClosedLoop) -> None:
         centre = sheet.draw_source("feedforward\n" + r"gain $\frac{time\;s}{time\;s + 1}$", SOURCE_WIDTH, SOURCE_HEIGHT)
         sheet.draw_branch(BRANCH, 0.0)
         sheet.draw_line([(BRANCH, 0.0), (BRANCH, SOURCE_HEIGHT), (centre - SOURCE_WIDTH / 2, SOURCE_HEIGHT)])
+
+
+def _draw_compensators(sheet: Sheet, loop: ClosedLoop) -> None:
+    """Each adds to the command that it gets."""
+    for part in loop.compensators:
+        sheet.draw_arrow()
+        centre = sheet.draw_block(fill(part.section.replace("_", " "), 14), COMPENSATOR_WIDTH)
+        sheet.write_below(centre, "adds to the\ncommand")
 
 
 def _draw_command(sheet: Sheet, loop: ClosedLoop) -> None:
@@ -106,8 +117,10 @@ def _draw_sampling(sheet: Sheet, loop: ClosedLoop, begin: float) -> None:
     sheet.draw_curve(centre, 0.0, steps)
     sheet.write_below(centre, "hold")
     top = sheet.high + 0.3
-    sheet.draw_frame(begin - 0.12, sheet.x + 0.12, -0.98, top, f"controller, every {1e3 * h:g} ms")
-    sheet.above = sheet.x + 0.12
+    sheet.draw_frame(begin - FRAME, sheet.x + FRAME, -0.98, top, f"controller, every {1e3 * h:g} ms")
+    sheet.draw_line([(sheet.x, 0.0), (sheet.x + FRAME, 0.0)], head=False)
+    sheet.x += FRAME
+    sheet.above = sheet.x
     if loop.dither and _has_generator(loop):
         _draw_dither(sheet, loop.dither.waveform, "dither generator:")
         _draw_limits(sheet, loop)

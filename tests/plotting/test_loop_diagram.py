@@ -8,6 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
+from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
@@ -24,7 +25,8 @@ from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Quantity
 
 SAMPLED = {"limits", "hold", "controller, every"}
-OPTIONS = {*SAMPLED, "dither", "generator", "computing", "feedforward", "sensor:", "encoder", "dead band"}
+RIVALS = {"friction feedforward", "knocker", "dead zone inverse"}
+OPTIONS = {*SAMPLED, *RIVALS, "dither", "generator", "computing", "feedforward gain", "sensor:", "encoder", "dead band"}
 FORCE, VALVE = ForceDrive(LuGre()).system(), PneumaticDrive(friction=LuGre()).system()
 BARE = ClosedLoop(FORCE, PID(limits=False))
 
@@ -52,7 +54,11 @@ LOOPS = {
     "analogue": (ClosedLoop(VALVE, PID(1e-3), ANALOGUE, measured="speed"), {*SAMPLED, "dither", "generator"}),
     "lag": (
         ClosedLoop(VALVE, PID(limits=False), Dither(), None, "position", LAGGING, Feedforward()),
-        {"sensor:", "feedforward", "dither"},
+        {"sensor:", "feedforward gain", "dither"},
+    ),
+    "rivals": (
+        ClosedLoop(VALVE, PID(1e-3), measured="speed", compensators=tuple(part() for part in COMPENSATORS.values())),
+        {*SAMPLED, *RIVALS},
     ),
     "other input": (ClosedLoop(pushed(), PID(limits=False), actuated="valve_voltage"), set()),
 }
