@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.text import Text
 
-from pneuopt.cli.terminal import format_number, new_table
+from pneuopt.cli.terminal import format_number, new_table, show_sentence
 from pneuopt.control.forms import Form, ParallelForm, SeriesForm, StandardForm, to_parallel, to_standard
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
@@ -25,8 +24,12 @@ from pneuopt.tuning.validation import DesignValidation
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_REFERENCE_COLUMNS = 3
-"""References beside each other: more do not fit a terminal of 80 columns, so that the worst of all is shown."""
+MAX_REFERENCE_COLUMNS, MAX_COMPARED_COLUMNS = 3, 2
+"""References beside each other, alone and with other figures: more do not fit 80 columns; their worst is shown."""
+MIN_SHOWN_PERCENT = 1e-3
+"""Least figure in percent that is shown as it is: below, digits of rounding errors hide the others."""
+MIN_DERIVATIVE_RATIO = 0.01
+"""Td/Tf below which a derivative adds less than 1 % to Kp at any frequency: its time would be a riddle."""
 MAX_CASE_ROWS, MAX_FAILURE_REASONS = 40, 5
 """Rows and reasons that a study shows: more scroll the verdict away."""
 MAX_GAIN_COLUMNS = 6
@@ -42,7 +45,7 @@ def show_gains(console: Console, before: ParameterSet, after: ParameterSet) -> N
         mark = "at its bound" if p.value in (p.lower, p.upper) else ""
         table.add_row(n, write_value(before.value(n), unit), write_value(p.value, unit), bounds, mark)
     console.print(table)
-    console.print(_other_form(after), soft_wrap=True)
+    show_sentence(console, _other_form(after))
 
 
 def show_rejection(console: Console, tuning: Path, stats: Mapping[str, float], given: ParameterSet, word: str) -> None:
@@ -70,10 +73,10 @@ def show_metrics(
     loop: ClosedLoop,
     *,
     title: str = "certified",
-    before: "pd.DataFrame | None" = None,
+    beside: tuple[str, "pd.DataFrame | None"] = ("", None),
     limits: Sequence[Requirement] = (),
 ) -> None:
-    """Certified metrics, a column a reference.
+    """Certified metrics, a column a reference, or their worst where there are many.
 
     Parameters
     ----------
@@ -84,27 +87,28 @@ def show_metrics(
         Gives the units.
     title : str
         What the figures are.
-    before : DataFrame, optional
-        The same with the gains before.
+    beside : (str, DataFrame or None)
+        Figures of the same references that stand beside them, and their heading: "was", with the gains before.
     limits : sequence of Requirement
     """
     units, allowed = metric_units(loop), {metric_name(q): _format_limit(q) for q in limits}
-    several = len(metrics.columns) > MAX_REFERENCE_COLUMNS
-    columns = [f"worst of {len(metrics.columns)}"] if several else [f"{c} {loop.feedback.unit}" for c in metrics]
+    heading, other = beside
+    several = len(metrics.columns) > (MAX_REFERENCE_COLUMNS if other is None else MAX_COMPARED_COLUMNS)
+    names = [f"worst of {len(metrics.columns)}"] if several else [f"{c}\n{loop.feedback.unit}" for c in metrics]
+    columns = [title for name in names for title in ((name,) if other is None else (name, heading))]
     table = new_table(title, *columns, *(["limit"] if allowed else []), "unit")
     for metric in (m for m in units if m in metrics.index and _is_relevant(m, metrics, loop)):
-        now, was = (_metric_values(frame, metric, several) for frame in (metrics, before))
-        cells = [
-            _metric_cell(metric, v) + (f" (was {_metric_cell(metric, was[k])})" if was else "")
-            for k, v in enumerate(now)
-        ]
-        limit = [allowed.get(metric, "")] if allowed else []
-        table.add_row(metric, *cells, *limit, units[metric])
+        now, then = (_metric_values(frame, metric, several) for frame in (metrics, other))
+        cells = [_metric_cell(metric, v) for v in now]
+        if other is not None:
+            beside_cells = [_metric_cell(metric, v, 3) for v in then] or [""] * len(cells)
+            cells = [cell for pair in zip(cells, beside_cells, strict=True) for cell in pair]
+        table.add_row(metric, *cells, *([allowed.get(metric, "")] if allowed else []), units[metric])
     console.print(table)
 
 
-def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[str], loop: ClosedLoop) -> None:
-    """The room to each limit, and which limits and bounds are active.
+def show_active(console: Console, table: "pd.DataFrame", active: Sequence[str], parameters: ParameterSet) -> None:
+    """What keeps the objective from being smaller: limits with the room that is left, and bounds of the gains.
 
     Parameters
     ----------
@@ -113,20 +117,32 @@ def show_requirements(console: Console, table: "pd.DataFrame", active: Sequence[
         Of a `TuningResult`, "requirements".
     active : sequence of str
         Likewise.
-    loop : ClosedLoop
-        Gives the units.
+    parameters : ParameterSet
+        The tuned ones.
     """
-    units, grid = metric_units(loop), new_table("requirement", "claimed", "certified", "limit", "room", "", "unit")
-    for row in table.reset_index(names="requirement").to_dict(orient="records"):
-        metric = str(row["requirement"])
-        values = [percent_factor(metric) * row[n] for n in ("claimed", "certified", "allowed")]
-        figures = [_metric_cell(metric, v) for v in values[:2]] + [format_number(values[2], 4)]
-        room = "-" if math.isnan(row["room"]) else f"{100 * row['room']:.3g} %"
-        grid.add_row(metric, *figures, room, "active" if row["active"] else "", units[metric])
-    console.print(grid)
-    others = [n for n in active if n not in table.index]
-    if others:
-        console.print(f"also held back by: {', '.join(others)}", soft_wrap=True)
+    limits = [f"{n} ({100 * row['room']:.2g} % of room left)" for n, row in table.iterrows() if row["active"]]
+    at_bounds = [n for n in parameters.free_names if parameters.value(n) in (parameters[n].lower, parameters[n].upper)]
+    bounds = [f"{n} (at its bound)" for n in dict.fromkeys((*at_bounds, *(a for a in active if a not in table.index)))]
+    if limits or bounds:
+        show_sentence(console, f"held back by: {', '.join((*limits, *bounds))}")
+
+
+def show_margins(console: Console, margins: "pd.DataFrame") -> None:
+    """Where the loop's sensitivity is largest, operating point by operating point.
+
+    Parameters
+    ----------
+    console : Console
+    margins : DataFrame
+        Of a `Certificate`.
+    """
+    if margins.empty:
+        return
+    worst = margins.groupby("point", sort=False)["MaxSensitivity"].max().to_dict()
+    parts = ", ".join(f"{value:.4g} {point}" for point, value in worst.items())
+    phase = margins["PhaseMargin"].min() if "PhaseMargin" in margins else math.nan
+    also = "" if math.isnan(phase) else f"; phase margin at least {phase:.3g} deg"
+    show_sentence(console, f"MaxSensitivity, the worst of all cases: {parts}{also}")
 
 
 def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
@@ -146,22 +162,33 @@ def show_relaxations(console: Console, table: "pd.DataFrame") -> None:
     console.print(grid)
 
 
+def show_validation_verdict(console: Console, found: DesignValidation) -> None:
+    """On how many plants a design holds, and what breaks on the others."""
+    breaks = ", ".join(
+        f"{word} breaks on {count}" if word in METRICS else f"it {word} on {count}"
+        for word, count in found.breaks.items()
+    )
+    text = f"{found.verdict}: {breaks}" if breaks else found.verdict
+    show_sentence(console, text, style="bold yellow" if found.broken else "bold green")
+
+
 def show_validation(console: Console, found: DesignValidation, loop: ClosedLoop) -> None:
-    """On how many plants a design holds, what they differ by, what breaks and would help; then the figures."""
+    """What the plants differ by, the figures on them, and what would help."""
     units = metric_units(loop)
-    console.print(Text(found.verdict, style="bold yellow" if found.broken else "bold green"), soft_wrap=True)
-    breaks = ", ".join(f"{word} on {count}" for word, count in found.breaks.items())
-    for sentence in (*found.varied, *([f"what breaks: {breaks}"] if breaks else []), *found.advice):
-        console.print(f"  {sentence}", soft_wrap=True)
-    if found.suggested:
-        console.print(f"  in the tuning's file: {'; '.join(_scenario_lines(found.suggested))}", soft_wrap=True)
-    table = new_table("new plants", "median", "95 %", "worst", "certified", "limit", "broken by", "unit")
+    show_sentence(console, f"tried on {found.count} plants that no search has seen, each off by")
+    for sentence in found.varied:
+        show_sentence(console, sentence, indent=2)
+    table = new_table("new plants", "median", "95 %", "worst", "limit", "broken by", "unit")
     for row in found.summary.reset_index(names="metric").to_dict(orient="records"):
         metric = str(row["metric"])
-        figures = [_metric_cell(metric, row[n]) for n in ("median", "p95", "worst", "certified")]
+        figures = [_metric_cell(metric, row[n]) for n in ("median", "p95", "certified")]
         limit = "" if math.isnan(row["limit"]) else format_number(row["limit"], 4)
         table.add_row(metric, *figures, limit, str(row["violations"]), units[metric])
     console.print(table)
+    for sentence in found.advice:
+        show_sentence(console, sentence)
+    if found.suggested:
+        show_sentence(console, f"to do so, add to the tuning's file: {'; '.join(_scenario_lines(found.suggested))}")
 
 
 def _scenario_lines(axes: Sequence[PlantAxis]) -> list[str]:
@@ -178,9 +205,9 @@ def show_dither(console: Console, verdict: DitherVerdict) -> None:
     """Whether a dither is useful, and why, a sentence a line."""
     colours = {Usefulness.USEFUL: "bold green", Usefulness.HARMFUL: "bold red", Usefulness.USELESS: "bold yellow"}
     head, *reasons = str(verdict).splitlines()
-    console.print(Text(head, style=colours[verdict.usefulness]), soft_wrap=True)
+    show_sentence(console, head, style=colours[verdict.usefulness])
     for reason in reasons:
-        console.print(reason, soft_wrap=True)
+        show_sentence(console, reason.strip(), indent=2)
 
 
 def show_cases(console: Console, table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mapping[str, str]) -> None:
@@ -288,6 +315,8 @@ def _other_form(parameters: ParameterSet) -> str:
     form = to_standard(gains)
     integral = f", Ti {form.Ti:.4g} s" if gains.Ki else ", no integral"
     derivative = f", Td {form.Td:.4g} s, N {form.N:.4g} (ISA's ratio Td/Tf)" if gains.Kd else ", no derivative"
+    if 0 < abs(form.N) < MIN_DERIVATIVE_RATIO:
+        derivative = f", next to no derivative (Kd/Tf is {100 * abs(form.N):.2g} % of Kp)"
     return f"standard form: Kp {form.Kp:.4g}{integral}{derivative}"
 
 
@@ -296,5 +325,9 @@ def _format_limit(requirement: Requirement) -> str:
     return "" if limit is None else f"{relation} {format_number(requirement.metric.factor * limit, 4)}"
 
 
-def _metric_cell(metric: str, value: float) -> str:
-    return "never" if metric in ("SettlingTime", "SettlingTimeRaw") and math.isnan(value) else format_number(value, 4)
+def _metric_cell(metric: str, value: float, digits: int = 4) -> str:
+    if metric in ("SettlingTime", "SettlingTimeRaw") and math.isnan(value):
+        return "never"
+    if percent_factor(metric) == 100 and 0 < abs(value) < MIN_SHOWN_PERCENT:
+        return f"< {MIN_SHOWN_PERCENT:g}"
+    return format_number(value, digits)

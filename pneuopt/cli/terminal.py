@@ -2,6 +2,7 @@
 
 import math
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -48,9 +49,24 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
 def show_status(console: Console, status: Status) -> None:
     """How a computation ended: the verdict in bold, then its details, a line each."""
     verdict, *details = str(status).splitlines()
-    console.print(Text(verdict, style="bold green" if status.converged else "bold red"), soft_wrap=True)
+    show_sentence(console, verdict, style="bold green" if status.converged else "bold red")
     for detail in details:
-        console.print(detail, soft_wrap=True)
+        show_sentence(console, detail.strip(), indent=2)
+
+
+def show_sentence(console: Console, text: str, *, indent: int = 0, style: str = "") -> None:
+    """A sentence in one piece; on a terminal in lines that end between words, the second one indented by two more."""
+    lines = [" " * indent + text]
+    if console.is_terminal:
+        lines = textwrap.wrap(
+            lines[0],
+            console.width,
+            subsequent_indent=" " * (indent + 2),
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    for line in lines:
+        console.print(Text(line, style=style), soft_wrap=True)
 
 
 def show_output_files(console: Console, paths: Sequence[Any]) -> None:

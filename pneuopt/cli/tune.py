@@ -21,13 +21,15 @@ from pneuopt.cli.shared import (
     write_csv,
 )
 from pneuopt.cli.show_loops import (
+    show_active,
     show_dither,
     show_gains,
+    show_margins,
     show_metrics,
     show_rejection,
     show_relaxations,
-    show_requirements,
     show_validation,
+    show_validation_verdict,
 )
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.control.disturbance import add_disturbances
@@ -73,7 +75,8 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     else:
         word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
         show_rejection(console, tuning, result.stats, parameters, word)
-        show_metrics(console, result.certified, task.loop, title=word, limits=task.specification.limits)
+        limits, beside = task.specification.limits, ("on rig", result.on_rig)
+        show_metrics(console, result.certified, task.loop, title=word, beside=beside, limits=limits)
         show_relaxations(console, result.relaxations)
     if result.status.code is Code.INTERRUPTED:
         console.print("no file is written")
@@ -137,21 +140,23 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
 
 
 def _show_design(console: "Console", task: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
-    """Show gains, metrics, the validation on new plants and the dither's verdict; returns the last two as tables."""
-    show_gains(console, before, result.parameters)
-    show_metrics(
-        console, result.certified, task.loop, before=_initial_metrics(task, before), limits=task.specification.limits
-    )
-    show_requirements(console, result.requirements, result.active, task.loop)
-    slopes = [v for n, v in result.stats.items() if n.startswith("friction_slope")]
-    axis = task.loop.plant.axis
-    if slopes and axis is not None:
-        length = next(q.unit for q in task.loop.plant.states if q.name == axis.position)
-        ends = " to ".join(dict.fromkeys(f"{v:.4g}" for v in (min(slopes), max(slopes))))
-        console.print(
-            f"margins are read with the slope that friction has where a step ends: {ends} {axis.force}*s/{length}"
-        )
+    """Show a certified design: on how many plants it holds, gains, metrics, margins, plants, the dither's verdict.
+
+    Returns
+    -------
+    dict of str to object
+        The tables of the plants and of the dither.
+    """
     tables: dict[str, Any] = {}
+    if result.validation is not None:
+        show_validation_verdict(console, result.validation)
+    show_gains(console, before, result.parameters)
+    on_rig = result.on_rig is not None
+    beside = ("on rig", result.on_rig) if on_rig else ("was", _initial_metrics(task, before))
+    show_metrics(console, result.certified, task.loop, beside=beside, limits=task.specification.limits)
+    show_active(console, result.requirements, result.active, result.parameters)
+    if result.certificate is not None:
+        show_margins(console, result.certificate.margins)
     if result.validation is not None:
         show_validation(console, result.validation, task.loop)
         tables["validation"] = records(result.validation.summary)

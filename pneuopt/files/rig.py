@@ -30,7 +30,7 @@ from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import ModelError, check_names, require
 
 Part = TypeVar("Part", Actuator, Sensor, Encoder)
-_SECTIONS = ("actuator", "sensors", "encoder")
+RIG_SECTIONS = ("actuator", "sensors", "encoder")
 _TIMES = ("lag", "filter")
 
 
@@ -55,7 +55,7 @@ def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
         Or its kind; the message names file, section and key.
     """
     table = read_toml(path).unwrap()
-    check_names("section", table, _SECTIONS, str(path))
+    check_names("section", table, RIG_SECTIONS, str(path))
     for name, entry in table.items():
         require(isinstance(entry, dict), f"{path}: {name} must be a section, [{name}]")
     own = construct_at(lambda: replace(loop, plant=stick_slip_drive(drive).system(), sensor=None), str(path))

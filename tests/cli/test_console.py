@@ -1,25 +1,42 @@
 import io
+import math
+import re
+from collections.abc import Callable
 
 import pandas as pd
 import pytest
 from rich.console import Console
 
-from pneuopt.cli.show_loops import metric_units, show_dither, show_gains, show_metrics
-from pneuopt.cli.terminal import make_console
+from pneuopt.cli.show_loops import (
+    metric_units,
+    show_active,
+    show_dither,
+    show_gains,
+    show_margins,
+    show_metrics,
+    show_validation,
+    show_validation_verdict,
+)
+from pneuopt.cli.terminal import make_console, show_sentence
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
 from pneuopt.evaluation.dither_effect import DitherEffect
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
+from pneuopt.evaluation.expected_plants import expected_plants
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     MaxComplementarySensitivity,
     Overshoot,
+    PeakControl,
     PhaseMargin,
     Requirement,
+    SettlingTime,
     StepEnvelope,
 )
-from pneuopt.models.linear import FirstOrder
+from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.tuning.validation import validate_design
 
 
 def test_metrics_stand_beside_what_is_allowed() -> None:
@@ -83,3 +100,70 @@ def test_a_limit_cycle_is_shown_where_there_is_one(amplitude: float, capsys: pyt
     out = capsys.readouterr().out
     assert ("LimitCycleFrequency" in out) == (amplitude > 0)
     assert "l(ANR)" in out
+
+
+def screen(show: Callable[[Console], None], *, terminal: bool = False) -> str:
+    console = Console(file=io.StringIO(), width=80, force_terminal=terminal, no_color=True, highlight=False)
+    show(console)
+    return re.sub(r"\x1b\[[0-9;]*m", "", console.file.getvalue())  # type: ignore[attr-defined]
+
+
+def test_figures_before_stand_in_columns_of_their_own_on_80_columns() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID())
+    now = {"SettlingTime": 0.08874, "Overshoot": 3.1e-6, "MaxSensitivity": 1.077, "PeakControl": 149.6}
+    then = {"SettlingTime": math.nan, "Overshoot": 23.734, "MaxSensitivity": 1.0374, "PeakControl": 68.84}
+    frames = [pd.DataFrame({"0 to 0.05": row, "0 to 0.25": row}) for row in (now, then)]
+    limits = [PeakControl(150.0)]
+    text = screen(lambda c: show_metrics(c, frames[0], loop, beside=("was", frames[1]), limits=limits))
+    rows = [line.split() for line in text.splitlines()]
+    assert max(map(len, text.splitlines())) <= 80
+    assert ["SettlingTime", "0.08874", "never", "0.08874", "never", "s"] in rows
+    assert ["PeakControl", "149.6", "68.8", "149.6", "68.8", "<=", "150", "V"] in rows
+    assert "< 0.001" in text, "rounding errors are not figures"
+
+
+def test_what_holds_a_design_back_is_one_sentence() -> None:
+    table = pd.DataFrame({"room": [0.0171, 0.5], "active": [True, False]}, index=["Overshoot", "PeakControl"])
+    loop = ClosedLoop(FirstOrder().system(), PID())
+    tuned = loop.parameters.with_values({"pid.Kp": 9.0}).with_bounds({"pid.Kp": (1.0, 9.0)}).freed("pid.Kp")
+    text = screen(lambda c: show_active(c, table, ("Overshoot", "pid.Kp"), tuned))
+    assert text == "held back by: Overshoot (1.7 % of room left), pid.Kp (at its bound)\n"
+
+
+def test_margins_name_their_operating_point() -> None:
+    rows = [("0 to 1", "at rest", 1.2, 65.0), ("0 to 1", "sliding", 3.5, 17.0), ("0 to 2", "sliding", 3.1, 19.0)]
+    table = pd.DataFrame(rows, columns=["case", "point", "MaxSensitivity", "PhaseMargin"])
+    text = screen(lambda c: show_margins(c, table))
+    assert text == "MaxSensitivity, the worst of all cases: 1.2 at rest, 3.5 sliding; phase margin at least 17 deg\n"
+
+
+def test_a_derivative_that_does_nothing_has_no_riddle_of_a_time() -> None:
+    gains = {"pid.Kp": 793.4, "pid.Ki": 28950.0, "pid.Kd": 1e-6, "pid.Tf": 0.05}
+    given = ClosedLoop(FirstOrder().system(), PID()).parameters.with_values(gains)
+    text = screen(lambda c: show_gains(c, given, given))
+    assert "next to no derivative (Kd/Tf is 2.5e-06 % of Kp)" in text
+    assert "Td" not in text
+
+
+def test_sentences_end_between_words_on_a_terminal_and_stay_whole_in_a_pipe() -> None:
+    text = "in the tuning's file: " + ", ".join(f'"load.parameter_{k}" = "5 %"' for k in range(5))
+    assert screen(lambda c: show_sentence(c, text)) == text + "\n"
+    lines = screen(lambda c: show_sentence(c, text, indent=2), terminal=True).splitlines()
+    assert len(lines) > 1
+    assert max(map(len, lines)) <= 80
+    assert all(line.startswith("    ") for line in lines[1:])
+    assert " ".join(line.strip() for line in lines) == text
+
+
+def test_the_plants_are_told_verdict_first_and_what_would_help() -> None:
+    loop = ClosedLoop(Integrator().system(), PID(limits=False))
+    design = loop.parameters.with_values({"plant.gain": 1.0, "pid.Kp": 5.0})
+    design = design.with_bounds({"pid.Kp": (0.1, 50.0)}).freed("pid.Kp")
+    asked, step = SettlingTime(max=0.79), Step(1.0, horizon=2.0)
+    found = validate_design(loop, step, design, minimise=asked, scenarios=expected_plants(design))
+    verdict = screen(lambda c: show_validation_verdict(c, found))
+    assert verdict == f"holds on {found.held} of 100 plants: SettlingTime breaks on {100 - found.held}\n"
+    text = screen(lambda c: show_validation(c, found, loop))
+    assert "assumed tolerances: plant.gain +-5 %\n" in text
+    assert "these gains hold on 100 of 100\n" in text
+    assert 'add to the tuning\'s file: [scenarios.corners] "plant.gain" = "5 %"' in text
