@@ -10,13 +10,14 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.system import define
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import GainMargin, MaxSensitivity, PhaseMargin, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre, Stribeck
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 
@@ -49,7 +50,22 @@ def sampled_axis() -> tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[floa
     return loop, p, Step(0.1, at=0.05, initial=0.05, horizon=0.5), ranges
 
 
-@pytest.mark.parametrize("problem", [cylinder, positioner, sampled_axis])
+def gained_lag() -> tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[float, float]]]:
+    """A lag whose gain rises fourfold with the step."""
+    x, u = Quantity("x", "1"), Quantity("u", "1")
+    plant = define(
+        [x],
+        [u],
+        [x],
+        ParameterSet({"gain": Parameter(1.0, "1")}),
+        lambda _t, x, u, p: ({"x": p["gain"] * u["u"] - x["x"]}, dict(x)),
+    )
+    loop = ClosedLoop(plant, PID(0.05))
+    p = loop.parameters.with_values({"pid.Tf": 0.05, "pid.Kd": 0.0})
+    return loop, p, Step(1.0, horizon=5.0, disturbance={"gain": 3.0}), {"pid.Kp": (0.1, 2.0), "pid.Ki": (0.5, 4.0)}
+
+
+@pytest.mark.parametrize("problem", [cylinder, positioner, sampled_axis, gained_lag])
 def test_search_and_certificate_agree_on_random_gains(
     problem: Callable[[], tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[float, float]]]],
 ) -> None:
