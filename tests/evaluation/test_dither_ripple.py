@@ -84,8 +84,12 @@ def test_a_lag_under_a_steady_ripple_settles_as_without(
     ripple = sine(1 / PERIOD, amplitude, phase) + sine(2 / PERIOD, amplitude * overtone)
     plain, found = measure(1 - np.exp(-T / lag), None), measure(1 - np.exp(-T / lag) + ripple)
     assert found["SettlingTime"] == pytest.approx(lag * log(50), rel=2e-3)
+    begun = (
+        amplitude * (1 + overtone) / pi * lag / 0.9
+    )  # the first period's mean holds half a wave more, where 10 % is met
     for name in READ[1:-1]:
-        assert found[name] == pytest.approx(plain[name], rel=5e-3, abs=0.03), name
+        near = 0.03 + (begun if name == "RiseTime" else 0.0)
+        assert found[name] == pytest.approx(plain[name], rel=5e-3, abs=near), name
     assert found["Ripple"] == pytest.approx(np.ptp(ripple), rel=0.02, abs=2e-3)
 
 
