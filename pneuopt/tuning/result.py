@@ -106,7 +106,7 @@ def requirement_table(
     return frame
 
 
-def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]]) -> TuningResult:
+def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]], confirmation: str) -> TuningResult:
     """The result of the design that comes closest to the limits, with the relaxations that would make them feasible."""
     import pandas as pd
 
@@ -114,7 +114,7 @@ def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]]) ->
     closest = [f"{n} {row.certified:.6g} ({row.allowed:.6g} asked)" for n, row in broken.iterrows()]
     unknown = [str(n) for n, row in result.requirements.iterrows() if np.isnan(row.certified) and np.isnan(row.allowed)]
     lead = f"no design found keeps all limits, the closest has {', '.join([*closest, *(f'no {n}' for n in unknown)])}"
-    sentences = (lead, describe_relaxations(rows), "or widen the gains' bounds")
+    sentences = (lead, confirmation, describe_relaxations(rows), "or widen the gains' bounds")
     relaxations = pd.DataFrame.from_dict(rows, orient="index")
     return replace(result, status=Status(Code.INFEASIBLE, sentences), relaxations=relaxations)
 

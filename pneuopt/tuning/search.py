@@ -11,8 +11,9 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.certifier import MAX_CERTIFIED_EXCESS, Certifier
+from pneuopt.tuning.confirmation import confirm_infeasible, describe_confirmation
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
-from pneuopt.tuning.relaxation import relax_all, relaxation_row, relaxation_specification
+from pneuopt.tuning.relaxation import limit_excess, relax_all, relaxation_row, relaxation_specification
 from pneuopt.tuning.responses import to_records
 from pneuopt.tuning.result import TuningResult, relaxation_share, with_relaxations
 from pneuopt.tuning.screening import compute_merits
@@ -206,19 +207,30 @@ def _interruption_result(point: Array) -> SearchResult:
 
 
 def relax(search: Search, result: TuningResult) -> TuningResult:
-    """Find by how much the limits have to give way, each alone and all together.
+    """Confirm that no design keeps all limits, and find by how much they have to give way, each alone and together.
 
-    A search with its margins can miss a design that keeps all limits; where one turns up here, it is the answer.
+    A search can miss a design that keeps all limits; where one turns up here, it is the answer.
     """
-    spec, points, rows = search.spec, [end_point(result, search.space)], dict[str, dict[str, float]]()
-    method = search.method.shorten(RELAXATION_MARGIN)
+    spec, rows = search.spec, dict[str, dict[str, float]]()
+    try:
+        second = confirm_infeasible(search.simulator, spec, search.method.margin, search.progress)
+    except KeyboardInterrupt:
+        return _interrupt(result)
+    if second.share <= 0:
+        found = _continue_from_feasible(search, second.point)
+        if found.status.converged or found.status.code is Code.INTERRUPTED:
+            return found
+    method, points = (
+        search.method.shorten(RELAXATION_MARGIN),
+        _rank_points(search, end_point(result, search.space), second.point),
+    )
     for q in spec.limits:
         search.progress(f"finding how far {metric_name(q)} alone has to give way")
         found = search.with_specification(relaxation_specification(spec, q, search.task.references), method).run(
             points[0]
         )
         if found.status.code is Code.INTERRUPTED:
-            return result
+            return _interrupt(result)
         points.append(end_point(found, search.space))
         value = float(found.requirements["certified"][metric_name(q)]) if found.status.converged else np.nan
         rows[metric_name(q)] = relaxation_row(q, value, points[-1], search.space.names)
@@ -234,7 +246,22 @@ def relax(search: Search, result: TuningResult) -> TuningResult:
         rows["all"] = relaxation_row(
             None, relaxation_share(closest), end_point(closest, search.space), search.space.names
         )
-    return with_relaxations(replace(closest, stats={**result.stats, **closest.stats}), rows)
+    counts = {"confirmation.simulations": float(second.simulations), "confirmation.share": second.share}
+    closest = replace(closest, stats={**result.stats, **closest.stats, **counts})
+    return with_relaxations(closest, rows, describe_confirmation(second))
+
+
+def _rank_points(search: Search, *points: Array) -> list[Array]:
+    """Points, the one closest to the limits first."""
+    stable = search.spec.with_stability()
+    excess = limit_excess(search.simulator.values(np.array(points), stable), stable)
+    return [points[k] for k in np.argsort(excess, kind="stable").tolist()]
+
+
+def _interrupt(result: TuningResult) -> TuningResult:
+    """The result of a search that found nothing, where Ctrl-C came before that was confirmed."""
+    sentences = (f"nothing found so far: {result.status.verdict}", "run again for an answer")
+    return replace(result, status=Status(Code.INTERRUPTED, sentences))
 
 
 def _continue_from_feasible(search: Search, point: Array) -> TuningResult:

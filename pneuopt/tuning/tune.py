@@ -124,7 +124,7 @@ def tune(
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
-    if method is None and successor is not None and not result.status.converged:
+    if method is None and successor is not None and result.status.code not in (Code.CONVERGED, Code.INTERRUPTED):
         search = prepare_search(task, successor, progress)
         result = search.run()
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
