@@ -113,8 +113,9 @@ def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]], co
     broken = result.requirements[~(result.requirements["room"] >= 0) & result.requirements["allowed"].notna()]
     closest = [f"{n} {row.certified:.6g} ({row.allowed:.6g} asked)" for n, row in broken.iterrows()]
     unknown = [str(n) for n, row in result.requirements.iterrows() if np.isnan(row.certified) and np.isnan(row.allowed)]
-    lead = f"no design found keeps all limits, the closest has {', '.join([*closest, *(f'no {n}' for n in unknown)])}"
-    sentences = (lead, confirmation, describe_relaxations(rows), "or widen the gains' bounds")
+    shortfall = ", ".join([*closest, *(f"no {n}" for n in unknown)])
+    lead = f"no design found keeps all limits, nor does {confirmation} find one; the closest has {shortfall}"
+    sentences = (lead, describe_relaxations(rows), "or widen the gains' bounds")
     relaxations = pd.DataFrame.from_dict(rows, orient="index")
     return replace(result, status=Status(Code.INFEASIBLE, sentences), relaxations=relaxations)
 
