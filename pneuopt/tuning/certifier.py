@@ -22,6 +22,7 @@ from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.agreement import describe_agreement
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.responses import worst_values
 from pneuopt.tuning.result import RELAXATION_COLUMNS, TuningResult, requirement_table
@@ -144,12 +145,9 @@ class Certifier:
             verdict = f"the objective is {ours:.6g}, claimed {min(theirs, found.stats['optimum']):.6g}"
             cause = "the optimum grazes the band, or does not survive rounding, or the search misread it"
             return Status(Code.NOT_CERTIFIED, (verdict, cause, "ask for more digits or a wider band"))
-        agreeing = (
-            f", {found.stats['starts_agreeing']:.0f} of {found.stats['starts']:.0f} starts agree"
-            if "starts" in found.stats
-            else ""
-        )
-        return Status(Code.CONVERGED, (f"certified objective {ours:.6g}, claimed {theirs:.6g}{agreeing}",))
+        agreeing, warning = describe_agreement(found.stats)
+        verdict = f"certified objective {ours:.6g}, claimed {theirs:.6g}"
+        return Status(Code.CONVERGED, (f"{verdict}, {agreeing}" if agreeing else verdict,)).with_details(warning)
 
     def _worst_case(self, certified: "pd.DataFrame", metric: str) -> str:
         """The words " at" and the worst case of a metric, where there are several cases."""

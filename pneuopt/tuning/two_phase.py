@@ -21,6 +21,7 @@ from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
+from pneuopt.tuning.agreement import Agreement, compare_starts
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.screening import WIDEN_BOUNDS
@@ -40,6 +41,9 @@ PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "
 # Relative difference of two objectives below which starts agree. A smaller one counts the solver's tolerance as another
 # optimum; a larger one hides local optima.
 OPTIMA_TOLERANCE = 1e-3
+# Starts, at most, as a multiple of those asked for, where the best optimum has been found once only. Fewer hand out a
+# local optimum that nothing confirms; more delay answers of problems with many optima.
+MAX_START_FACTOR = 3
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,8 @@ class TwoPhase:
         How much tighter the problem's limits are than those asked for, a fraction; without it an optimum's response
         touches the band.
     starts : int
-        Number of starts: the given gains, then random ones within the bounds.
+        Number of starts: the given gains, then random ones within the bounds; more where only one of them ends in the
+        best optimum.
     seed : int
         Of the random numbers.
     digits : int, optional
@@ -114,9 +119,7 @@ class TwoPhase:
         optima = _solve_stable(task, replace(task, space=space, spec=spec), method, progress)
         best, values = optima.best, optima.best.parameters
         stats = {
-            "starts": float(optima.starts),
-            "starts_converged": float(optima.converged),
-            "starts_agreeing": float(optima.agreeing),
+            **optima.agreement.stats,
             "optimum": best.stats.get("cost", np.nan),
             "iterations": best.stats.get("iterations", 0.0),
         }
@@ -137,12 +140,10 @@ class TwoPhase:
 
 @dataclass(frozen=True, eq=False)
 class Optima:
-    """The best solution of several starts, the number of starts that converged, and of those that agree with it."""
+    """The best solution of several starts, and how far they agree."""
 
     best: Solution
-    starts: int
-    converged: int
-    agreeing: int
+    agreement: Agreement
 
 
 def is_linear(loop: ClosedLoop) -> bool:
@@ -178,7 +179,7 @@ def _solve_stable(task: TuningTask, tightened: TuningTask, method: TwoPhase, pro
     plain = _without_stability(task, spec)
     is_allowed = partial(_is_stable, loop, math.inf if plain is spec else spec.limit(MaxSensitivity))
     optima = solve_two_phase(loop, references, space, plain, method, progress, is_allowed)
-    if plain is spec or optima.converged:
+    if plain is spec or optima.agreement.converged:
         return optima
     return solve_two_phase(loop, references, space, spec, method, progress, is_allowed)
 
@@ -206,7 +207,8 @@ def solve_two_phase(
 ) -> Optima:
     """Solve the two-phase problem from every start; `report_progress` receives a line of text a start.
 
-    Solutions that are not allowed do not count as converged.
+    Solutions that are not allowed do not count as converged. Of several starts two have to end in the best optimum:
+    until then, up to a limit, there are more of them.
 
     Raises
     ------
@@ -216,24 +218,24 @@ def solve_two_phase(
     problem = prepare_full_space(transcribe_two_phase(loop, references, space, spec, method.nodes), method.solver)
     parameters = problem.graph.transcription.parameters
     rng = np.random.default_rng(method.seed)
-    found = []
-    for k in range(method.starts):
+    found, agreement = list[Solution](), compare_starts([], OPTIMA_TOLERANCE)
+    for k in range(method.starts * MAX_START_FACTOR if method.starts > 1 else 1):
+        if k >= method.starts and agreement.agreeing != 1:
+            break
         point = space.from_unit(rng.random(len(space.names))) if k else space.start
         gains = dict(zip(space.names, point.tolist(), strict=True))
         found.append(solve_from(problem, parameters.with_values(gains)))
         value, ended = _objective_value(found[-1]), found[-1].status.code.value
-        report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
-    good = [s for s in found if s.status.converged and is_allowed(s)]
+        report_progress(f"start {k + 1} of {max(k + 1, method.starts)}: objective {value:.4g}, {ended}")
+        good = [s for s in found if s.status.converged and is_allowed(s)]
+        failed = [math.inf] * (len(found) - len(good))
+        agreement = compare_starts([*map(_objective_value, good), *failed], OPTIMA_TOLERANCE)
     if not good:
         closest = min(found, key=lambda s: s.stats.get("largest_violation", math.inf))
         unstable = Status(Code.INFEASIBLE, ("every optimum found is an unstable loop, or nearly so", WIDEN_BOUNDS))
         closest = replace(closest, status=unstable) if closest.status.converged else closest
-        return Optima(closest, len(found), 0, 0)
-    best = min(good, key=_objective_value)
-    agreeing = sum(
-        _objective_value(s) - _objective_value(best) <= OPTIMA_TOLERANCE * abs(_objective_value(best)) for s in good
-    )
-    return Optima(best, len(found), len(good), agreeing)
+        return Optima(closest, agreement)
+    return Optima(min(good, key=_objective_value), agreement)
 
 
 @dataclass(frozen=True, eq=False)

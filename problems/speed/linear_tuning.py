@@ -63,7 +63,7 @@ def main() -> "DataFrame":
     same, near = (median([reached(trace, optimum * (1 + k)) for trace in traces]) / spent for k in (SAME, NEAR))
     return frame(
         [
-            Claim("starts_agreeing", many.agreeing, f"of {STARTS}", None, ">= 19"),
+            Claim("starts_agreeing", many.agreement.agreeing, f"of {STARTS}", None, ">= 19"),
             Claim("optimum", optimum, "s"),
             Claim("two_phase.cpu", spent, "s"),
             Claim("de.best", median([trace[-1][1] for trace in traces]), "s", optimum),

@@ -1,0 +1,69 @@
+"""How far the starts of a search agree, and what that says of optima that none has seen."""
+
+import numpy as np
+import pytest
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.models.linear import SecondOrder
+from pneuopt.tuning.agreement import compare_starts, describe_agreement
+from pneuopt.tuning.tune import tune
+from pneuopt.tuning.two_phase import MAX_START_FACTOR, TwoPhase
+
+
+def test_starts_that_all_agree_warn_of_nothing() -> None:
+    stats = compare_starts([0.5, 0.5001, 0.5, 0.5], 1e-3).stats
+    assert (stats["starts"], stats["starts_agreeing"], stats["starts_optima"]) == (4, 4, 1)
+    assert stats["starts_unseen"] == pytest.approx(2 / 12)
+    assert describe_agreement(stats) == ("4 of 4 starts agree", "")
+    assert describe_agreement({}) == ("", "")
+
+
+def test_the_chance_of_another_optimum_is_the_one_seen_in_random_draws() -> None:
+    """Optima with random shares of the box, uniform as in the paper: one draw more is new with the chance said."""
+    rng = np.random.default_rng(0)
+    found, said = [], []
+    for _ in range(8000):
+        count = int(rng.integers(1, 60))
+        shares = rng.dirichlet(np.ones(count))
+        draws = rng.choice(count, size=9, p=shares)
+        seen = set(draws[:8].tolist())
+        if len(seen) == 2:
+            found.append(draws[8] not in seen)
+            said.append(compare_starts([float(k) for k in draws[:8] + 1], 1e-3).unseen)
+    assert np.mean(found) == pytest.approx(np.mean(said), abs=0.05)
+
+
+def test_failed_starts_and_single_ones_say_nothing_of_the_spread() -> None:
+    alone = compare_starts([0.7, np.inf], 1e-3)
+    assert (alone.converged, alone.agreeing) == (1, 1)
+    assert np.isnan([alone.spread, alone.unseen]).all()
+    none = compare_starts([np.inf, np.inf], 1e-3)
+    assert (none.converged, none.agreeing, none.optima) == (0, 0, 0)
+
+
+def test_an_optimum_that_one_start_found_is_sought_by_more() -> None:
+    loop = ClosedLoop(SecondOrder().system(), PID(limits=False))
+    plant = {"plant.gain": 1.0, "plant.natural_frequency": 5.0, "plant.damping": 0.2}
+    free = {"pid.Kp": (0.01, 20.0), "pid.Ki": (0.05, 60.0), "pid.Kd": (0.0, 2.0)}
+    given = loop.parameters.with_values(plant | {"pid.Kp": 0.5, "pid.Ki": 2.0, "pid.Tf": 0.05})
+    given = given.with_bounds(free).freed(*free)
+    method = TwoPhase(nodes=(20, 20), starts=2)
+    limits = [Overshoot(0.05)]
+    found = tune(
+        loop,
+        Step(1.0, horizon=4.0),
+        given,
+        minimise=SettlingTime(),
+        subject_to=limits,
+        method=method,
+        plants={},
+        throw=False,
+    )
+    stats = found.stats
+    assert 2 <= stats["starts"] <= 2 * MAX_START_FACTOR
+    assert stats["starts_agreeing"] >= 2 or stats["starts"] == 2 * MAX_START_FACTOR
+    words, _ = describe_agreement(stats)
+    assert not found.status.converged or words in str(found.status)
