@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from types import MappingProxyType
 
+from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     EnvelopeBounds,
@@ -89,6 +90,13 @@ class Specification:
         if self.limit(MaxSensitivity) < inf:
             return self
         return replace(self, limits=(*self.limits, MaxSensitivity(STABILITY_SENSITIVITY)))
+
+    def with_rest(self, record: float) -> "Specification":
+        """Copy for a search, whose designs shall come to rest at the reference within a record of this length [s]."""
+        latest = (1 - TAIL_SHARE) * record  # what settles later than that counts as not settled
+        if self.limit(SettlingTime) <= latest:
+            return self
+        return replace(self, limits=(*self.without(SettlingTime).limits, SettlingTime(self.band, latest)))
 
     def without(self, kind: Kind) -> "Specification":
         """Copy without the limit of this kind."""

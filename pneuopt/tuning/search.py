@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.requirements import metric_name
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
@@ -23,6 +24,8 @@ from pneuopt.tuning.space import Space
 # Margins tried, each twice the one before. Fewer give up on designs that need more room to survive the certificate;
 # each more costs another search where no design exists.
 MARGINS_TO_TRY = 3
+# Defects of designs that no requirement makes move to the reference and stay there.
+ENDS_ELSEWHERE = (Defect.STANDS_STILL, Defect.MISSES_REFERENCE, Defect.CREEPS, Defect.NEVER_SETTLES)
 # Rounded designs certified at each margin, at most. Fewer miss the one that survives; each more costs an independent
 # simulation of every case.
 MAX_CERTIFIED_POINTS = 5
@@ -41,11 +44,22 @@ RELAXATION_MARGIN = 0.002
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Search, round the gains and certify them; search again with a wider margin where the certificate fails."""
+    """Search, round the gains and certify them; search again with a wider margin where the certificate fails.
+
+    Parameters
+    ----------
+    task : TuningTask
+    method : Method
+    progress : callable
+        Receives a line of text a step.
+    rests : bool
+        Whether to search only among responses that settle within the horizon.
+    """
 
     task: TuningTask
     method: Method
     progress: ProgressCallback
+    rests: bool = False
 
     @property
     def space(self) -> Space:
@@ -87,9 +101,19 @@ class Search:
             result = self.certify_roundings(found, margin)
             if result.status.converged or "contacts" in result.stats:
                 return result
+            if not self.rests and _ends_elsewhere(result):
+                return self._run_with_rest(result)
             start = found.point
         assert result is not None
         return result
+
+    def _run_with_rest(self, refused: TuningResult) -> TuningResult:
+        """Search again for designs that end in the band; the refused one's result where there is none."""
+        self.progress("the design found does not end at the reference; searching for one that does")
+        other = replace(self, rests=True)
+        vars(other)["simulator"] = self.simulator
+        result = other.run(self.space.start)
+        return result if result.status.converged or result.status.code is Code.INTERRUPTED else refused
 
     @cached_property
     def simulator(self) -> Simulator:
@@ -168,7 +192,8 @@ class Search:
 
         It asks for a stable loop, too, whatever was asked for.
         """
-        return self.spec.tighten(margin, margin * self.method.peak_margin).with_stability()
+        spec = self.spec.with_rest(self.task.horizon) if self.rests else self.spec
+        return spec.tighten(margin, margin * self.method.peak_margin).with_stability()
 
     def _round_gains(self, simulator: Simulator, found: SearchResult, margin: float) -> Iterator[Array]:
         """Roundings of the gains found: the nearest one, then neighbours that keep the limits and lose little."""
@@ -199,6 +224,12 @@ class Search:
         costs = [np.inf if spec.violations(row) else spec.objective(row) for row in rows]
         order = [k for k in np.argsort(costs).tolist() if costs[k] <= most][:MAX_CERTIFIED_POINTS]
         yield from points[order or [0]]
+
+
+def _ends_elsewhere(result: TuningResult) -> bool:
+    """Whether a design was refused because its response does not end at the reference."""
+    findings = result.certificate.findings if result.certificate is not None else ()
+    return any(f.defect in ENDS_ELSEWHERE and f.sentence in result.status.sentences for f in findings)
 
 
 def _interruption_result(point: Array) -> SearchResult:

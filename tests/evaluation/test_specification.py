@@ -45,6 +45,14 @@ def test_a_search_asks_for_a_stable_loop_whatever_was_asked_for() -> None:
     assert own.with_stability() is own
 
 
+def test_a_search_may_ask_for_a_rest_within_the_record_whatever_was_asked_for() -> None:
+    asked = specify(PeakControl(), [Overshoot(0.1), SettlingTime(band=0.05, max=3.0)])
+    rests = asked.with_rest(2.0)
+    assert (rests.limit(SettlingTime), rests.band, rests.limit(Overshoot)) == (1.9, 0.05, 0.1)
+    assert rests.violations({"PeakControl": 0.0, "Overshoot": 0.0, "SettlingTime": math.nan})
+    assert rests.with_rest(2.0) is rests
+
+
 def test_violated_names_what_is_not_kept_nan_included() -> None:
     spec = specify(SettlingTime(max=1.0), [Overshoot(0.1), MaxSensitivity(1.6), GainMargin(2.0), PhaseMargin(45.0)])
     values = {"SettlingTime": math.nan, "Overshoot": 0.1, "MaxSensitivity": 1.7, "GainMargin": 0.6, "PhaseMargin": 0.02}
