@@ -3,7 +3,7 @@
     python problems/paper/paper_physical.py [--json FILE] [--out DIR]
 
 Ye, Wang, Chen (IJRES 3(7), 2015) print eq. (16), 1270.12/(s^2 + 17.5 s + 86.34), and no hardware. The set R25 (rodless,
-25 mm, 12 kg) has it at rest. Rows eqN.*: orifices (1, 2), flow coefficients by AD (3, 4), mass balance (5, 6), chambers
+25 mm, 12 kg) has it at rest. Rows eq*.*: orifices (1, 2), flow coefficients by AD (3, 4), mass balance (5, 6), chambers
 (7, 8), linearised (9, 10), force (11), both chambers as one pressure (12, 13), force and speed (14), b0, w0 and zeta0
 (15), and (16) once from these formulas, once as the AD linearisation of the whole drive. "P_b = 0", which the paper
 assumes, is no legal assumption; what lets the second order stand is K_cb = m K_ca. Equation (15) drops a constant.
