@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from problems.dither import averaged_dither, dither_map
+from problems.dither import averaged_dither, dither_map, margins_under_dither
 from problems.friction import stiction_windup
 
 
@@ -27,6 +27,22 @@ def test_the_map_at_amplitude_zero_is_the_same_at_every_frequency(monkeypatch: p
     np.testing.assert_allclose(settled[0, 0], settled[1, 0], equal_nan=True)
     assert air[0, 0] == pytest.approx(air[1, 0])
     assert air[0, 1] > air[1, 1] > 0  # the valve passes less of the faster
+
+
+def test_the_sensitivity_under_dither_is_what_injected_sines_measure() -> None:
+    """Where the ripple opens the dead zone a linearisation about the mean state has twice the peak."""
+    rows = margins_under_dither.main(margins_under_dither.run({"edge": margins_under_dither.CASES["edge"]}))
+    assert rows["holds"].all()
+    value = rows.set_index("name")["value"]
+    assert value["edge.plain"] > 1.5 * value["edge.injected"]
+
+
+@pytest.mark.slow
+def test_margins_under_dither(tmp_path: Path) -> None:
+    measured = margins_under_dither.run()
+    rows = margins_under_dither.main(measured)
+    assert list(rows.loc[~rows["holds"].astype(bool), "name"]) == []
+    margins_under_dither.figure(measured).savefig(tmp_path / "margins.png")
 
 
 @pytest.mark.slow
