@@ -119,6 +119,7 @@ from .tuning.screening import Screening
 from .tuning.tune import TuningResult, tune
 from .tuning.two_phase import TwoPhase
 from .tuning.validation import DesignValidation, validate_design
+from .tuning.without_dither import tune_without_dither
 
 __version__: str
 __all__ = [
@@ -289,6 +290,7 @@ __all__ = [
     "to_standard",
     "tolerances",
     "tune",
+    "tune_without_dither",
     "validate",
     "validate_design",
     "with_sensors",

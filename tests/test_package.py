@@ -176,6 +176,7 @@ PUBLIC_NAMES = [
     "tolerances",
     "Trajectory",
     "tune",
+    "tune_without_dither",
     "TuningResult",
     "TwoPhase",
     "Usefulness",

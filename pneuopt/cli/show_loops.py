@@ -203,9 +203,9 @@ def _scenario_lines(axes: Sequence[PlantAxis]) -> list[str]:
 
 def show_dither(console: Console, verdict: DitherVerdict) -> None:
     """Whether a dither is useful, and why, a sentence a line."""
-    colours = {Usefulness.USEFUL: "bold green", Usefulness.HARMFUL: "bold red", Usefulness.USELESS: "bold yellow"}
+    colours = {Usefulness.USEFUL: "bold green", Usefulness.HARMFUL: "bold red"}
     head, *reasons = str(verdict).splitlines()
-    show_sentence(console, head, style=colours[verdict.usefulness])
+    show_sentence(console, head, style=colours.get(verdict.usefulness, "bold yellow"))
     for reason in reasons:
         show_sentence(console, reason.strip(), indent=2)
 

@@ -33,6 +33,7 @@ from pneuopt.cli.show_loops import (
 )
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.control.disturbance import add_disturbances
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
@@ -50,6 +51,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import TuningResult, tune
+from pneuopt.tuning.without_dither import tune_without_dither
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,7 +73,7 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     console, shown = make_console(), dict[str, Any]()
     show_status(console, result.status)
     if result.status.converged:
-        shown = _show_design(console, task, parameters, result)
+        shown = _show_design(console, task, parameters, result, quiet)
     else:
         word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
         show_rejection(console, tuning, result.stats, parameters, word)
@@ -139,7 +141,9 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     return finish(outputs, writers, tables, None)
 
 
-def _show_design(console: "Console", task: Tuning, before: ParameterSet, result: TuningResult) -> dict[str, Any]:
+def _show_design(
+    console: "Console", task: Tuning, before: ParameterSet, result: TuningResult, quiet: bool
+) -> dict[str, Any]:
     """Show a certified design: on how many plants it holds, gains, metrics, margins, plants, the dither's verdict.
 
     Returns
@@ -161,21 +165,48 @@ def _show_design(console: "Console", task: Tuning, before: ParameterSet, result:
         show_validation(console, result.validation, task.loop)
         tables["validation"] = records(result.validation.summary)
     if task.loop.dither_period(result.parameters) is not None:
-        tables |= _show_dither_verdict(console, task, result.parameters)
+        rival = _tune_rival(console, task, before, quiet)
+        tables |= _show_dither_verdict(console, task, result.parameters, rival)
     elif "dither.amplitude" in result.parameters.free_names:
         console.print("the dither's amplitude is 0: the tuning found no use for it")
     return tables
 
 
-def _show_dither_verdict(console: "Console", task: Tuning, parameters: ParameterSet) -> dict[str, Any]:
+def _tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet: bool) -> ParameterSet | None:
+    """Values tuned without dither, with which the dither is compared; None, and said, where there are none."""
+    if not set(parameters.free_names) - {DITHER_AMPLITUDE, DITHER_FREQUENCY}:
+        return None
+    with progress("tuning without dither", quiet=quiet) as report_progress:
+        rival = tune_without_dither(
+            task.loop,
+            task.references,
+            parameters,
+            minimise=task.specification,
+            scenarios=task.scenarios(parameters),
+            max_steps=task.max_steps,
+            accept=task.accept,
+            method=task.method,
+            throw=False,
+            progress=report_progress,
+        )
+    if rival.status.converged:
+        return rival.parameters
+    console.print(f"no gains were certified without dither: {rival.status.sentences[0]}", soft_wrap=True)
+    return None
+
+
+def _show_dither_verdict(
+    console: "Console", task: Tuning, parameters: ParameterSet, rival: ParameterSet | None
+) -> dict[str, Any]:
     """Show the dither's verdict; returns nothing where the loop cannot be simulated without dither."""
     try:
-        verdict = judge_dither(task.loop, task.references, parameters, band=task.specification.band)
+        verdict = judge_dither(task.loop, task.references, parameters, without=rival, band=task.specification.band)
     except ConvergenceError as error:
         console.print(f"no verdict on the dither: {error}", soft_wrap=True)
         return {}
     show_dither(console, verdict)
-    return {"dither": {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons)}}
+    gains = None if rival is None else {n: rival.value(n) for n in rival.free_names}
+    return {"dither": {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": gains}}
 
 
 def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":

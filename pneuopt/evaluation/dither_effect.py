@@ -52,27 +52,46 @@ class DitherEffect:
     drive_frequency: float = nan
 
 
-def dither_effect(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> DitherEffect:
+def dither_effect(
+    loop: ClosedLoop, reference: Step, parameters: ParameterSet, *, speed: float | None = None
+) -> DitherEffect:
     """Amplitudes that the dither causes: the motion and, behind a final element, its travel and force.
 
     Parameters
     ----------
     loop : ClosedLoop
     reference : Step
-        The body moves at its final value, and is held at its start.
+        The body is held at its start.
     parameters : ParameterSet
         Values with the dither's amplitude and frequency.
+    speed : float, optional
+        Speed at which the body moves [its unit]; by default the reference's final value where the loop feeds back a
+        speed, and otherwise the step's size over the time that is left to make it.
     """
     full = loop.complete(parameters)
     found = DitherEffect(full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY))
     axis = loop.plant.axis or Axis()
-    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, {axis.speed: reference.final}))
+    moves, held = _operating_points(loop, axis, reference, speed)
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
     if axis.speed in moving:
-        speed = abs(moving[axis.speed])
-        found = replace(found, speed=speed, travel=speed / (2 * pi * found.frequency))
+        swing = abs(moving[axis.speed])
+        found = replace(found, speed=swing, travel=swing / (2 * pi * found.frequency))
     if axis.final_element is None:
         return found
-    return _add_effect_at_rest(found, loop, axis, axis.final_element, reference, full)
+    return _add_effect_at_rest(found, loop, axis, axis.final_element, held, full)
+
+
+def _operating_points(
+    loop: ClosedLoop, axis: Axis, reference: Step, speed: float | None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """What is known of the plant where the body moves, half way of a step in position, and where it is held."""
+    if loop.feedback.name == axis.position:
+        half = (reference.initial + reference.final) / 2
+        fast = reference.size / (reference.horizon - reference.at) if speed is None else speed
+        return {axis.position: half, axis.speed: fast}, {axis.position: reference.initial, **reference.start}
+    start = {n: v for n, v in reference.start.items() if n == axis.position}
+    fast = (reference.final or reference.initial) if speed is None else speed
+    return {axis.speed: fast, **start}, {axis.speed: reference.initial, **reference.start}
 
 
 def explain_effect(loop: ClosedLoop, effect: DitherEffect, parameters: ParameterSet) -> tuple[str, ...]:
@@ -122,10 +141,15 @@ def format_with_prefix(value: float, unit: str) -> str:
 
 
 def _add_effect_at_rest(
-    found: DitherEffect, loop: ClosedLoop, axis: Axis, element: FinalElement, reference: Step, full: ParameterSet
+    found: DitherEffect,
+    loop: ClosedLoop,
+    axis: Axis,
+    element: FinalElement,
+    known: Mapping[str, float],
+    full: ParameterSet,
 ) -> DitherEffect:
     """Add what the dither moves where the body is held at rest: the final element, and the force behind it."""
-    rest = _try_rest(loop.plant, full, {axis.speed: reference.initial, **reference.start})
+    rest = _try_rest(loop.plant, full, known)
     held = _state_harmonics(loop, _clamp_body(loop.plant, axis), full, rest)
     if rest is None or not held:
         return found

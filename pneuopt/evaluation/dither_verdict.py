@@ -1,16 +1,18 @@
 """`judge_dither`: whether a dither is useful: the loop's metrics with and without it, and what the dither moves."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from math import inf, isfinite, isnan
+from math import inf, isfinite, isnan, nan
 from typing import TYPE_CHECKING, NamedTuple
 
-from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
+from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step, as_steps
+from pneuopt.dynamics.hooks import Axis
 from pneuopt.evaluation.dither_effect import DitherEffect, dither_effect, explain_effect, format_with_prefix
-from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.dithered_ending import DitheredEnding, read_ending
+from pneuopt.evaluation.evaluate import evaluate_cases
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
@@ -19,34 +21,41 @@ from pneuopt.quantities.parameters import ParameterSet
 if TYPE_CHECKING:
     import pandas as pd
 
-# Amplitude of the loop "without" dither, as a share of the judged one: at zero its means would not be read over the
-# same periods; a much larger one would act as a dither.
-NEGLIGIBLE_AMPLITUDE = 1e-9
+# Share by which a dither has to reduce the error of a loop that goes on hunting, to count as better: with less, one
+# that shakes a hunting loop a little is useful; with more, no dither is that does not cure it.
+MIN_CURE = 0.5
+# Ripple from peak to peak, a share of the step, from which a dither is harmful whatever else it does: above, the motion
+# goes to and fro instead of along the step; far below, a dither that cures hunting as large is refused.
+MAX_RIPPLE_SHARE = 0.5
 
 
 class Usefulness(Enum):
     """Verdict on a dither."""
 
     USEFUL = "useful"
+    HELPS_THESE_GAINS = "useful with these gains"
     USELESS = "useless"
     HARMFUL = "harmful"
 
 
 class Criterion(NamedTuple):
-    """A criterion on dithers: a metric's label and the least change that counts, relative to its value or absolute."""
+    """A criterion on dithers: a metric's label and the changes of which the larger counts, absolute and relative."""
 
     label: str
-    min_change: float
-    relative: bool
+    absolute: float
+    relative: float
+    counts_in_hunting: bool = True
 
 
 CRITERIA: Mapping[str, Criterion] = {  # where some improve and others do not, the first that changes decides
-    "LimitCycleAmplitude": Criterion("limit cycle", 0.02, relative=False),  # [fraction of the step]
-    "SettlingTime": Criterion("settling time", 0.05, relative=True),
-    "SteadyStateError": Criterion("steady-state error", 0.5, relative=False),  # [%]
-    "IAE": Criterion("integral of the error", 0.05, relative=True),
-    "Overshoot": Criterion("overshoot", 1.0, relative=False),  # [%]
+    "RemainingError": Criterion("largest error in the end, ripple included", 0.5, 0.05),  # [%]
+    "SettlingTimeRaw": Criterion("settling time, ripple included", 0.0, 0.05),
+    "SettlingTime": Criterion("settling time of the mean", 0.0, 0.05),
+    "SteadyStateError": Criterion("error of the mean in the end", 0.5, 0.0),  # [%]
+    "IAE": Criterion("integral of the error", 0.0, 0.05, counts_in_hunting=False),
+    "Overshoot": Criterion("overshoot", 1.0, 0.0, counts_in_hunting=False),  # [%]
 }
+NO_RIVAL = "gains tuned without dither may do as well: none were compared (tune_without_dither finds them)"
 PRICE_METRICS = {
     "Ripple": "ripple",
     "AirUse": "air consumption",
@@ -65,10 +74,12 @@ class DitherVerdict:
     reasons : tuple of str
         What decided, the price and the mechanism, a sentence each.
     table : DataFrame
-        A row for each metric of `evaluate`, columns "without" and "with": the worst over the references.
+        A row for each metric of `evaluate`, columns "without" and "with": the worst over the references. Settling times
+        and errors are those of the continued response, infinite where it never settles; RemainingError is the largest
+        error over the last cycles, ripple included [% of the step].
     effect : DitherEffect
     baseline : str
-        What "without" stands for: the same gains, or a design of its own.
+        What "without" stands for: the same gains, or gains tuned without dither.
     unit : str
         Unit of the command.
     """
@@ -94,12 +105,15 @@ def judge_dither(
     without: ParameterSet | None = None,
     band: float = 0.02,
 ) -> DitherVerdict:
-    """Evaluate a loop with and without its dither, and say whether the dither is useful, and why.
+    """Evaluate a loop with its dither and a rival without one, and say whether the dither is useful, and why.
 
-    A metric counts as better or worse where it changes by more than this: settling time and integral of the absolute
-    error by 5 %, steady-state error by 0.5 % of the step, overshoot by 1 %, a limit cycle's amplitude by 2 %. Where
-    some improve and others do not, the first of limit cycle, settling time, steady-state error, integral, overshoot
-    decides. A dither that swings the signal by more than the step is harmful, whatever the mean over its period does.
+    Responses are continued beyond their horizons until they stand or show at least three cycles of their hunting, or
+    the stroke ends (`continue_response`). The signal itself counts, with the ripple: first its largest error over the
+    last cycles, as far as it exceeds the settling band, then its settling time, then the mean's settling time and
+    error, the integral of the absolute error and the overshoot. Where some improve and others do not, the first that
+    changes decides; a change counts from 0.5 % of the step for errors, 1 % for the overshoot, and 5 % of the rest. A
+    dither with which the loop hunts has to halve the error to be useful. One that ripples by half the step or more,
+    from peak to peak, is harmful whatever else it does.
 
     Parameters
     ----------
@@ -108,8 +122,8 @@ def judge_dither(
     parameters : ParameterSet
         Values of the design with dither, whose amplitude is positive.
     without : ParameterSet, optional
-        Values of the design to compare with, whose dither is switched off. By default the same gains, which shows what
-        the dither changes; the gains of a tuning without dither show whether a dither is needed at all.
+        The rival: values tuned without dither (`tune_without_dither`); its dither is switched off. By default the same
+        gains, which are tuned for the dither, so that the verdict is "useful with these gains" at best.
     band : float
         Half width of the settling band, a fraction of the step.
 
@@ -132,59 +146,67 @@ def judge_dither(
     require(full.value(DITHER_AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")
     plain = full if without is None else full | without
     plain = plain.with_bounds({DITHER_AMPLITUDE: (0.0, plain[DITHER_AMPLITUDE].upper)})
-    plain = plain.with_values(
-        {
-            DITHER_AMPLITUDE: NEGLIGIBLE_AMPLITUDE * full.value(DITHER_AMPLITUDE),
-            DITHER_FREQUENCY: full.value(DITHER_FREQUENCY),
-        }
-    )
-    table = _compare_designs(loop, steps, plain, full, band)
-    effect = dither_effect(loop, steps[0], full)
-    sizes = [abs(s.size) for s in steps]
-    swing = float(table["with"]["Ripple"]) if isnan(effect.speed) else 2 * effect.speed
-    size = format_with_prefix(swing, loop.feedback.unit)
-    coarse = [f"worse: the dither swings {loop.feedback.name} by {size}, more than the step itself"]
-    coarse = coarse if swing > min(sizes) else []
-    usefulness, found = _weigh_changes(table, max(sizes), loop, coarse)
-    rival = "the same gains without it" if without is None else "a design of its own without it"
-    return DitherVerdict(
-        usefulness, (*found, *explain_effect(loop, effect, full)), table, effect, rival, loop.command.unit
-    )
+    plain = plain.with_values({DITHER_AMPLITUDE: 0.0})
+    before, after = ([read_ending(f, band) for f in evaluate_cases(loop, steps, p, band=band)] for p in (plain, full))
+    table = _worst_metrics(before, after)
+    effect = dither_effect(loop, steps[0], full, speed=after[0].speed)
+    objections = [
+        text for step, found in zip(steps, after, strict=True) for text in _object_to_swing(step, found, effect)
+    ]
+    hunts = any(e.hunts for e in after)
+    usefulness, changes = _weigh_changes(table, band, loop, objections, hunts=hunts)
+    notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
+    rival = "gains tuned without it"
+    if without is None:
+        usefulness = Usefulness.HELPS_THESE_GAINS if usefulness is Usefulness.USEFUL else usefulness
+        rival, notes = "the same gains without it", [*notes, NO_RIVAL]
+    reasons = (*changes, *dict.fromkeys(notes), *explain_effect(loop, effect, full))
+    return DitherVerdict(usefulness, reasons, table, effect, rival, loop.command.unit)
 
 
-def _compare_designs(
-    loop: ClosedLoop, steps: Sequence[Step], plain: ParameterSet, full: ParameterSet, band: float
-) -> "pd.DataFrame":
-    """Worst metrics over the references, without and with dither; a loop that never settles takes infinitely long."""
+def _worst_metrics(before: Sequence[DitheredEnding], after: Sequence[DitheredEnding]) -> "pd.DataFrame":
+    """Worst metrics over the references, without and with dither."""
     import pandas as pd
 
-    columns = {}
-    for name, given in {"without": plain, "with": full}.items():
-        found = evaluate(loop, steps, given, band=band)
-        found.loc["SettlingTime"] = found.loc["SettlingTime"].fillna(inf)
-        columns[name] = found.max(axis=1)
-    return pd.DataFrame(columns)
+    designs = {"without": before, "with": after}
+    return pd.DataFrame({n: pd.DataFrame([e.metrics for e in endings]).max() for n, endings in designs.items()})
+
+
+def _object_to_swing(reference: Step, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
+    """Objection to a dither that swings the signal by a large part of the step, in the end or while the body moves."""
+    signal, axis = found.course.loop.feedback, found.course.loop.plant.axis or Axis()
+    moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)
+    swing, size = max(found.ripple, 0.0 if isnan(moving) else 2 * moving), abs(reference.nominal_size)
+    if swing >= MAX_RIPPLE_SHARE * size:
+        text = f"worse: the dither swings {signal.name} by {format_with_prefix(swing, signal.unit)} from peak to peak"
+        yield f"{text}, {100 * swing / size:.0f} % of the step"
 
 
 def _weigh_changes(
-    table: "pd.DataFrame", size: float, loop: ClosedLoop, objections: list[str]
+    table: "pd.DataFrame", band: float, loop: ClosedLoop, objections: list[str], *, hunts: bool
 ) -> tuple[Usefulness, tuple[str, ...]]:
-    """Verdict and its reasons, from the changes of the metrics and the objections that are known beforehand."""
+    """Verdict and its reasons, from the objections that are known beforehand and the changes of the metrics.
+
+    Of a loop that hunts with the dither only settling and errors count.
+    """
     reasons, signs = [*objections], [-1] * len(objections)
-    for metric, (words, least, relative) in CRITERIA.items():
-        before, after = (float(table[c][metric]) for c in ("without", "with"))
-        room = least * max(before, after) if relative else least * (size if "Limit" in metric else 1.0)
-        if before == after or not (abs(after - before) > room or isfinite(before) != isfinite(after)):
+    for metric, criterion in CRITERIA.items():
+        if hunts and not criterion.counts_in_hunting:
+            continue
+        least = 100 * band if metric == "RemainingError" else 0.0  # inside the band no error counts
+        before, after = (max(least, float(table[c][metric])) for c in ("without", "with"))
+        share = MIN_CURE if hunts and after < before else criterion.relative
+        room = max(criterion.absolute, share * max(before, after))
+        if before == after or (isfinite(before) == isfinite(after) and abs(after - before) <= room):
             continue
         signs.append(1 if after < before else -1)
-        change = (
-            f"{words} {_format_metric(metric, before, loop)} without, {_format_metric(metric, after, loop)} with it"
-        )
-        reasons.append(f"{'better' if after < before else 'worse'}: {change}")
+        shown = [_format_metric(metric, float(table[c][metric]), loop) for c in ("without", "with")]
+        word = "better" if after < before else "worse"
+        reasons.append(f"{word}: {criterion.label} {shown[0]} without, {shown[1]} with it")
     if not signs:
-        kept = ("SettlingTime", "SteadyStateError")
+        kept = ("RemainingError",) if hunts else ("SettlingTimeRaw", "SteadyStateError")
         figures = [f"{CRITERIA[m].label} {_format_metric(m, float(table['with'][m]), loop)}" for m in kept]
-        reasons.append(f"nothing changes: {', '.join(figures)}")
+        reasons.append(f"nothing changes: {'it still hunts, ' if hunts else ''}{', '.join(figures)}")
     reasons.append("price: " + ", ".join(_price_clause(n, table, loop) for n in PRICE_METRICS if n in table.index))
     verdict = Usefulness.USELESS if not signs else Usefulness.USEFUL if signs[0] > 0 else Usefulness.HARMFUL
     return verdict, tuple(reasons)
@@ -196,10 +218,10 @@ def _price_clause(metric: str, table: "pd.DataFrame", loop: ClosedLoop) -> str:
 
 
 def _format_metric(metric: str, value: float, loop: ClosedLoop) -> str:
-    if metric == "SettlingTime" and value == inf:
+    if metric == "RemainingError":
+        return f"{value:.3g} %"
+    if metric in ("SettlingTime", "SettlingTimeRaw") and value == inf:
         return "never"
-    if metric == "LimitCycleAmplitude" and value == 0:
-        return "none"
-    if metric in ("Ripple", "LimitCycleAmplitude"):
+    if metric == "Ripple":
         return format_with_prefix(value, loop.feedback.unit)
     return f"{value:.3g} {METRICS[metric].shown_unit(loop.command.unit, loop.feedback.unit)}".rstrip()

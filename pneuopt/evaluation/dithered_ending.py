@@ -1,0 +1,139 @@
+"""`read_ending`: how a response ends with its ripple: its error over the last cycles, its settling, its ripple."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+
+from pneuopt.evaluation.continuation import Course, continue_response
+from pneuopt.evaluation.defects import BAND_TOLERANCE, Ending
+from pneuopt.evaluation.dither_mean import FINAL_PERIODS, TAIL_SHARE, period_mean
+from pneuopt.evaluation.dither_ripple import describe_ripple, measure_ripple
+from pneuopt.evaluation.evaluate import CaseEvaluation
+from pneuopt.evaluation.limit_cycle import LimitCycle
+from pneuopt.quantities.arrays import Array
+
+# Cycles of a hunting loop, at its end, over which its error is the largest one: fewer miss the worst of irregular
+# cycles, more reach back into the transient.
+LAST_CYCLES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class DitheredEnding:
+    """How a response ends.
+
+    Attributes
+    ----------
+    metrics : dict of str to float
+        Those of `evaluate`, with the settling times and the error of the continued response, infinite where it never
+        settles, and RemainingError, the largest error of the signal itself over the last cycles [% of the step].
+    course : Course
+        The response, continued until it is decided.
+    hunts : bool
+        Whether it neither stands in the end nor drifts in one direction.
+    cycle : LimitCycle or None
+        Its hunting, where that is regular.
+    ripple : float
+        Peak to peak of its dither's ripple in the end [measured unit].
+    speed : float or None
+        The largest mean speed of a body that is positioned [its unit]; None where the reference is a speed.
+    ripple_note : str or None
+        Sentence where only the mean settles.
+    """
+
+    metrics: dict[str, float]
+    course: Course
+    hunts: bool
+    cycle: LimitCycle | None
+    ripple: float
+    speed: float | None
+    ripple_note: str | None
+
+    def describe(self, which: str) -> Iterator[str]:
+        """What a table of metrics does not show, a sentence each; `which` is "with" or "without" the dither."""
+        if self.cycle is not None:
+            yield f"{which} it the loop ends in {self.cycle.describe(self.course.loop.feedback.unit)}"
+        if self.ripple_note is not None:
+            yield self.ripple_note
+        if self.course.contact and self.hunts:
+            until = f"{self.course.t[-1]:.3g} s after the step"
+            yield f"{which} it the response is judged until {until}: {self.course.contact}"
+
+
+def read_ending(found: CaseEvaluation, band: float) -> DitheredEnding:
+    """Continue a response until it stands, shows whether it hunts or meets a limit, and read how it ends.
+
+    Parameters
+    ----------
+    found : CaseEvaluation
+    band : float
+        Half width of the settling band, a fraction of the step.
+
+    Raises
+    ------
+    ConvergenceError
+        If the simulation stops.
+    """
+    course, size = continue_response(found, band), abs(found.case.reference.nominal_size)
+    ending = Ending(course, band, found.case.label)
+    begin, mean = _begin_of_end(ending), np.abs(course.error)
+    raw = np.abs(course.signal - course.reference.final) / size
+    errors = {
+        "RemainingError": 100 * float(raw[course.t >= begin].max()),
+        "SteadyStateError": 100 * float(mean[course.at >= begin].max()),
+    }
+    settled = {
+        "SettlingTime": _settling_time(ending, found.metrics["SettlingTime"], course.at, mean),
+        "SettlingTimeRaw": _settling_time(ending, found.metrics["SettlingTimeRaw"], course.t, raw),
+    }
+    return DitheredEnding(
+        {**found.metrics, **errors, **settled},
+        course,
+        not (ending.stands or ending.drifts),
+        ending.cycle,
+        _ripple(course),
+        _largest_speed(found),
+        describe_ripple(found.metrics, size, band),
+    )
+
+
+def _begin_of_end(ending: Ending) -> float:
+    """Instant from which the error counts as the one in the end: that of the last cycles of a loop that hunts [s]."""
+    end, cycle = float(ending.course.t[-1]), ending.cycle
+    if cycle is not None:
+        return end - LAST_CYCLES / cycle.frequency
+    if ending.stands or ending.drifts:
+        return end - max(TAIL_SHARE * end, FINAL_PERIODS * (ending.course.period or 0.0))
+    return end / 2
+
+
+def _settling_time(ending: Ending, within_horizon: float, t: Array, error: Array) -> float:
+    """That within the horizon, if the continuation does not refute it; else its own; infinite for never [s]."""
+    outside, end = np.flatnonzero(error > ending.band * (1 + BAND_TOLERANCE)), float(t[-1])
+    last = float(t[outside[-1]]) if len(outside) else 0.0
+    if isfinite(within_horizon) and last <= ending.course.horizon:
+        return within_horizon
+    stays = last <= end / 2 or (ending.cycle is None and last <= (1 - TAIL_SHARE) * end)
+    return last if stays else np.inf
+
+
+def _ripple(course: Course) -> float:
+    """Peak to peak of what repeats with the dither in the end [measured unit]."""
+    if course.period is None:
+        return 0.0
+    signal, k = course.signal[None], len(course.at)
+    means = period_mean(course.t, signal, course.reference.initial, course.period, course.at)
+    return float(measure_ripple(course.at, signal[:, :k] - means, course.period)[0])
+
+
+def _largest_speed(found: CaseEvaluation) -> float | None:
+    """The largest mean speed of a positioned body within the horizon [its unit]; None for other loops."""
+    axis, period, run = found.loop.plant.axis, found.loop.dither_period(found.parameters), found.response
+    if axis is None or found.loop.feedback.name != axis.position or axis.speed not in run:
+        return None
+    speed = run[axis.speed]
+    if period is not None and period <= run.t[-1] - run.t[0]:
+        at = run.t[run.t <= run.t[-1] - period / 2]
+        speed = period_mean(run.t, speed[None], float(speed[0]), period, at)[0]
+    return float(speed[np.abs(speed).argmax()])
