@@ -31,6 +31,9 @@ STANDING_SHARE = 0.1
 # A larger one misses an integral that pushes a stuck drive towards its break-away; a smaller one continues responses
 # for the last of their decay.
 COMMAND_DRIFT_SHARE = 0.01
+# Share of a record before a contact with a validity limit that is not judged: the rounded edge of an end stop slows a
+# piston some millimetres before it. With less, a speed that holds until the stop creeps; more hides what it did there.
+CONTACT_SHARE = 0.1
 # Size of the error, in steps, from which a response counts as running away: a lower one takes a large overshoot for
 # it, from a higher one on numbers overflow.
 RUNAWAY_ERROR = 100.0
@@ -89,8 +92,12 @@ class Course:
 
     @cached_property
     def at(self) -> Array:
-        """Instants at which the means are known [s]: half a dither period before the end at the latest."""
-        return np.asarray(self.t[self.t <= self.t[-1] - (self.period or 0.0) / 2])
+        """Instants that are judged [s]: means are known until half a dither period before the end.
+
+        Those shortly before a contact are left out.
+        """
+        left_out = CONTACT_SHARE * self.t[-1] if self.contact else 0.0
+        return np.asarray(self.t[self.t <= self.t[-1] - max(left_out, (self.period or 0.0) / 2)])
 
     @cached_property
     def error(self) -> Array:
@@ -119,7 +126,7 @@ class Course:
 
     def _mean(self, values: Array, initial: float) -> Array:
         if self.period is None:
-            return values
+            return values[: len(self.at)]
         return np.asarray(period_mean(self.t, values[None], initial, self.period, self.at)[0])
 
 
