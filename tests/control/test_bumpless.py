@@ -52,6 +52,17 @@ def test_the_command_goes_on_where_it_is(name: str) -> None:
     assert after["speed"][-1] == pytest.approx(0.1, abs=2e-3)
 
 
+@pytest.mark.parametrize("c", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_loop_that_starts_in_steady_motion_goes_on_so(name: str, c: float) -> None:
+    """Whatever part of the reference the derivative sees: it remembers that part, not the whole error."""
+    loop = LOOPS[name]
+    p = loop.parameters.with_values(OLD | {"pid.c": c})
+    after = simulate(loop, fed(31), p, initial=loop.initial(p, reference=0.1))
+    np.testing.assert_allclose(after["control"], after["control"][0], rtol=1e-6)
+    np.testing.assert_allclose(after["speed"], 0.1, rtol=1e-6)
+
+
 def test_a_form_takes_over_in_its_own_gains() -> None:
     loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(H, form=Form.STANDARD))
     old = loop.parameters.with_values({"pid.Kp": 100.0, "pid.Ti": 0.1})
