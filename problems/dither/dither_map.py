@@ -11,7 +11,7 @@ Rows without.*: the gains alone. Rows with.*: gains, amplitude and frequency of 
 triangle at the sine's frequency. Both are certified on all plants. Rows quiet.*: with a limit on the air. The map is of
 the nominal plant: the settling time over amplitude and frequency, at the gains of either design; a cell is useful where
 it settles at least 5 % sooner than the design without. Rows verdict.*: what `judge_dither` says, the gains of each
-design its own, and at the same gains.
+design its own, and at the same gains: 1 useful, .5 useful with these gains, 0 useless, -1 harmful.
 """
 
 import sys
@@ -32,7 +32,7 @@ from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from problems.shared.arrays import Array
-from problems.shared.claims import Claim, arguments, design, finish, frame
+from problems.shared.claims import VERDICT_SCORES, Claim, arguments, design, finish, frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -156,7 +156,7 @@ def main(job: Job) -> "DataFrame":
     alone, dithered = (worst(job.designs[n], "SettlingTime") for n in ("without", "with"))
     claims.append(Claim("gain", alone / dithered))
     for name, verdict in job.verdicts.items():
-        claims.append(Claim(f"verdict.{name}", SCORES[verdict.usefulness]))
+        claims.append(Claim(f"verdict.{name}", VERDICT_SCORES[verdict.usefulness.name]))
         for row, unit in {"AirUse": "l", "ValveTravel": "1", "Ripple": "m/s"}.items():
             before, after = (float(verdict.table[c][row]) for c in ("without", "with"))
             claims.append(Claim(f"verdict.{name}.{row}", after, unit, before))
@@ -169,9 +169,6 @@ def main(job: Job) -> "DataFrame":
     claims.append(Claim("map.air.most", float(job.air.max()), "l", float(job.air.min())))
     claims.append(Claim("seconds", job.seconds, "s"))
     return frame([replace(c, bound=BOUNDS.get(c.name, c.bound)) for c in claims])
-
-
-SCORES = {po.Usefulness.USEFUL: 1.0, po.Usefulness.USELESS: 0.0, po.Usefulness.HARMFUL: -1.0}
 
 
 def useful(settled: Array, job: Job) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ import numpy as np
 
 import pneuopt as po
 from pneuopt.plotting import BLUE, GREY, ORANGE, RED, axes_grid
-from problems.shared.claims import Claim
+from problems.shared.claims import VERDICT_SCORES, Claim
 from problems.shared.r25 import CLIP, PAPERS_PID, TRANSDUCER, Case, averaged, lagging, linearised, simulated
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ TABLE = {
     628.0: (1.21, 0.16, 0.26, 33.0, 248.0),
     1000.0: (0.76, 0.064, 0.064, 52.0, 630.0),
 }
-SCORES = {po.Usefulness.USEFUL: 1.0, po.Usefulness.USELESS: 0.0, po.Usefulness.HARMFUL: -1.0}
 HUNTING, LATE = Case(0.2, pid=True, lugre=True, seconds=6.0), 3.0  # 10 mm/s; [s] from which it is measured
 
 
@@ -146,7 +145,7 @@ def _verdicts() -> list[Claim]:
     for name, volts in {"paper": PAPERS, "4V": 4.0}.items():
         found = po.judge_dither(loop, po.Step(1 / TRANSDUCER), given.with_values({"dither.amplitude": volts}))
         bound = "0 +- 0" if name == "paper" else ""
-        rows.append(Claim(f"verdict.{name}", SCORES[found.usefulness], "1", None, bound))
+        rows.append(Claim(f"verdict.{name}", VERDICT_SCORES[found.usefulness.name], "1", None, bound))
         rows.append(Claim(f"verdict.{name}.force", found.effect.force, "N", STATIC))
         before, after = (float(found.table[c]["Overshoot"]) for c in ("without", "with"))
         rows.append(Claim(f"verdict.{name}.overshoot", after, "%", before))

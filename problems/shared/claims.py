@@ -36,6 +36,8 @@ METRICS = {
     "max_sensitivity": ("MaxSensitivity", "1"),
     "ripple": ("Ripple", ""),
 }
+# A dither's verdict as a figure, by the name of its `Usefulness`.
+VERDICT_SCORES = {"USEFUL": 1.0, "HELPS_THESE_GAINS": 0.5, "USELESS": 0.0, "HARMFUL": -1.0}
 COMPARISONS: dict[str, Callable[[float, float], bool]] = {"<=": operator.le, ">=": operator.ge}
 
 

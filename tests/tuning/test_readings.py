@@ -16,7 +16,7 @@ METRICS = ("SettlingTime", "SettlingTimeRaw", "Undershoot", "RiseTime", "IAE", "
 
 def response(reference: Step) -> tuple[ReferenceGrid, np.ndarray]:
     """A lag of .1 s under a ripple of 10 % of the step: signal, command, and the signal's integral."""
-    t = np.arange(round(reference.horizon / SPACING) + 1) * SPACING
+    t = np.linspace(0.0, reference.horizon, round(reference.horizon / SPACING) + 1, dtype=np.float64)
     lag, rate = 0.1, 2 * pi / PERIOD
     y = reference.final - reference.size * np.exp(-t / lag) + 0.1 * np.sin(rate * t)
     whole = reference.final * t - reference.size * lag * (1 - np.exp(-t / lag)) + 0.1 * (1 - np.cos(rate * t)) / rate
