@@ -112,7 +112,6 @@ from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
 from .studies.sweep import grid, sweep
-from .tuning.condensed import Condensed
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
 from .tuning.screening import Screening
@@ -134,7 +133,6 @@ __all__ = [
     "Certificate",
     "ClosedLoop",
     "Code",
-    "Condensed",
     "ControlRate",
     "ConvergenceError",
     "Coulomb",

@@ -29,7 +29,6 @@ PUBLIC_NAMES = [
     "coarse_delay",
     "Code",
     "compare_logs",
-    "Condensed",
     "contacts",
     "ControlRate",
     "ConvergenceError",

@@ -3,15 +3,14 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.two_phase import TwoPhase
 
 # By their key in a tuning's file; the first that suits a task is chosen: `Racing` suits every task.
-METHODS: Mapping[str, type[TwoPhase] | type[Racing] | type[Condensed] | type[Screening]] = MappingProxyType(
-    {"two_phase": TwoPhase, "racing": Racing, "condensed": Condensed, "screening": Screening}
+METHODS: Mapping[str, type[TwoPhase] | type[Racing] | type[Screening]] = MappingProxyType(
+    {"two_phase": TwoPhase, "racing": Racing, "screening": Screening}
 )
 
 

@@ -2,8 +2,7 @@
 
 Minimise ``f(z) + sum_g weight_g max(floor_g, max_i r_gi(z))`` in a box, f linear: a limit is a group of rows with floor
 0 and a weight beyond its multiplier (an exact penalty), an objective such as a peak is one without a floor. The rows
-come from compiled simulations with forward sensitivities, the gaps between segments closed in every iteration
-(condensed multiple shooting), so that the program in each step is dense and small.
+come from compiled simulations with forward sensitivities, so that the program in each step is dense and small.
 """
 
 import functools

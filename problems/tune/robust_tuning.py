@@ -150,7 +150,7 @@ def _part(name: str, task: Task, seeds: int, more: Callable[[po.ParameterSet], d
     runs = []
     for seed in range(seeds):
         begun = time.process_time()
-        method = po.Condensed(seed=seed)
+        method = po.Racing(seed=seed)
         runs.append(po.tune(task.loop, task.steps, start, scenarios=task.scenarios, method=method, **asked))
         seconds["robust"] = time.process_time() - begun
         print(f"{name} seed {seed}: {runs[-1].status}, {seconds['robust']:.1f} s CPU", file=sys.stderr, flush=True)

@@ -19,8 +19,8 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
@@ -93,7 +93,7 @@ def test_a_tuning_reckons_with_it() -> None:
     """Tuned without the delay the loop overshoots once it is there; tuned with it, it keeps the limit."""
     loop, given = friction_loop()
     ignorant = ClosedLoop(loop.plant, PID(5e-3))
-    quick = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
+    quick = Racing(members=8, trials=40, polish=16)
     limits = [Overshoot(0.05)]
     knowing = tune(loop, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)
     blind = tune(ignorant, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)

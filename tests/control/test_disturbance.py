@@ -14,8 +14,8 @@ from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.method import Method
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase
@@ -75,7 +75,7 @@ def test_a_disturbance_of_a_step_comes_with_it() -> None:
     np.testing.assert_allclose(both, step + push, atol=1e-9)
 
 
-@pytest.mark.parametrize("method", [TwoPhase((12, 20), starts=1), Screening(20, 6, (), 100), Condensed()])
+@pytest.mark.parametrize("method", [TwoPhase((12, 20), starts=1), Screening(20, 6, (), 100), Racing()])
 def test_each_search_claims_what_is_certified(method: Method) -> None:
     """The step's rise and the load's recovery are bound together: all searches end in the same design."""
     loop = ClosedLoop(FirstOrder().system(), PID(limits=False))

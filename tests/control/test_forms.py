@@ -34,8 +34,8 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.condensed import Condensed
 from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
@@ -189,7 +189,7 @@ def test_gradients_are_those_of_finite_differences(
 
 def test_it_is_tuned_in_its_own_gains() -> None:
     loop, freed = friction_loop(Form.STANDARD, 2e-3)
-    quick = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
+    quick = Racing(members=8, trials=40, polish=16)
     best = tune(loop, Step(0.1, horizon=0.3), freed, minimise=SettlingTime(), subject_to=[Overshoot(0.1)], method=quick)
     assert best.status.converged
     assert set(best.parameters.free_names) == {"pid.Kp", "pid.Ti", "pid.Td", "pid.N"}

@@ -21,15 +21,14 @@ from pneuopt.models.friction import Viscous
 from pneuopt.models.linear import FirstOrder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError, ModelError
-from pneuopt.tuning.condensed import Condensed
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 from pneuopt.tuning.two_phase import TwoPhase
 
 LAG = 5e-3
-QUICK = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
+QUICK = Racing(members=8, trials=40, polish=16)
 
 
 def first_order(sample_time: float | None = None) -> ClosedLoop:
@@ -202,20 +201,17 @@ def test_search_and_certificate_count_alike(step: Step) -> None:
         assert claimed[name] == pytest.approx(certified[name], rel=1e-3, abs=2e-4), name
 
 
-def test_counts_are_tuned_by_screening() -> None:
+def test_counts_are_tuned_without_gradients() -> None:
     loop = encoder_loop(Encoder(2e-5, LAG))
     given = loop.parameters.with_values(SPEED_GAINS).with_bounds({"pid.Kp": (50.0, 600.0)}).freed("pid.Kp")
-    told = r"Condensed has no gradient for sensor\.resolution \(an encoder's counts\); use method=Racing\(\)"
 
-    def tuned(loop: ClosedLoop, method: Condensed | Screening, scenarios: Scenarios) -> bool:
+    def tuned(loop: ClosedLoop, method: Racing, scenarios: Scenarios) -> bool:
         step, limits = Step(0.1, horizon=0.3), [Overshoot(0.1)]
         goal = SettlingTime()
         found = tune(loop, step, given, minimise=goal, subject_to=limits, method=method, scenarios=scenarios)
         return found.status.converged
 
-    with pytest.raises(InputError, match=told):
-        tuned(loop, Condensed(), {})
-    assert tuned(loop, Screening(members=6, generations=2, refinements=20), corners(given, {"load.mass": 0.1}))
+    assert tuned(loop, QUICK, corners(given, {"load.mass": 0.1}))
     assert tuned(encoder_loop(Encoder(0.0, LAG)), QUICK, {})
 
 

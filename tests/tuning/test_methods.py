@@ -26,7 +26,6 @@ STEP, LIMITS = Step(1.0, horizon=1.0), (Overshoot(0.05),)
 SMALL: dict[str, dict[str, object]] = {  # options with which each one takes a second
     "two_phase": {"starts": 1, "nodes": [20, 20]},
     "racing": {"members": 8, "trials": 40, "bands": [4.0], "polish": 2},
-    "condensed": {"members": 8, "generations": 2, "restarts": 0, "polish": 2, "keep": 1},
     "screening": {"members": 8, "generations": 3, "bands": [0.1], "refinements": 20},
 }
 FILE = """
@@ -151,4 +150,4 @@ def test_what_it_refuses_does_not_suit_it(kind: str) -> None:
             refused += 1
             assert not method.suits(task)
         assert choose_method(task).suits(task)
-    assert refused == {"two_phase": 3, "racing": 0, "condensed": 2, "screening": 0}[kind]
+    assert refused == {"two_phase": 3, "racing": 0, "screening": 0}[kind]

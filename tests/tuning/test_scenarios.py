@@ -19,7 +19,7 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.linear import Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.tuning.condensed import Condensed
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.screening import MeritFunction, Screening, run_screening
 from pneuopt.tuning.simulator import Simulator
@@ -29,7 +29,7 @@ from pneuopt.tuning.two_phase import TwoPhase
 
 STEP = Step(1.0, horizon=2.0)
 QUICK = Screening(members=10, generations=6, refinements=60)
-GRADIENTS = Condensed(members=8, generations=3, keep=2, iterations=16, restarts=0, polish=4)
+GRADIENTS = Racing(members=8, trials=40, polish=16)
 
 
 def integrator() -> tuple[ClosedLoop, ParameterSet]:
@@ -55,8 +55,8 @@ def test_the_certificate_has_a_column_a_case_and_the_analytic_times() -> None:
         assert found[column]["SettlingTime"] == pytest.approx(math.log(50) / (5 * gain), rel=1e-3)
 
 
-@pytest.mark.parametrize("method", [QUICK, GRADIENTS], ids=["screening", "condensed"])
-def test_the_slowest_plant_decides_the_gain(method: Screening | Condensed) -> None:
+@pytest.mark.parametrize("method", [QUICK, GRADIENTS], ids=["screening", "racing"])
+def test_the_slowest_plant_decides_the_gain(method: Screening | Racing) -> None:
     """Settling within 0.4 s at a gain of 0.8 takes Kp = ln 50/0.32; no more, for the peak is minimised."""
     loop, given = integrator()
     best = tune(
