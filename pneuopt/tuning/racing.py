@@ -190,7 +190,8 @@ def run_racing(
     try:
         search.run(method)
     except KeyboardInterrupt:
-        return RacingResult(space.from_unit(search.best), search.count, False, search.starts, search.agreeing)
+        best = space.from_unit(search.best_so_far())
+        return RacingResult(best, search.count, False, search.starts, search.agreeing)
     return RacingResult(space.from_unit(search.best), search.count, True, search.starts, search.agreeing)
 
 
@@ -235,6 +236,7 @@ class _RacingSearch:
         self._rng, self._progress, self._coarse = rng, progress, simulator.coarse(spec)
         self._polisher = Polish(simulator, spec)
         self.best, self.count, self.starts, self.agreeing = np.clip(start, 0.0, 1.0), 0, 0, 0
+        self._ends = list[Array]()
 
     def run(self, method: Racing) -> None:
         """Search from each start on coarse samples, then from the best of all on fine ones."""
@@ -242,20 +244,23 @@ class _RacingSearch:
         population = first_population(method.members, given, self._rng)
         if not method.bands:
             population[1:] = _near(given, population[1:], self._rng)
-        ends, bests = list[Array](), list[float]()
+        bests = list[float]()
         for share in START_SHARES:
-            best = self.best
             population, merits = self._search(population, method, share)
-            ends.append(population)
+            self._ends.append(population)
             bests.append(float(merits[0]))
-            if bests[-1] > min(bests):
-                self.best = best
             self.starts, self.agreeing = len(bests), sum(b <= min(bests) * (1 + AGREEMENT) for b in bests)
             population = _other_population(method, names, population, self._rng)
         trials = (1 - sum(START_SHARES)) * method.trials * len(names)
         fine = _Phase("fine samples", self._simulator, round(trials))
-        population, merits = self.evolve(np.vstack([*ends, given]), fine, FINE_MEMBERS)
+        population, merits = self.evolve(np.vstack([*self._ends, given]), fine, FINE_MEMBERS)
         self._polish(population, merits, self._simulator, method.polish)
+
+    def best_so_far(self) -> Array:
+        """The best of the present phase, which may ask for another band, and of the starts that have ended."""
+        points = np.array([self.best, *(end[0] for end in self._ends)])
+        merits, _ = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(points))
+        return np.asarray(points[np.argmin(merits)])
 
     def _search(self, population: Array, method: Racing, share: float) -> tuple[Array, Array]:
         """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for."""

@@ -1,0 +1,104 @@
+"""The race as a method: the same answer by the same seed, the best so far at Ctrl-C, starts that differ in kind."""
+
+import numpy as np
+import pytest
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.evaluation.specification import specify
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.quantities.status import Code
+from pneuopt.tuning.method import TuningTask
+from pneuopt.tuning.race import Race
+from pneuopt.tuning.racing import Racing, RacingResult, run_racing
+from pneuopt.tuning.screening import compute_merits
+from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import search_space
+
+BOUNDS = {"pid.Kp": (50.0, 600.0), "pid.Ki": (100.0, 8000.0)}
+STEP, SPEC = Step(0.1, horizon=0.2), specify(SettlingTime(), [Overshoot(0.1)])
+SMALL = Racing(members=8, trials=60, polish=0)
+
+
+def posed(dither: Dither | None = None) -> tuple[TuningTask, Simulator]:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(), dither)
+    values = {"friction.coulomb": 40.0, "friction.static": 50.0, "pid.Kp": 100.0, "pid.Ki": 1000.0}
+    values |= {"pid.lower": -300.0, "pid.upper": 300.0} | ({"dither.amplitude": 5.0} if dither else {})
+    bounds = BOUNDS | ({"dither.amplitude": (0.0, 30.0)} if dither else {})
+    given = loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
+    task = TuningTask(loop, (STEP,), {"heavy": {"load.mass": 9.0}}, search_space(loop, given), SPEC)
+    return task, Simulator(loop, task.references, task.space, task.scenarios, SPEC)
+
+
+def merit(simulator: Simulator, point: np.ndarray) -> float:
+    return float(compute_merits(simulator.values(point[None], SPEC), SPEC, STEP.horizon)[0])
+
+
+def search(method: Racing = SMALL, stop: str = "never", dither: Dither | None = None) -> tuple[RacingResult, list[str]]:
+    (task, simulator), heard = posed(dither), list[str]()
+
+    def hear(line: str) -> None:
+        heard.append(line)
+        if line.startswith(stop) and any("coarse" in earlier for earlier in heard):
+            raise KeyboardInterrupt
+
+    return run_racing(task, simulator, SPEC, method, task.space.start, hear), heard
+
+
+def test_a_seed_decides() -> None:
+    first, again, other = (search(m)[0] for m in (SMALL, SMALL, Racing(8, 60, polish=0, seed=1)))
+    assert np.array_equal(first.point, again.point)
+    assert first.count == again.count
+    assert not np.array_equal(first.point, other.point)
+
+
+def test_the_budget_is_in_trials() -> None:
+    """All that it simulates beside them is the populations, once a phase, and each new best on whole responses."""
+    found, heard = search()
+    assert found.is_complete
+    generations = sum("generation" in line for line in heard)
+    assert generations * 8 >= 0.8 * 60 * 2
+    assert found.count <= 2 * 60 * 2 + 8 * 8
+
+
+def test_it_is_never_worse_than_the_given_gains() -> None:
+    task, simulator = posed()
+    found, _ = search(Racing(members=5, trials=1, polish=0))
+    assert merit(simulator, found.point) <= merit(simulator, task.space.start)
+
+
+def test_ctrl_c_in_a_later_start_gives_the_end_of_the_first() -> None:
+    found, heard = search(stop="wide bands")
+    assert not found.is_complete
+    assert found.starts == 1
+    ended = [line for line in heard if line.startswith("coarse samples")][-1]
+    _, simulator = posed()
+    assert merit(simulator, found.point) == pytest.approx(float(ended.split("best ")[1]), rel=2e-3)
+
+
+def test_a_second_start_tries_hardly_any_dither(monkeypatch: pytest.MonkeyPatch) -> None:
+    ranked, merits = list[np.ndarray](), Race.merits
+
+    def note(race: Race, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ranked.append(points[:, 2])
+        return merits(race, points)
+
+    monkeypatch.setattr(Race, "merits", note)
+    found, _ = search(dither=Dither(100.0))
+    assert found.starts == 2
+    assert 1 <= found.agreeing <= 2
+    populations = [amplitudes.max() for amplitudes in ranked if len(amplitudes) == 8]
+    assert populations[0] > 15.0
+    assert min(populations) <= 0.02 * 30.0
+
+
+def test_the_result_says_how_many_starts_agree() -> None:
+    task, simulator = posed()
+    found = SMALL.find(task, simulator, SPEC.with_stability(), task.space.start, 0, lambda _: None)
+    assert found.status.code is Code.CONVERGED
+    assert found.stats["starts"] == 2
+    assert found.stats["starts_agreeing"] in (1, 2)
