@@ -18,6 +18,9 @@ from pneuopt.quantities.parameters import ParameterSet
 # RK4 steps between two samples, at most. A lower limit refuses stiff loops that could be run; with a higher one a
 # search whose bounds let a filter get too fast takes hours instead of naming them.
 MAX_LOOP_SUBSTEPS = 100
+# Distance from a bound, a fraction of the range, within which a gain is rounded to the bound. A larger one moves gains
+# that matter; below a solver's tolerance an unused derivative time is printed as 1e-9 s.
+BOUND_DISTANCE = 1e-6
 # Rounded points around a design that are simulated, at most: 5^4, all that differ by two last places or less in four
 # gains. Fewer miss roundings that keep the limits; each more costs a simulation.
 MAX_ROUNDING_POINTS = 625
@@ -88,7 +91,7 @@ class Space:
         return rows
 
     def round_point(self, point: Array, digits: int) -> Array:
-        """Round a point to so many significant digits, within the bounds, shape (n,).
+        """Round a point to so many significant digits, within the bounds, shape (n,); close to a bound it is the bound.
 
         Examples
         --------
@@ -99,7 +102,11 @@ class Space:
         (0.3966, [0.3965, 0.3967])
         """
         found = np.array(point)
-        for k, (value, (low, up)) in enumerate(zip(point.tolist(), self.bounds, strict=True)):
+        for k, (value, (low, up)) in enumerate(zip(point.tolist(), self.bounds.tolist(), strict=True)):
+            at = next((b for b in (low, up) if abs(value - b) <= BOUND_DISTANCE * (up - low)), None)
+            if at is not None and not self.parameters[self.names[k]].log:
+                found[k] = at
+                continue
             rounded = (_round_digits(value + n * _last_place(value, digits), digits) for n in (0, -1, 1))
             found[k] = next((v for v in rounded if low <= v <= up), value)
         return found

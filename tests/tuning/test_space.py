@@ -15,10 +15,10 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import dither_resolution_rate, search_space
+from pneuopt.tuning.space import Space, dither_resolution_rate, search_space
 from pneuopt.tuning.tune import tune
 
 STEP = Step(0.1, horizon=0.4)
@@ -87,3 +87,11 @@ def test_a_frequency_of_zero_and_an_amplitude_beyond_the_command_are_refused_bef
     wide = valve.parameters.with_bounds({"dither.amplitude": (0.0, 8.0)}).freed("dither.amplitude")
     with pytest.raises(InputError, match=r"may reach 8 V, but the valve ends at -5 and 5 V.*lower its upper bound"):
         search_space(valve, wide)
+
+
+def test_a_gain_at_its_bound_is_printed_as_the_bound() -> None:
+    """A solver leaves an unused derivative gain at 3e-9: a derivative time of 1e-9 s was printed."""
+    gains = {"pid.Kp": Parameter(0.5, "1", 0.0, 2.0, free=True), "pid.Kd": Parameter(0.1, "s", 0.0, 2.0, free=True)}
+    space = Space(ParameterSet(gains), ("pid.Kp", "pid.Kd"))
+    assert space.round_point(np.array([1.99999999, 3.1234567e-9]), 4).tolist() == [2.0, 0.0]
+    assert space.round_point(np.array([0.51234567, 3.1234567e-4]), 4).tolist() == [0.5123, 3.123e-4]

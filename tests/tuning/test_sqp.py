@@ -63,6 +63,19 @@ def test_a_linear_objective_on_a_circle() -> None:
         assert found.values.max() < 1e-4
 
 
+def test_a_step_that_makes_it_worse_is_refused() -> None:
+    """Slopes of the wrong sign: every step of the program leads uphill, so the start stands, and the descent ends."""
+
+    def misleading(x: Array) -> tuple[Array, Array]:
+        return np.array([x @ x]), -2 * x[None]
+
+    problem = Analytic(misleading, np.zeros(2), MINIMAX, np.zeros(1, dtype=np.intp))
+    (found,) = descend(problem, np.array([[1.0, 2.0]]), 40)
+    assert found.z.tolist() == [1.0, 2.0]
+    assert found.merit == 5.0
+    assert problem.evaluations < 60
+
+
 def test_the_best_line_through_a_parabola_has_the_known_error() -> None:
     """Chebyshev: x^2 on [-1, 1] is a line within 1/2 and no less, the rows 2 x 201; a vertex, found in few steps."""
     t = np.linspace(-1, 1, 201)
