@@ -46,10 +46,15 @@ def relaxation_specification(
     return replace(spec, weights=weights, limits=tuple(q for q in limits if q is not requirement))
 
 
-def limits_with_settling(spec: Specification, references: Sequence[Step]) -> tuple[Requirement, ...]:
-    """The limits, and one that the response settles at all where a settling time is minimised without a limit."""
+def limits_with_settling(
+    spec: Specification, references: Sequence[Step], *, always: bool = False
+) -> tuple[Requirement, ...]:
+    """The limits, and one that the response settles at all where a settling time is minimised without a limit.
+
+    With `always` it has to settle whatever is minimised.
+    """
     horizon = min(r.horizon - r.at for r in references)
-    if not spec.weight(SettlingTime) or any(isinstance(q, SettlingTime) for q in spec.limits):
+    if not (always or spec.weight(SettlingTime)) or any(isinstance(q, SettlingTime) for q in spec.limits):
         return spec.limits
     return (*spec.limits, SettlingTime(spec.band, max=(1 - TAIL_SHARE) * horizon))
 

@@ -6,15 +6,24 @@ from functools import cached_property
 
 import numpy as np
 
+from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.requirements import metric_name
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.certifier import MAX_CERTIFIED_EXCESS, Certifier
 from pneuopt.tuning.confirmation import confirm_infeasible, describe_confirmation
+from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
-from pneuopt.tuning.relaxation import limit_excess, relax_all, relaxation_row, relaxation_specification
+from pneuopt.tuning.relaxation import (
+    limit_excess,
+    limits_with_settling,
+    relax_all,
+    relaxation_row,
+    relaxation_specification,
+)
 from pneuopt.tuning.responses import to_records
 from pneuopt.tuning.result import TuningResult, relaxation_share, with_relaxations
 from pneuopt.tuning.screening import compute_merits
@@ -32,6 +41,10 @@ MAX_CERTIFIED_POINTS = 5
 # Rounds in which the neighbours of the best rounded design are simulated. Fewer miss a rounding that loses next to
 # nothing; more move the design away from the one that was found.
 ROUNDING_ROUNDS = 3
+# Horizons over which a design is sought whose rival hunted or crept after one: fewer do not show it; more cost time in
+# proportion. And the defects of responses that a longer horizon, over which they have to settle, shows to a search.
+HORIZON_FACTOR = 4.0
+LATE_DEFECTS = (Defect.GROWS, Defect.HUNTS, Defect.CREEPS, Defect.NEVER_SETTLES, Defect.UNDECIDED)
 # Searches on closer samples, at most: fewer claim figures of responses that are not resolved; more cost a search each.
 MAX_REFINED_SEARCHES = 3
 # Relative change of a requirement on closer samples above which a search is repeated on them. A smaller one repeats
@@ -85,10 +98,12 @@ class Search:
         except KeyboardInterrupt:
             return self._result_so_far(simulator, _interruption_result(self.space.start))
         result, start, counts = None, self.space.start if start is None else start, dict[str, float]()
+        finder = self
         for attempt in range(MARGINS_TO_TRY):
             margin = min(self.method.margin * 2**attempt, 0.5)
             try:
-                found = self._find(margin, start, attempt)
+                found = finder.find(margin, start, attempt)
+                found = found if finder is self else self._restate(found)
             except KeyboardInterrupt:  # in a method that holds no best point yet
                 found = _interruption_result(start)
             simulator = self.simulator
@@ -103,7 +118,7 @@ class Search:
                 return result
             if not self.rests and _ends_elsewhere(result):
                 return self._run_with_rest(result)
-            start = found.point
+            start, finder = found.point, finder.lengthen() if _fails_late(result) else finder
         assert result is not None
         return result
 
@@ -115,13 +130,33 @@ class Search:
         result = other.run(self.space.start)
         return result if result.status.converged or result.status.code is Code.INTERRUPTED else refused
 
+    def lengthen(self) -> "Search":
+        """A search over a longer horizon, in which a response that hunts or creeps later never settles.
+
+        Where the piston's travel or the plant allows no longer one it is this search.
+        """
+        steps = tuple(replace(r, horizon=r.at + HORIZON_FACTOR * (r.horizon - r.at)) for r in self.task.references)
+        spec, task = replace(self.spec, limits=limits_with_settling(self.spec, steps, always=True)), self.task
+        every = cases(steps, task.scenarios, self.space.parameters, self.space.names)
+        try:
+            check_feasibility(task.loop, every, self.space, spec)
+        except InputError:
+            return self
+        self.progress(f"what it does after its horizon forbids the design; searching over {HORIZON_FACTOR:g} horizons")
+        return replace(self, task=replace(task, references=steps, spec=spec))
+
+    def _restate(self, found: SearchResult) -> SearchResult:
+        """A result of a search over a longer horizon, with the objective over the horizon asked for."""
+        values = to_records(self.simulator.values(found.point[None], self.spec))[0]
+        return replace(found, stats={**found.stats, "optimum": self.spec.objective(values)})
+
     @cached_property
     def simulator(self) -> Simulator:
         """The compiled simulation of all cases, which reads the requirements asked for."""
         task = self.task
         return Simulator(task.loop, task.references, task.space, task.scenarios, task.spec)
 
-    def _find(self, margin: float, start: Array, attempt: int) -> SearchResult:
+    def find(self, margin: float, start: Array, attempt: int) -> SearchResult:
         """Search, and search again on closer samples where the response found is too fast for those of the search."""
         spec = self.tighten(margin)
         found = self.method.find(self.task, self.simulator, spec, start, attempt, self.progress)
@@ -230,6 +265,12 @@ def _ends_elsewhere(result: TuningResult) -> bool:
     """Whether a design was refused because its response does not end at the reference."""
     findings = result.certificate.findings if result.certificate is not None else ()
     return any(f.defect in ENDS_ELSEWHERE and f.sentence in result.status.sentences for f in findings)
+
+
+def _fails_late(result: TuningResult) -> bool:
+    """Whether the certificate failed by what the response does after its horizon."""
+    findings = result.certificate.findings if result.certificate is not None else ()
+    return any(finding.defect in LATE_DEFECTS for finding in findings)
 
 
 def _interruption_result(point: Array) -> SearchResult:
