@@ -1,5 +1,6 @@
 """Where a certificate finds what a response does after its horizon, the next attempt searches over a longer one."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -8,10 +9,13 @@ from pneuopt import catalog
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import NoiseGain, Overshoot, Requirement, RiseTime, SettlingTime
+from pneuopt.evaluation.defects import Defect, Finding
+from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import SecondOrder
+from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
@@ -27,18 +31,31 @@ def slow_problem() -> tuple[ClosedLoop, Any]:
     return loop, given
 
 
-@pytest.mark.parametrize("minimise", [RiseTime(), NoiseGain()])
-def test_a_design_that_does_not_reach_the_reference_is_followed_by_one_that_does(minimise: Requirement) -> None:
-    """Without integral both are best, and the response stays where it is: that was handed out."""
-    (loop, given), heard = slow_problem(), list[str]()
-    asked: Any = {"minimise": minimise, "subject_to": [Overshoot(0.05)], "method": SMALL, "plants": {}}
+def test_a_design_that_creeps_is_followed_by_a_search_over_four_horizons(monkeypatch: pytest.MonkeyPatch) -> None:
+    (loop, given), heard, horizons = slow_problem(), list[str](), list[float]()
+    certify, find = Search.certify_roundings, Screening.find
+
+    def refuse_once(search: Search, found: SearchResult, margin: float) -> TuningResult:
+        result = certify(search, found, margin)
+        if len(horizons) > 1 or result.certificate is None:
+            return result
+        creep = Finding(Defect.CREEPS, "0 to 1", "it still moves")
+        refused = replace(result.certificate, findings=(creep,))
+        return replace(result, status=Status(Code.NOT_CERTIFIED, ("it creeps",)), certificate=refused)
+
+    def record_horizon(method: Screening, task: TuningTask, *rest: Any) -> SearchResult:
+        horizons.append(task.references[0].horizon)
+        return find(method, task, *rest)
+
+    monkeypatch.setattr(Search, "certify_roundings", refuse_once)
+    monkeypatch.setattr(Screening, "find", record_horizon)
+    asked: Any = {"minimise": SettlingTime(), "subject_to": [Overshoot(0.05)], "method": SMALL, "plants": {}}
     found = tune(loop, Step(1.0, horizon=1.5), given, progress=heard.append, **asked)
     assert any("searching over 4 horizons" in text for text in heard)
-    assert found.certificate is not None
-    assert not found.certificate.findings
-    later = evaluate(loop, Step(1.0, horizon=24.0), found.parameters).iloc[:, 0]
-    assert later["SteadyStateError"] < 0.1
-    assert later["SettlingTime"] < 6.0
+    assert horizons == [1.5, 6.0]
+    assert found.status.converged
+    claimed, certified = found.requirements["claimed"], found.requirements["certified"]
+    assert claimed["SettlingTime"] == pytest.approx(certified["SettlingTime"], rel=5e-3)
 
 
 def search_for(loop: ClosedLoop, step: Step, given: Any) -> Search:
