@@ -33,6 +33,8 @@ MIN_DERIVATIVE_RATIO = 0.01
 MAX_CASE_ROWS, MAX_FAILURE_REASONS = 40, 5
 """Rows and reasons that a study shows: more scroll the verdict away."""
 MAX_GAIN_COLUMNS = 6
+# Notes of a certificate on the screen: fewer hide kinds of notes; more repeat one of them for each case.
+MAX_NOTES = 4
 """Gains that a front shows: more do not fit a terminal of 80 columns."""
 
 
@@ -125,6 +127,16 @@ def show_active(console: Console, table: "pd.DataFrame", active: Sequence[str], 
     bounds = [f"{n} (at its bound)" for n in dict.fromkeys((*at_bounds, *(a for a in active if a not in table.index)))]
     if limits or bounds:
         show_sentence(console, f"held back by: {', '.join((*limits, *bounds))}")
+
+
+def show_notes(console: Console, notes: Sequence[str]) -> None:
+    """What a certificate notes beside its figures, the first few in full."""
+    for note in notes[:MAX_NOTES]:
+        show_sentence(console, note)
+    if len(notes) > MAX_NOTES:
+        show_sentence(
+            console, f"{len(notes) - MAX_NOTES} more notes of this kind on other cases; --json FILE holds all"
+        )
 
 
 def show_margins(console: Console, margins: "pd.DataFrame") -> None:

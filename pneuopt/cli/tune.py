@@ -26,6 +26,7 @@ from pneuopt.cli.show_loops import (
     show_gains,
     show_margins,
     show_metrics,
+    show_notes,
     show_rejection,
     show_relaxations,
     show_validation,
@@ -161,6 +162,8 @@ def _show_design(
     show_active(console, result.requirements, result.active, result.parameters)
     if result.certificate is not None:
         show_margins(console, result.certificate.margins)
+        show_notes(console, result.certificate.notes)
+        tables["notes"] = list(result.certificate.notes)
     if result.validation is not None:
         show_validation(console, result.validation, task.loop)
         tables["validation"] = records(result.validation.summary)

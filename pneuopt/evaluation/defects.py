@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from math import nan
 
 import numpy as np
@@ -116,7 +117,7 @@ class Ending:
         late = self.course.error[self.course.since(1 - TAIL_SHARE)]
         return float(late.mean())
 
-    @property
+    @cached_property
     def cycle(self) -> LimitCycle | None:
         """An oscillation that does not decay in the second half of the record [measured unit]."""
         course, size = self.course, abs(self.course.reference.nominal_size)

@@ -120,7 +120,8 @@ class Certifier:
         status = self._compare(found, claimed, proof.metrics.loc[claimed.index])
         defects = dict.fromkeys(f.sentence for f in proof.findings if f.defect not in self.task.accept)
         if not found.status.converged or not defects:
-            return status if status.converged else status.with_details(*proof.notes[:MAX_DEFECTS_TOLD])
+            details = [f"accepted: {f.sentence}" for f in proof.findings] if status.converged else proof.notes
+            return status.with_details(*details[:MAX_DEFECTS_TOLD])
         words = dict.fromkeys(f.defect.value for f in proof.findings if f.defect not in self.task.accept)
         remedy = f"limit SettlingTime or MaxSensitivity, or accept it by name: {', '.join(map(repr, words))}"
         broken = () if status.converged else status.sentences[:1]

@@ -122,6 +122,27 @@ def test_a_drive_that_sticks_and_slips_hunts() -> None:
     assert np.isnan(hunting().metrics["0 to 0.05"]["SettlingTime"])
 
 
+def test_a_settling_time_that_the_horizon_makes_up_is_none() -> None:
+    """A position loop that enters the band after 0.13 s, slips out of it and comes to rest seconds later."""
+    loop, values = position_loop(8000.0, 5000.0, 100.0)
+    short = next(evaluate_cases(loop, Step(0.05, horizon=0.8), values)).metrics
+    long = next(evaluate_cases(loop, Step(0.05, horizon=8.0), values)).metrics
+    assert short["SettlingTime"] < 0.2
+    found = certificate(loop, Step(0.05, horizon=0.8), values)
+    assert np.isnan(found.metrics["0 to 0.05"]["SettlingTime"])
+    assert "leaves the band of 2 % again after its horizon" in found.notes[0]
+    said = float(found.notes[1].partition("only ")[2].split()[0])
+    assert said == pytest.approx(long["SettlingTime"], abs=0.01)
+
+
+def test_an_overshoot_beyond_the_horizon_counts() -> None:
+    loop, values = position_loop(4000.0, 20000.0, 100.0)
+    short, long = (next(evaluate_cases(loop, Step(0.05, horizon=h), values)).metrics["Overshoot"] for h in (0.8, 8.0))
+    assert short < 0.6 * long
+    found = certificate(loop, Step(0.05, horizon=0.8), values).metrics["0 to 0.05"]
+    assert found["Overshoot"] == pytest.approx(long, rel=1e-3)
+
+
 def test_an_undecided_response_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(continuation, "MAX_CONTINUATION_INSTANTS", 1500)
     found = certificate(*_at(Step(0.05), position_loop(2000.0, 20000.0, 100.0)))

@@ -146,6 +146,7 @@ def test_an_unstable_design_is_refused_unless_all_that_is_wrong_is_accepted_by_n
     assert "unstable" in results[0].status.sentences[0]
     assert "runs away" in results[1].status.sentences[0]
     assert "'grows'" in results[1].status.sentences[-1]
+    assert results[2].status.sentences[1].startswith("accepted: the linear loop is unstable")
     assert [r.parameters.value("pid.Ki") for r in results] == [5.0, 5.0, 22.5]
 
 
