@@ -32,7 +32,7 @@ from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.margins import margins, noise_gain
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -44,6 +44,11 @@ FRICTION_SLOPE, NOISE_GAIN = "FrictionSlope", "NoiseGain"
 MARGIN_METRICS = tuple(metric.name for metric in METRICS.values() if metric.source is Source.LINEAR_LOOP)
 # Speed below which a body counts as resting, a share of its state's nominal value; a rest's own rounding lies below.
 RESTING_SPEED = 1e-9
+
+
+# Share of the largest speed by which a speed may miss it and count as the largest: below, rounding chooses between the
+# instants of a steady motion; above, the body still accelerates.
+SPEED_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +109,12 @@ def margin_rows(
     return tuple(
         _margin_row(loop, parameters, point) for point in operating_points(loop, parameters, reference, response)
     )
+
+
+def first_largest(speeds: Array) -> Indices:
+    """Index of the first entry of each row that is as large as its largest magnitude, but for `SPEED_TOLERANCE`."""
+    sizes = np.abs(speeds)
+    return np.asarray(np.argmax(sizes >= (1 - SPEED_TOLERANCE) * sizes.max(axis=1, keepdims=True), axis=1))
 
 
 def worst_margins(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
@@ -178,7 +189,7 @@ def _fastest_instant(t: Array, speed: Array, start: float, period: float) -> flo
     """Instant of the largest speed after the step, under dither of the largest mean over a period."""
     within = t[(t >= min(start + period / 2, t[-1] - period / 2)) & (t <= t[-1] - period / 2)]
     means = period_mean(t, speed[None], 0.0, period, within)[0] if period else speed[np.searchsorted(t, within)]
-    return float(within[np.argmax(np.abs(means))])
+    return float(within[first_largest(means[None])[0]])
 
 
 def _margin_row(loop: ClosedLoop, parameters: ParameterSet, point: OperatingPoint) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from pneuopt.control.compensation import acting_always
+from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
@@ -297,7 +298,7 @@ class LinearisedProblem:
         )
         loop = self._simulator.loop
         sections = tuple(f"{c.section}." for c in acting_always(loop))
-        felt = {f"pid.{gain}" for gain in loop.pid.form.gains}
+        felt = {*(f"pid.{gain}" for gain in loop.pid.form.gains), DITHER_AMPLITUDE, DITHER_FREQUENCY}
         shaping = [k for k, name in enumerate(names) if name in felt or name.startswith(sections)]
         found: dict[type, tuple[Array, Array]] = {
             kind: (np.full((len(p), 1), np.inf), np.zeros((len(p), 1, n))) for kind in kinds

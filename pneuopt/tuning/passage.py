@@ -15,6 +15,7 @@ from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
+from pneuopt.evaluation.operating_points import first_largest
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid
@@ -68,7 +69,7 @@ def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices
     if period and means.shape[1] > width + 1:
         sums = np.cumsum(means, axis=1)
         means = sums[:, width:] - sums[:, :-width]
-    return np.asarray(first + np.argmax(np.abs(means), axis=1))
+    return np.asarray(first + first_largest(means))
 
 
 @dataclass(frozen=True, eq=False)

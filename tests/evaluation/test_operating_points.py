@@ -53,8 +53,9 @@ def test_the_points_are_those_of_the_response() -> None:
     response = respond(loop, step, p)
     rest, sliding, end = operating_points(loop, p, step, response)
     assert (rest.x.tolist(), rest.inputs["force"]) == ([0.0, 0.0], 0.0)
-    assert sliding.x[1] == pytest.approx(np.abs(response["speed"]).max())
-    assert sliding.inputs["force"] == pytest.approx(response["control"][np.argmax(np.abs(response["speed"]))])
+    fastest = np.argmax(np.abs(response["speed"]))
+    assert sliding.x[1] == pytest.approx(response["speed"][fastest], rel=1e-3)
+    assert sliding.t == pytest.approx(response.t[fastest], abs=2e-3)
     assert end.x.tolist() == [response["position"][-1], response["speed"][-1]]
     moving = Step(0.1, at=0.02, initial=0.05, horizon=0.4)
     speed = ClosedLoop(ForceDrive(Stribeck()).system(), PID(1e-3))
@@ -79,7 +80,7 @@ def test_under_dither_the_points_are_means() -> None:
     mean = np.trapezoid(response["speed"][period], response.t[period]) / 0.01
     assert points[-1].x[1] == pytest.approx(mean, rel=1e-6)
     assert np.ptp(response["speed"][period]) > 0.01
-    assert mean - 1e-9 <= points[1].x[1] < response["speed"].max()
+    assert 0.999 * mean <= points[1].x[1] < response["speed"].max()
 
 
 def test_unstable_at_one_point_is_unstable() -> None:
