@@ -10,6 +10,7 @@ import numpy as np
 
 from pneuopt.evaluation.continuation import Course
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
+from pneuopt.evaluation.dither_ripple import describe_ripple
 from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
 
 # Share of the step below which a response has not moved: below it, a stuck drive whose friction gives way a little
@@ -212,6 +213,6 @@ def describe_ending(ending: Ending, metrics: Mapping[str, float]) -> Iterator[st
         yield f"{begins} keeps {cycle.describe(course.loop.feedback.unit)}, inside {band}"
     if ending.stands and EDGE_SHARE * ending.band < abs(ending.final_error) <= ending.band:
         yield f"{begins} rests {100 * abs(ending.final_error):.3g} % off the reference, near the edge of {band}"
-    ripple = metrics["Ripple"] / 2 / abs(course.reference.nominal_size)
-    if course.period is not None and ripple > ending.band:
-        yield f"{begins} settles in the mean only: its ripple of +-{100 * ripple:.3g} % of the step exceeds {band}"
+    ripple = describe_ripple(metrics, course.reference.nominal_size, ending.band)
+    if ripple is not None:
+        yield f"at {ending.case} {ripple}"

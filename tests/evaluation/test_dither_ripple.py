@@ -11,6 +11,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.dither_ripple import describe_ripple
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Source
@@ -129,6 +130,15 @@ def test_the_raw_signal_settles_too_or_a_sentence_says_that_it_does_not() -> Non
     assert "only the mean settles, in 1.17 s: a ripple of 18 % of the step" in text
     hunting = measure(1 - np.exp(-T / 0.3) + sine(2.0, 0.09))
     assert describe_ripple(hunting, 1.0, 0.02) is None
+
+
+@pytest.mark.parametrize(("amplitude", "exceeds"), [(60.0, True), (1.0, False)])
+def test_a_certificate_says_that_only_the_mean_settles(amplitude: float, exceeds: bool) -> None:
+    loop, p = friction_drive(Dither(60.0), amplitude)
+    found = certificate(loop, Step(0.2, horizon=0.5), p)
+    assert found.metrics.loc["SettlingTime"].notna().all()
+    assert found.metrics.loc["SettlingTimeRaw"].isna().all() == exceeds
+    assert any("at 0 to 0.2 only the mean settles" in note for note in found.notes) == exceeds
 
 
 def test_before_a_step_from_motion_the_signal_is_the_old_reference() -> None:
