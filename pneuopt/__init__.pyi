@@ -28,6 +28,7 @@ from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_sti
 from .dynamics.stick_slip import EventKind
 from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
 from .evaluation.certificate import Certificate, certificate
+from .evaluation.compensator_verdict import CompensatorVerdict, judge_compensators
 from .evaluation.defects import Defect, Finding
 from .evaluation.dither_effect import dither_effect
 from .evaluation.dither_verdict import DitherVerdict, Usefulness, judge_dither
@@ -133,6 +134,7 @@ __all__ = [
     "Certificate",
     "ClosedLoop",
     "Code",
+    "CompensatorVerdict",
     "ControlRate",
     "ConvergenceError",
     "Coulomb",
@@ -246,6 +248,7 @@ __all__ = [
     "grid",
     "identifiability",
     "identify",
+    "judge_compensators",
     "judge_dither",
     "linear_plant",
     "margins",

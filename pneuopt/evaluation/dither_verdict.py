@@ -147,14 +147,14 @@ def judge_dither(
     plain = full if without is None else full | without
     plain = plain.with_bounds({DITHER_AMPLITUDE: (0.0, plain[DITHER_AMPLITUDE].upper)})
     plain = plain.with_values({DITHER_AMPLITUDE: 0.0})
-    before, after = ([read_ending(f, band) for f in evaluate_cases(loop, steps, p, band=band)] for p in (plain, full))
-    table = _worst_metrics(before, after)
+    before, after = (read_endings(loop, steps, p, band) for p in (plain, full))
+    table = worst_metrics(before, after)
     effect = dither_effect(loop, steps[0], full, speed=after[0].speed)
     objections = [
         text for step, found in zip(steps, after, strict=True) for text in _object_to_swing(step, found, effect)
     ]
     hunts = any(e.hunts for e in after)
-    usefulness, changes = _weigh_changes(table, band, loop, objections, hunts=hunts)
+    usefulness, changes = weigh_changes(table, band, loop, objections, hunts=hunts)
     notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
     rival = "gains tuned without it"
     if without is None:
@@ -164,7 +164,14 @@ def judge_dither(
     return DitherVerdict(usefulness, reasons, table, effect, rival, loop.command.unit)
 
 
-def _worst_metrics(before: Sequence[DitheredEnding], after: Sequence[DitheredEnding]) -> "pd.DataFrame":
+def read_endings(
+    loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, band: float
+) -> list[DitheredEnding]:
+    """How a loop's response to each reference ends."""
+    return [read_ending(found, band) for found in evaluate_cases(loop, steps, parameters, band=band)]
+
+
+def worst_metrics(before: Sequence[DitheredEnding], after: Sequence[DitheredEnding]) -> "pd.DataFrame":
     """Worst metrics over the references, without and with dither."""
     import pandas as pd
 
@@ -182,7 +189,7 @@ def _object_to_swing(reference: Step, found: DitheredEnding, effect: DitherEffec
         yield f"{text}, {100 * swing / size:.0f} % of the step"
 
 
-def _weigh_changes(
+def weigh_changes(
     table: "pd.DataFrame", band: float, loop: ClosedLoop, objections: list[str], *, hunts: bool
 ) -> tuple[Usefulness, tuple[str, ...]]:
     """Verdict and its reasons, from the objections that are known beforehand and the changes of the metrics.
