@@ -11,6 +11,7 @@ SEARCH = "runs a search's own simulator and merit, to compare what finds the bet
 INSIDE = {
     "problems/shared/b32.py": "makes its logs by machine code, and times one simulation of it as the unit of cost",
     "problems/shared/random_problems.py": "finds feasible designs by brute force on the search's batched simulator",
+    "problems/paper/paper_rivals.py": "tunes designs that hunt, which tune refuses, on the search's simulator",
     "problems/speed/benchmark_identification.py": "times the full-space solver from the start that the log gives",
     "problems/speed/linear_tuning.py": SEARCH,
     "problems/speed/simulation_speed.py": "times the compiled simulation, lane by lane",
