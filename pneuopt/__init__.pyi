@@ -112,6 +112,7 @@ from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
+from .studies.neighbours import search_again
 from .studies.sweep import grid, sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
@@ -280,6 +281,7 @@ __all__ = [
     "ripple",
     "samples",
     "save_figure",
+    "search_again",
     "select_model",
     "simulate",
     "simulate_stick_slip",

@@ -150,6 +150,7 @@ PUBLIC_NAMES = [
     "save_figure",
     "Screening",
     "SecondOrder",
+    "search_again",
     "select_model",
     "Sensor",
     "SensorLag",
