@@ -77,7 +77,7 @@ def read_ending(found: CaseEvaluation, band: float) -> DitheredEnding:
     """
     course, size = continue_response(found, band), abs(found.case.reference.nominal_size)
     ending = Ending(course, band, found.case.label)
-    begin, mean = _begin_of_end(ending), np.abs(course.error)
+    begin, mean = begin_of_end(ending), np.abs(course.error)
     raw = np.abs(course.signal - course.reference.final) / size
     errors = {
         "RemainingError": 100 * float(raw[course.t >= begin].max()),
@@ -98,9 +98,12 @@ def read_ending(found: CaseEvaluation, band: float) -> DitheredEnding:
     )
 
 
-def _begin_of_end(ending: Ending) -> float:
-    """Instant from which the error counts as the one in the end: that of the last cycles of a loop that hunts [s]."""
-    end, cycle = float(ending.course.t[-1]), ending.cycle
+def begin_of_end(ending: Ending) -> float:
+    """Instant from which the error counts as the one in the end: that of the last cycles of a loop that hunts [s].
+
+    It lies before the last instant at which a mean over the dither's period is known.
+    """
+    end, cycle = float(ending.course.at[-1]), ending.cycle
     if cycle is not None:
         return end - LAST_CYCLES / cycle.frequency
     if ending.stands or ending.drifts:

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 from math import pi
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.dither_verdict import Usefulness, judge_dither
+from pneuopt.evaluation.dithered_ending import begin_of_end
 from pneuopt.models.catalog import r25, t32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
@@ -177,6 +179,17 @@ def test_a_hunting_loop_is_judged_by_its_largest_error_in_the_last_cycles() -> N
     table = judge_dither(loop, Step(0.01, horizon=0.4), p).table
     assert table["without"]["SteadyStateError"] == pytest.approx(40.6, abs=1.0)
     assert table["without"]["SettlingTime"] == np.inf
+
+
+@pytest.mark.parametrize("frequency", [0.5, 5.0, 400.0])
+def test_cycles_shorter_than_the_dithers_period_have_an_end_too(frequency: float) -> None:
+    """Means end half a period before the record; three cycles at 400 Hz fit into that half period."""
+    t = np.linspace(0.0, 2.0, 2001)
+    course = SimpleNamespace(t=t, at=t[t <= 1.9875], period=0.025)
+    hunting: Any = SimpleNamespace(
+        course=course, cycle=SimpleNamespace(frequency=frequency), stands=False, drifts=False
+    )
+    assert begin_of_end(hunting) <= course.at[-1] - min(2.0, 3 / frequency) + 1e-3
 
 
 @pytest.mark.parametrize("name", CASES)
