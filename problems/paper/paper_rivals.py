@@ -20,7 +20,8 @@ What they say: at 10 mm/s the dead-zone inverse gives most and costs nothing, th
 dozens of times the air and hundreds of times the travel, and the search finds no use for pulses or feedforward: behind
 a valve, which sets a speed, Coulomb friction is no voltage. At 50 mm/s dither and pulses help, feedforward little, the
 inverse not at all. Row bare_sensitivity: of the knocker's gains without its pulses, beyond the limit of 2 that it keeps
-only because it is read in the middle of them.
+only because it is read in the middle of them. Rows verdict: of `judge_dither` and `judge_compensators` against the PID
+alone, 1 useful, 0 useless, -1 harmful: both count the ripple, with which the dither never settles.
 """
 
 import sys
@@ -96,6 +97,7 @@ RIVALS = {
 }
 
 
+SCORES = {po.Usefulness.USEFUL: 1.0, po.Usefulness.USELESS: 0.0, po.Usefulness.HARMFUL: -1.0}
 SHOWN = {  # row: metric, factor, unit
     "error_integral": ("IAE", 1e3, "ms"),
     "settling": ("SettlingTimeRaw", 1.0, "s"),
@@ -116,6 +118,8 @@ BOUNDS = {
     "step.measured.gain": "<= 1.4", "step.inverse.gain": "<= 1.4",
     "step.dither.air": ">= 1", "step.dither.ripple": ">= 5", "step.knocker.air": "<= 0.3",
     "step.knocker.bare_sensitivity": ">= 2", "none_worse": ">= 0.99",
+    "crawl.dither.verdict": "-1 +- 0", "crawl.inverse.verdict": "1 +- 0", "crawl.knocker.verdict": "0 +- 0",
+    "step.dither.verdict": "-1 +- 0", "step.knocker.verdict": "1 +- 0",
 }  # fmt: skip
 
 
@@ -198,6 +202,8 @@ def main(designs: "Mapping[tuple[str, str], Design]", seconds: float) -> "DataFr
             rows.append(Claim(f"{task}.{name}.{parameter.split('.')[-1]}", q.value, q.unit))
         gains[task, name] = float(plain.metrics["IAE"] / found.metrics["IAE"])
         rows.append(Claim(f"{task}.{name}.gain", gains[task, name]))
+        if name != "pid":
+            rows.append(Claim(f"{task}.{name}.verdict", verdict(task, found, plain)))
         if name == "knocker":
             bare = RIVALS["pid"].loop
             alone = po.evaluate(bare, TASKS[task], found.parameters.select(bare.parameters), band=BAND)
@@ -209,6 +215,13 @@ def main(designs: "Mapping[tuple[str, str], Design]", seconds: float) -> "DataFr
             )
     rows += [Claim("none_worse", min(gains.values())), Claim("seconds", seconds, "s")]
     return frame([replace(c, bound=BOUNDS.get(c.name, "")) for c in rows])
+
+
+def verdict(task: str, found: Design, plain: Design) -> float:
+    """1 useful, 0 useless, -1 harmful, against the PID alone with the gains tuned for that."""
+    judge: Any = po.judge_dither if found.loop.dither else po.judge_compensators
+    told = judge(found.loop, TASKS[task], found.parameters, without=plain.parameters, band=BAND)
+    return SCORES[told.usefulness]
 
 
 def figure(designs: "Mapping[tuple[str, str], Design]") -> "Figure":
