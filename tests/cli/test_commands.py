@@ -311,3 +311,24 @@ def test_a_front_without_a_free_gain_says_so(front: Path) -> None:
     Path("tuning.toml").write_text(TUNING, encoding="utf-8")
     edit("tuning.toml", "[limits]", '[limits]\npeak_control = "120 N"')
     assert "tuning.toml: no gain is free; mark what to tune with free = true" in run(FRONT_LINE).stderr
+
+
+def test_a_ripple_beyond_the_band_is_said_beside_the_settling_of_the_mean(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mean settles, the signal as it is never does: a scope would show it."""
+    monkeypatch.chdir(tmp_path)
+    drive = '[drive]\nkind = "force"\n[load]\nmass = "5 kg"\n[friction]\nmodel = "viscous"\nviscous = "40 N*s/m"'
+    gain = '{ value = "300 N*s/m", lower = "100 N*s/m", upper = "900 N*s/m", free = true }'
+    dither = '[dither]\nfrequency = "50 Hz"\namplitude = "60 N"\n'
+    loop = f'[pid]\nsample_time = "2 ms"\nKp = {gain}\nKi = "2000 N/m"\n{dither}[[reference]]\nstep = "0.1 m/s"'
+    Path("drive.toml").write_text(drive, encoding="utf-8")
+    asked = '[minimise]\nsettling_time = { band = "5 %" }\n[method]\nkind = "racing"\nmembers = 8\ntrials = 20'
+    Path("tuning.toml").write_text(f'{loop}\nhorizon = "0.4 s"\n{asked}', encoding="utf-8")
+    result = CliRunner().invoke(app, ["tune", "drive.toml", "tuning.toml"])
+    assert result.exit_code == 0, result.output
+    rows = {line.split()[0]: line.split() for line in result.output.splitlines() if line.split()}
+    assert rows["SettlingTime"][1] != "never"
+    assert rows["SettlingTimeRaw"][1] == "never"
+    assert "ripple" in result.output
+    assert "exceeds the band of 5 %" in result.output
