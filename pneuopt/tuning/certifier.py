@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pneuopt.evaluation.certificate import Certificate, judge_evaluations
+from pneuopt.evaluation.certificate import Certificate, Defect, judge_evaluations
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
 from pneuopt.evaluation.requirements import (
     METRICS,
@@ -124,6 +124,9 @@ class Certifier:
             return status.with_details(*details[:MAX_DEFECTS_TOLD])
         words = dict.fromkeys(f.defect.value for f in proof.findings if f.defect not in self.task.accept)
         remedy = f"limit SettlingTime or MaxSensitivity, or accept it by name: {', '.join(map(repr, words))}"
+        if Defect.STANDS_STILL.value in words and self.task.spec.limits:
+            limits = " and ".join(metric_name(q) for q in self.task.spec.limits)
+            remedy = f"the search found only designs that stand still: {limits} may leave no room to move; relax them"
         broken = () if status.converged else status.sentences[:1]
         return Status(Code.NOT_CERTIFIED, (*list(defects)[:MAX_DEFECTS_TOLD], *broken, remedy))
 
