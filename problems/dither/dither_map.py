@@ -123,7 +123,9 @@ def tuned(
     given = filled(loop).with_values(start).with_bounds(ranges).freed(*ranges)
     limits, asked = [po.Overshoot(0.05), *limits], po.SettlingTime(BAND)
     method = SEARCH if "dither.amplitude" in ranges else LONGER
-    return po.tune(loop, STEPS, given, minimise=asked, subject_to=limits, scenarios=PLANTS, method=method, throw=False)
+    return po.tune(
+        loop, STEPS, given, minimise=asked, subject_to=limits, scenarios=PLANTS, method=method, plants={}, throw=False
+    )
 
 
 def best(found: po.TuningResult) -> po.ParameterSet:

@@ -120,7 +120,7 @@ def tuned(ranges: Mapping[str, tuple[float, float]], start: Mapping[str, float])
     own = loop.parameters.select(loop.parameters.match_names("pid.*", "sensor.*", *(["dither.*"] if start else [])))
     given = (p | own).with_values({**HAND, **DAMPER, **start}).with_bounds(ranges).freed(*ranges)
     limits = [] if start else [po.MaxSensitivity(SENSITIVITY)]
-    return po.tune(loop, STEPS, given, minimise=po.SettlingTime(BAND), subject_to=limits, method=SEARCH)
+    return po.tune(loop, STEPS, given, minimise=po.SettlingTime(BAND), subject_to=limits, method=SEARCH, plants={})
 
 
 def controlled(plant: po.System, *, dither: bool) -> po.ClosedLoop:

@@ -118,7 +118,9 @@ def tuned(steps: list[po.Step], *limits: Any) -> po.TuningResult:
     loop = po.ClosedLoop(drive.system(), po.PID(), measured="speed")
     given = (loop.parameters | p).with_values(PAPERS).with_bounds(RANGES).freed(*RANGES)
     asked = (*LIMITS, *limits)
-    return po.tune(loop, steps, given, minimise=po.SettlingTime(), subject_to=asked, method=SEARCH, throw=False)
+    return po.tune(
+        loop, steps, given, minimise=po.SettlingTime(), subject_to=asked, method=SEARCH, plants={}, throw=False
+    )
 
 
 def main(job: Job) -> "DataFrame":

@@ -77,7 +77,7 @@ def design_row(seed: int) -> dict[str, Any]:
     row |= {"objective": " ".join(type(q).__name__ for q in spec.weights), "dither": plant.loop.dither is not None}
     begun = time.process_time()
     try:
-        found = po.tune(plant.loop, steps, plant.parameters, minimise=spec, throw=False)
+        found = po.tune(plant.loop, steps, plant.parameters, minimise=spec, plants={}, throw=False)
         outcome, status = "solved" if found.status.converged else "refused", str(found.status)
     except po.PneuoptError as error:
         found, outcome, status = None, "error", str(error)

@@ -100,6 +100,7 @@ def tuned(seed: int) -> dict[str, Any]:
             given.parameters,
             minimise=given.minimise,
             subject_to=given.subject_to,
+            plants={},  # brute force had none either
             throw=False,
         )
     except po.PneuoptError as error:

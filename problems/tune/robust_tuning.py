@@ -144,14 +144,14 @@ PARTS: dict[str, Callable[[int], Part]] = {"linear": linear, "drive": drive, "fi
 def _part(name: str, task: Task, seeds: int, more: Callable[[po.ParameterSet], dict[str, float]]) -> Part:
     asked: dict[str, Any] = {"minimise": task.minimise, "subject_to": task.subject_to}
     begun = time.process_time()
-    nominal = po.tune(task.loop, task.steps, task.parameters, method=task.nominal, **asked)
+    nominal = po.tune(task.loop, task.steps, task.parameters, method=task.nominal, plants={}, **asked)
     seconds = {"nominal": time.process_time() - begun}
     start = task.parameters | nominal.parameters
     runs = []
     for seed in range(seeds):
         begun = time.process_time()
         method = po.Racing(seed=seed)
-        runs.append(po.tune(task.loop, task.steps, start, scenarios=task.scenarios, method=method, **asked))
+        runs.append(po.tune(task.loop, task.steps, start, scenarios=task.scenarios, method=method, plants={}, **asked))
         seconds["robust"] = time.process_time() - begun
         print(f"{name} seed {seed}: {runs[-1].status}, {seconds['robust']:.1f} s CPU", file=sys.stderr, flush=True)
     runs.sort(key=lambda r: _worst(r.certified, "SettlingTime"))

@@ -85,7 +85,9 @@ def _tuned(loop: po.ClosedLoop, given: po.ParameterSet) -> Run:
     found = []
     for seed in SEEDS:
         method = po.Screening(seed=seed)
-        best = po.tune(loop, STEP, given, minimise=po.SettlingTime(BAND), subject_to=LIMITS, method=method, throw=False)
+        best = po.tune(
+            loop, STEP, given, minimise=po.SettlingTime(BAND), subject_to=LIMITS, method=method, plants={}, throw=False
+        )
         found.append(Run(loop, best.parameters, best.certified))
     return min(found, key=lambda r: r.settling_time if r.is_kept else np.inf)
 
