@@ -240,7 +240,7 @@ def _draw_friction(ax: "Axes", demo: Demo) -> None:
     ax.plot(v, _law(v, TRUTH.__getitem__, np.sign(v)), color=GREY, lw=4, alpha=0.6, label="of the rig")
     ax.plot(v, _law(v, demo.fit.parameters.value, side), color=BLUE, lw=1, label="identified")
     ax.set(xlabel="speed [m/s]", ylabel="friction [N]")
-    ax.set_title("the friction that it tells", fontsize=9)
+    ax.set_title("the identified friction", fontsize=9)
     ax.legend(frameon=False, fontsize=8)
 
 

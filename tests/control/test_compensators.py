@@ -324,7 +324,7 @@ def test_margins_count_slopes_at_the_operating_point(
     opened = open_loop(loop, p, np.array([reference, 0.0]), {"valve_voltage": command})
     closed = np.sort_complex(np.linalg.eigvals(opened.A - opened.B @ opened.C / (1 + opened.D[0, 0])))
     np.testing.assert_allclose(closed, closed_poles(loop, p, reference), rtol=1e-6)
-    at = loop.parameter_vector(p)[None], np.array([[reference, 0.0]]), np.array([command])
+    at = loop.parameter_vector(p)[None], np.array([[[reference, 0.0]]]), np.array([[[command]]])
     found, batch = margins(opened), batch_margin_function(loop, np.geomspace(0.01, 1e5, 400))
     in_search = batch(*at, ["MaxSensitivity", "PhaseMargin"])
     assert in_search["MaxSensitivity"][0] == pytest.approx(found.max_sensitivity, rel=1e-3)
