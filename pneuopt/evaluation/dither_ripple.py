@@ -74,8 +74,10 @@ def remove_ripple(t: Array, y: Array, means: Array, period: float) -> RippleFree
     k = means.shape[1]
     ripple = measure_ripple(t[:k], y[:, :k] - means, period)
     reach = RIPPLE_ALLOWANCE / 2 * ripple
-    signal = _move(y, np.concatenate([means, extend_means(t, y, means[:, -1], k, period)], axis=1), reach[:, None])
-    return RippleFree(signal, _move(y[:, -1], end_mean(t, y, period), reach), ripple)
+    signal = move_towards(
+        y, np.concatenate([means, extend_means(t, y, means[:, -1], k, period)], axis=1), reach[:, None]
+    )
+    return RippleFree(signal, move_towards(y[:, -1], end_mean(t, y, period), reach), ripple)
 
 
 def describe_ripple(metrics: Mapping[str, float], size: float, band: float) -> str | None:
@@ -164,7 +166,7 @@ def extend_means(t: Array, y: Array, last: Array, k: int, period: float) -> Arra
     return np.asarray(last[..., None] + change * ((t[k:] - t[k - 1]) / period))
 
 
-def _move(y: Array, mean: Array, reach: Array) -> Array:
+def move_towards(y: Array, mean: Array, reach: Array) -> Array:
     """The mean where it is within reach of the signal, elsewhere the signal moved towards it by the reach."""
     return np.asarray(np.clip(mean, y - reach, y + reach))
 

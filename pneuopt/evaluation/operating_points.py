@@ -10,8 +10,9 @@ for long enough to oscillate there:
 * "at the end" of the response.
 
 A passage through the friction's falling branch on the way is no such point: it lasts for milliseconds, in which nothing
-can grow. Under dither a point is a mean over the dither's period, and the loop is averaged over its ripple there. A
-plant whose Jacobian is the same everywhere has one point, its end.
+can grow. Under dither the points are those of the response without its ripple, and the loop is averaged over the ripple
+there. A mean over the dither's period alone would smooth a fast command, even under a dither of a picovolt. A plant
+whose Jacobian is the same everywhere has one point, its end.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -29,6 +30,7 @@ from pneuopt.control.reference import Step, disturbance_input
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.evaluation.dither_mean import period_mean
+from pneuopt.evaluation.dither_ripple import remove_ripple
 from pneuopt.evaluation.margins import margins, noise_gain
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS
@@ -111,6 +113,27 @@ def margin_rows(
     )
 
 
+def without_ripple(t: Array, y: Array, period: float) -> Array:
+    """Signals without their dither's ripple (`remove_ripple`), as they are where the record is shorter than a period.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        [s]
+    y : ndarray, shape (m, n)
+    period : float
+        [s]; 0: no dither.
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+    """
+    if not 0 < period <= t[-1] - t[0]:
+        return y
+    first, averaged = y[:, :1], t[t <= t[-1] - period / 2]
+    return remove_ripple(t, y, first + period_mean(t, y - first, 0.0, period, averaged), period).signal
+
+
 def first_largest(speeds: Array) -> Indices:
     """Index of the first entry of each row that is as large as its largest magnitude, but for `SPEED_TOLERANCE`."""
     sizes = np.abs(speeds)
@@ -164,14 +187,11 @@ def _find_points(
 ) -> Iterator[OperatingPoint]:
     disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
     t, signals = response.t, response.matrix([*names(loop.plant.states), "control"]).T
-    period = loop.dither_period(parameters) or 0.0
-    period = period if period <= t[-1] - t[0] else 0.0
+    signals = without_ripple(t, signals, loop.dither_period(parameters) or 0.0)
 
-    def point(name: str, at: float) -> OperatingPoint:
-        values = (
-            period_mean(t, signals, 0.0, period, np.array([at])) if period else signals[:, [np.searchsorted(t, at)]]
-        )
-        return OperatingPoint(name, at, values[:-1, 0], {loop.command.name: float(values[-1, 0]), **disturbed})
+    def point(name: str, k: int) -> OperatingPoint:
+        inputs = {loop.command.name: float(signals[-1, k]), **disturbed}
+        return OperatingPoint(name, float(t[k]), signals[:-1, k], inputs)
 
     if not is_affine(loop.plant):
         axis = loop.plant.axis
@@ -181,15 +201,9 @@ def _find_points(
         moves = v is not None and abs(x[v]) > RESTING_SPEED * loop.plant.states[v].nominal
         yield OperatingPoint(AT_THE_START if moves else AT_REST, float(t[0]), x, {loop.command.name: command})
         if v is not None:
-            yield point(SLIDING, _fastest_instant(t, signals[v], reference.at, period))
-    yield point(AT_THE_END, float(t[-1]) - period / 2)
-
-
-def _fastest_instant(t: Array, speed: Array, start: float, period: float) -> float:
-    """Instant of the largest speed after the step, under dither of the largest mean over a period."""
-    within = t[(t >= min(start + period / 2, t[-1] - period / 2)) & (t <= t[-1] - period / 2)]
-    means = period_mean(t, speed[None], 0.0, period, within)[0] if period else speed[np.searchsorted(t, within)]
-    return float(within[first_largest(means[None])[0]])
+            first = int(np.searchsorted(t, reference.at))
+            yield point(SLIDING, first + int(first_largest(signals[v, None, first:])[0]))
+    yield point(AT_THE_END, -1)
 
 
 def _margin_row(loop: ClosedLoop, parameters: ParameterSet, point: OperatingPoint) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """`Passage`: where simulated lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
 
 The points are those of `operating_points` in evaluation/operating_points.py. A search keeps no states along a response:
-the fastest sample is read off the outputs, and the states there come from a second run up to it.
+the fastest sample is read off the outputs, and the states there come from a second run up to it. Under dither that run
+goes through the period around it, and a further one through the period after the end, off which the ripple is read.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,7 +16,8 @@ from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.system import names
-from pneuopt.evaluation.operating_points import first_largest
+from pneuopt.evaluation.dither_ripple import RIPPLE_ALLOWANCE, move_towards
+from pneuopt.evaluation.operating_points import first_largest, without_ripple
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid
@@ -33,7 +35,7 @@ class Passage(NamedTuple):
     ----------
     starts, ends : ndarray, shape (m, n_states)
     fastest : ndarray of int, shape (m,)
-        Sample of the largest speed, under dither the first one of the period in which its mean is the largest.
+        Sample of the largest speed, under dither of the speed without its ripple.
     command : ndarray, shape (m,)
         The commands in which they end.
     """
@@ -62,14 +64,10 @@ def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices
     grid : ReferenceGrid
     speed : ndarray, shape (m, n)
     period : float
-        Of the mean [s]; 0 for none.
+        Of the dither [s]; 0 for none.
     """
-    first, width = grid.step_index, max(1, round(period / grid.spacing))
-    means = speed[:, first:]
-    if period and means.shape[1] > width + 1:
-        sums = np.cumsum(means, axis=1)
-        means = sums[:, width:] - sums[:, :-width]
-    return np.asarray(first + first_largest(means))
+    first = grid.step_index
+    return np.asarray(first + first_largest(without_ripple(grid.t, speed, period)[:, first:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +118,12 @@ class PointFinder:
     ) -> tuple[Array, Array]:
         """Points of lanes on one grid, states and inputs, shapes (k, m, n)."""
         own, p = passage.select(rows), p[rows]
-        states = list[Array]()
+        states, (end, reach) = list[Array](), self._at_end(grid, p, periods[rows], own)
         if not is_affine(self.loop.plant):
             states.append(self._at_start(grid, p, own))
             if self.loop.plant.axis is not None:
-                states.append(self._sliding(grid, p, periods[rows], own))
-        states.append(self._at_end(grid, p, periods[rows], own))
+                states.append(self._sliding(grid, p, periods[rows], own, reach))
+        states.append(end)
         along, plant = np.array(states), self.loop.plant
         u = np.zeros((len(along), len(p), len(plant.inputs)))
         disturbances = dict(zip(names(self.loop.inputs), grid.u[-1].tolist(), strict=True))
@@ -145,34 +143,45 @@ class PointFinder:
         control = self.rollout.run(own.starts, u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
         return np.column_stack([own.starts[:, : len(self.loop.plant.states)], control])
 
-    def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage) -> Array:
-        """The plant's state and the command at the fastest sample, or their means over the period that begins there."""
-        out, order = np.empty((len(p), len(self.loop.plant.states) + 1)), np.argsort(own.fastest, kind="stable")
+    def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage, reach: Array) -> Array:
+        """The plant's state and the command at the fastest sample, without ripple."""
+        begin = np.maximum(own.fastest - np.round(periods / 2 / grid.spacing).astype(np.intp), 0)
+        out, ends = self._run_up_to(grid, p, begin, own)
+        for period, rows in _by_period(periods):
+            along = self._period(grid, ends[rows], p[rows], grid.t[begin[rows]], period)
+            share = (grid.t[own.fastest[rows]] - grid.t[begin[rows]]) / period
+            _put_finite(out, rows, move_towards(_at(along, share), _mean(along), reach[rows]))
+        return out
+
+    def _run_up_to(self, grid: ReferenceGrid, p: Array, last: Indices, own: Passage) -> tuple[Array, Array]:
+        """The plant's state and the command at a sample of each lane, and the loop's state there."""
+        out, order = np.empty((len(p), len(self.loop.plant.states) + 1)), np.argsort(last, kind="stable")
         ends, u, t, h = np.empty_like(own.starts), *grid.pad(len(grid.t))
         for rows in np.split(order, np.arange(LANES_TO_FASTEST, len(order), LANES_TO_FASTEST)):
-            fastest = own.fastest[rows]
-            k = np.minimum(np.arange(fastest.max() + 1), fastest[:, None])
-            steps = np.where(np.arange(k.shape[1]) < fastest[:, None], h[k], 0.0)
+            k = np.minimum(np.arange(last[rows].max() + 1), last[rows][:, None])
+            steps = np.where(np.arange(k.shape[1]) < last[rows][:, None], h[k], 0.0)
             with np.errstate(all="ignore"):
                 substeps = rk4_substeps(self.rate, grid.spacing)
                 run = self.rollout.run(own.starts[rows], u[k], p[rows], t[k], steps, substeps=substeps)
             ends[rows] = run.x_end
             out[rows] = np.column_stack([run.x_end[:, : out.shape[1] - 1], run.y[:, -1, CONTROL_OUTPUT]])
-        for period, rows in _by_period(periods):
-            _put_finite(out, rows, _mean(self._period(grid, ends[rows], p[rows], t[own.fastest[rows]], period)))
-        return out
+        return out, ends
 
-    def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage) -> Array:
-        """The plant's state and the command at the end, under dither their means over the last period.
+    def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage) -> tuple[Array, Array]:
+        """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.
 
-        One more period is run after the end. The change from that period's start to its end is subtracted from the
-        mean, which puts it back by one period.
+        Under dither one more period is run after the end. Half the change from its start to its end is subtracted from
+        its mean, which puts the mean back to the end.
         """
         out = np.column_stack([own.ends[:, : len(self.loop.plant.states)], own.command])
+        reach = np.zeros_like(out)
         for period, rows in _by_period(periods):
             along = self._period(grid, own.ends[rows], p[rows], np.full(len(rows), grid.t[-1]), period)
-            _put_finite(out, rows, _mean(along) - (along[:, -1] - along[:, 0]))
-        return out
+            change = along[:, -1] - along[:, 0]
+            drift = change[:, None] * np.linspace(-0.5, 0.5, along.shape[1])[:, None]
+            _put_finite(reach, rows, RIPPLE_ALLOWANCE / 2 * np.ptp(along - drift, axis=1))
+            _put_finite(out, rows, move_towards(out[rows], _mean(along) - change / 2, reach[rows]))
+        return out, reach
 
     def _period(self, grid: ReferenceGrid, x: Array, p: Array, t: Array, period: float) -> Array:
         """The plant's states and the command along one period from t on, shape (m, n, n_plant_states + 1)."""
@@ -199,7 +208,14 @@ def _mean(along: Array) -> Array:
     return np.asarray(np.trapezoid(along, axis=1) / (along.shape[1] - 1))
 
 
-def _put_finite(out: Array, rows: Indices, means: Array) -> None:
-    """Put means into their rows, but those of lanes that run away."""
-    tame = np.isfinite(means).all(axis=1)
-    out[rows[tame]] = means[tame]
+def _at(along: Array, share: Array) -> Array:
+    """Each lane's values a share of its period after the first, linear between instants, shape (m, n_values)."""
+    at, lane = share * (along.shape[1] - 1), np.arange(len(along))
+    k = np.minimum(at.astype(np.intp), along.shape[1] - 2)
+    return np.asarray(along[lane, k] + (at - k)[:, None] * (along[lane, k + 1] - along[lane, k]))
+
+
+def _put_finite(out: Array, rows: Indices, values: Array) -> None:
+    """Put values into their rows, but those of lanes that run away."""
+    tame = np.isfinite(values).all(axis=1)
+    out[rows[tame]] = values[tame]

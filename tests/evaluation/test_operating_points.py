@@ -6,6 +6,7 @@ import pytest
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import Dither
+from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -14,11 +15,13 @@ from pneuopt.dynamics.system import System, define
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.operating_points import operating_point_margins, operating_points, worst_margins
+from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre, Stribeck
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 
+MARGINS = ["MaxSensitivity", "MaxComplementarySensitivity", "GainMargin", "PhaseMargin"]
 GAINS = {"pid.Kp": 4000.0, "pid.Ki": 300.0, "pid.Kd": 20.0, "pid.Tf": 2e-3}
 
 
@@ -77,10 +80,32 @@ def test_under_dither_the_points_are_means() -> None:
     response = respond(loop, step, p)
     points = operating_points(loop, p, step, response)
     period = response.t > 0.49 - 1e-9
-    mean = np.trapezoid(response["speed"][period], response.t[period]) / 0.01
+    last, speed = response.t[period], response["speed"][period]
+    mean = np.trapezoid(speed, last) / 0.01 + 0.5 * (speed[-1] - speed[0])  # of the period around the end
     assert points[-1].x[1] == pytest.approx(mean, rel=1e-6)
-    assert np.ptp(response["speed"][period]) > 0.01
+    assert np.ptp(speed) > 0.01
     assert 0.999 * mean <= points[1].x[1] < response["speed"].max()
+
+
+def test_margins_do_not_jump_where_a_dither_begins() -> None:
+    """A light body at high pressure whose command crosses the dead zone within a dither period."""
+    drive, given = t32()
+    loop = ClosedLoop(drive.system(), PID(), Dither(1000 / (2 * np.pi)), feedforward=Feedforward())
+    p = loop.complete(given).with_values(
+        {"pid.Kp": 28.47, "pid.Ki": 264.7, "pid.Kd": 0.3219, "pid.Tf": 5e-4, "pid.b": 0.984, "pid.c": 0.0}
+        | {"pid.Tt": 0.1, "pid.lower": -5.0, "pid.upper": 5.0, "dither.offset": -0.34}
+        | {"feedforward.gain": -20.0, "feedforward.time": 0.00401}
+        | {f"friction.{n}": 0.7 * given.value(f"friction.{n}") for n in ("coulomb", "static", "viscous")}
+        | {"load.mass": 0.7 * given.value("load.mass"), "supply.pressure": 1.1 * given.value("supply.pressure")}
+    )
+    step = Step(0.2, horizon=0.2, start={"position": 0.05, "pressure_b": 3.5e5})
+    found = [
+        operating_point_margins(loop, q, step, respond(loop, step, q)).set_index("point")[["t", *MARGINS]]
+        for q in (p.with_values({"dither.amplitude": a}) for a in (0.0, 1e-12, 1e-3))
+    ]
+    assert 3 < found[0]["MaxSensitivity"]["sliding"] < 5
+    for table in found[1:]:
+        np.testing.assert_allclose(table, found[0], rtol=1e-3)
 
 
 def test_unstable_at_one_point_is_unstable() -> None:
