@@ -6,6 +6,7 @@ Fixed steps of classical Runge-Kutta, so short that halving them changes nothing
 """
 
 import ctypes
+import itertools
 import shutil
 import subprocess
 import tempfile
@@ -32,7 +33,7 @@ AIR = ("supply.pressure", "ambient.pressure", "ambient.temperature", "gas.consta
 NONLINEAR_STEP = 1e-5  # [s]: twice as much changes the fifth digit of settling times, half as much nothing
 LINEAR_STEPS = 40_000  # steps over a horizon
 KEPT_STROKE = 0.03  # share of the stroke at either end that counts as the cover: beyond it the plain model has no stop
-STROKE, SPAN = 11, 19  # indices of the cylinder's parameters in the C code
+STROKE, SPAN, SUPPLY, AMBIENT = 11, 19, 22, 23  # indices of the cylinder's parameters in the C code
 SAMPLES = 2000  # recorded over a horizon, at least
 SAMPLES_A_PERIOD = 40  # recorded in a dither period, at least
 
@@ -172,10 +173,12 @@ def _cylinder_rest(p: Array, v: float, start: dict[str, float]) -> tuple[list[fl
         _library().plant_rates(5, pointers[0], ctypes.c_double(0.0), pointers[2], pointers[1])
         return [rates[1], rates[2] / 1e6, rates[3] / 1e6]
 
-    found, info, good, why = fsolve(residuals, [0.05 * np.sign(v), 4.0, 4.5], full_output=True, xtol=1e-13)
-    if good != 1 and np.max(np.abs(info["fvec"])) > 1e-8:
-        raise po.ConvergenceError(f"no rest found: {why}", None)
-    return [x, v, found[1] * 1e5, found[2] * 1e5, found[0], 0.0, z], found[0] * p[SPAN]
+    for spool, pressure in itertools.product((0.05, 0.1, 0.2, 0.4), (4.0, 5.0, 6.0)):
+        found, info, _, _ = fsolve(residuals, [spool * np.sign(v), pressure, pressure], full_output=True, xtol=1e-13)
+        inside = p[AMBIENT] < 1e5 * min(found[1:]) and 1e5 * max(found[1:]) < p[SUPPLY]
+        if inside and np.max(np.abs(info["fvec"])) <= 1e-8:
+            return [x, v, found[1] * 1e5, found[2] * 1e5, found[0], 0.0, z], found[0] * p[SPAN]
+    raise po.ConvergenceError(f"no steady motion found at {v:g} m/s", None)
 
 
 @cache

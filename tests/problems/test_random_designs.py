@@ -42,6 +42,7 @@ SPEC = specify(po.SettlingTime(), [po.Overshoot(0.05)])
 
 def test_a_response_that_settles_and_stays_has_no_fault() -> None:
     assert faults(lambda t: np.exp(-10 * t), settled=np.log(50) / 10) == []
+    assert faults(lambda t: np.exp(-2 * t), settled=np.nan) == []
 
 
 @pytest.mark.parametrize(
@@ -51,7 +52,7 @@ def test_a_response_that_settles_and_stays_has_no_fault() -> None:
         (lambda t: np.exp(-1e-3 * t), 0.4, "standing"),
         (lambda t: np.exp(-10 * t), 0.3, "leaves the band"),
         (lambda t: np.exp(-10 * t) + 0.03 * (t > 2.5), 0.4, "leaves the band"),
-        (lambda t: np.exp(-10 * t), np.nan, "leaves the band"),
+        (lambda t: np.exp(-0.9 * t), np.nan, "leaves the band"),
         (lambda t: np.exp(-10 * t) * np.cos(20 * t), 0.4, "overshoot"),
     ],
 )
