@@ -199,12 +199,12 @@ def best_of(search: Search, find: Callable[[Clock, Array, int], None], limit: fl
     """The answer of a rival after a CPU time: the best on fine samples of its best on coarse ones."""
     space, spec = search.space, tight(search)
     start = space.to_unit(space.start)
-    coarse = MeritFunction(search.simulator.coarse(spec), space, spec, STEP.horizon, start)
+    coarse = MeritFunction(search.simulator.coarse(spec), space, spec, search.task.horizon, start)
     clock = Clock(coarse, limit)
     with suppress(OutOfTimeError):
         find(clock, start, seed)
     points = np.array([point for _, point in clock.kept])
-    fine = MeritFunction(search.simulator, space, spec, STEP.horizon, start)
+    fine = MeritFunction(search.simulator, space, spec, search.task.horizon, start)
     return space.from_unit(points[int(np.argmin(fine(points)))])
 
 
