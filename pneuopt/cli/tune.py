@@ -168,33 +168,38 @@ def _show_design(
         show_validation(console, result.validation, task.loop)
         tables["validation"] = records(result.validation.summary)
     if task.loop.dither_period(result.parameters) is not None:
-        rival = _tune_rival(console, task, before, quiet)
+        rival = tune_rival(console, task, before, quiet)
         tables |= _show_dither_verdict(console, task, result.parameters, rival)
     elif "dither.amplitude" in result.parameters.free_names:
         console.print("the dither's amplitude is 0: the tuning found no use for it")
     return tables
 
 
-def _tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet: bool) -> ParameterSet | None:
+def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet: bool) -> ParameterSet | None:
     """Values tuned without dither, with which the dither is compared; None, and said, where there are none."""
     if not set(parameters.free_names) - {DITHER_AMPLITUDE, DITHER_FREQUENCY}:
         return None
-    with progress("tuning without dither", quiet=quiet) as report_progress:
-        rival = tune_without_dither(
-            task.loop,
-            task.references,
-            parameters,
-            minimise=task.specification,
-            scenarios=task.scenarios(parameters),
-            max_steps=task.max_steps,
-            accept=task.accept,
-            method=task.method,
-            throw=False,
-            progress=report_progress,
-        )
-    if rival.status.converged:
-        return rival.parameters
-    console.print(f"no gains were certified without dither: {rival.status.sentences[0]}", soft_wrap=True)
+    try:
+        with progress("tuning without dither", quiet=quiet) as report_progress:
+            rival = tune_without_dither(
+                task.loop,
+                task.references,
+                parameters,
+                minimise=task.specification,
+                scenarios=task.scenarios(parameters),
+                max_steps=task.max_steps,
+                accept=task.accept,
+                method=task.method,
+                throw=False,
+                progress=report_progress,
+            )
+    except InputError as error:  # an encoder's counts may hide the band from a loop without dither
+        refused = str(error)
+    else:
+        if rival.status.converged:
+            return rival.parameters
+        refused = rival.status.sentences[0]
+    console.print(f"no gains were certified without dither: {refused}", soft_wrap=True)
     return None
 
 

@@ -281,6 +281,13 @@ class ClosedLoop:
         value = without_prefix(dict(zip(self.parameters, p, strict=True)), "sensor")
         return self.sensor.time_constant(self._sensor_feedback, value) if self.sensor else 0.0
 
+    def count_size(self, parameters: ParameterSet) -> float:
+        """What one count of the sensor changes its reading by [measured unit]; 0 of a sensor without counts."""
+        if self.sensor is None:
+            return 0.0
+        value = dict(zip(self.parameters, self.parameter_vector(parameters).tolist(), strict=True))
+        return self.sensor.count_size(self._sensor_feedback, without_prefix(value, "sensor"))
+
     @property
     def dead_time(self) -> float:
         """Of the loop linearised [s]: half a sample for the hold, and the computing delay."""

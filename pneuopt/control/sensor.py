@@ -87,6 +87,10 @@ class SensorLag:
         """Of the loop linearised [s]."""
         return p["lag"]
 
+    def count_size(self, _on: SensedSignal, _p: Mapping[str, float]) -> float:
+        """What one count changes the reading by: nothing, it has no counts."""
+        return 0.0
+
 
 @dataclass(frozen=True)
 class Encoder:
@@ -171,6 +175,12 @@ class Encoder:
     def time_constant(self, on: SensedSignal, p: Mapping[str, Any]) -> Any:
         """Of the loop linearised [s]; half a sample of it is the difference's."""
         return p["filter"] + 0.5 * on.h if self.differentiates(on) else 0.0
+
+    def count_size(self, on: SensedSignal, p: Mapping[str, float]) -> float:
+        """What one count changes the reading by [measured unit]; 0 without counts."""
+        if not self.resolution:
+            return 0.0
+        return p["resolution"] / (on.h + p["filter"]) if self.differentiates(on) else p["resolution"]
 
     def _quantise(self, position: Any, p: Mapping[str, Any]) -> Any:
         return p["resolution"] * ca.floor(position / p["resolution"] + 0.5) if self.resolution else position

@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.continuation import continue_response
+from pneuopt.evaluation.counts import describe_counts
 from pneuopt.evaluation.defects import Defect as Defect  # noqa: PLC0414 - who reads a certificate finds it here
 from pneuopt.evaluation.defects import Ending, Finding, correct_metrics, describe_ending, find_defects
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
@@ -120,6 +121,8 @@ def judge_evaluations(
         ending = Ending(continue_response(found, band), band, found.case.label)
         findings += find_defects(ending, rest_error)
         notes += describe_ending(ending, found.metrics)
+        counts = describe_counts(found.loop, found.parameters, found.case.reference, band)
+        notes += [f"at {ending.case} {counts}"] if counts else []
         metrics[ending.case] = pd.Series(correct_metrics(ending, found.metrics))
     return Certificate(metrics, tuple(findings), tuple(notes), pd.DataFrame(margins))
 

@@ -6,12 +6,14 @@ from math import inf
 
 import numpy as np
 
+from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.evaluation.cases import TuningCase
+from pneuopt.evaluation.counts import describe_counts, sees_speed
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.margins import frequency_response
 from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
@@ -45,14 +47,16 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
     Raises
     ------
     InputError
-        If a limit lies beyond the horizon, the dither cannot be sampled, the stroke is too short for a reference, no
-        command holds it, or none that the limits allow, or all gains allowed have the wrong sign.
+        If a limit lies beyond the horizon, the dither cannot be sampled, the settling band is below half a count of an
+        encoder, the stroke is too short for a reference, no command holds it, or none that the limits allow, or all
+        gains allowed have the wrong sign.
     """
     _check_dither(loop, space)
     for case in cases:
         _check_horizon(case.reference, spec)
     _check_noise(loop, space, spec)
     for case in cases:
+        _check_counts(loop, case, space, spec)
         _check_travel(loop, case, space)
         _check_hold(loop, case, space, spec)
     _check_sign(loop, cases[0], space)
@@ -85,6 +89,18 @@ def _check_noise(loop: ClosedLoop, space: Space, spec: Specification) -> None:
         f"NoiseGain: max {spec.limit(NoiseGain):g} is below Kp + Kd/Tf, at least {least:.4g} within the gains' bounds"
     )
     require(least <= spec.limit(NoiseGain), f"{message}; lower pid.Kp or pid.Kd, raise pid.Tf, or raise max")
+
+
+def _check_counts(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
+    """Check that a controller that sees a position in counts can tell whether it is in the settling band.
+
+    Under dither it can, in the mean: the ripple moves the position over the edges of counts. Of a speed it can as well.
+    """
+    dithered = max(abs(v) for v in _parameter_range(space, DITHER_AMPLITUDE)) > 0
+    if dithered or sees_speed(loop) or not spec.concerns(SettlingTime):
+        return
+    told = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
+    require(told is None, f"{_case_prefix(case)}{told}")
 
 
 def _check_travel(loop: ClosedLoop, case: TuningCase, space: Space) -> None:

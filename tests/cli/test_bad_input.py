@@ -4,9 +4,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli.app import app
+from pneuopt.cli.tune import tune_rival
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.control.sensor import Encoder
+from pneuopt.evaluation.requirements import SettlingTime
+from pneuopt.evaluation.specification import specify
+from pneuopt.files.tuning import Tuning
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Viscous
 
 
 def run(line: str) -> Result:
@@ -157,3 +169,16 @@ def test_wrong_usage_is_bad_input(line: str) -> None:
     result = run(line)
     assert result.exit_code == 2
     assert "Error" in result.stderr
+
+
+def test_a_rival_that_cannot_be_tuned_leaves_the_dithered_result(capsys: pytest.CaptureFixture[str]) -> None:
+    """Under dither a band below half an encoder's count can be kept, without it not."""
+    loop = ClosedLoop(
+        ForceDrive(Viscous()).system(), PID(1e-3), Dither(20.0), measured="position", sensor=Encoder(1e-3)
+    )
+    given = loop.parameters.with_values({"dither.amplitude": 1.0, "pid.Kp": 100.0})
+    given = given.with_bounds({"pid.Kp": (50.0, 200.0)}).freed("pid.Kp")
+    task = Tuning(loop, (Step(0.02, horizon=0.1),), given, specify(SettlingTime()))
+    assert tune_rival(Console(width=400), task, given, quiet=True) is None
+    said = capsys.readouterr().out
+    assert said.startswith("no gains were certified without dither: reference 0 to 0.02: the settling band of +-0.4 mm")

@@ -11,6 +11,8 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.control.sensor import Encoder
+from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.evaluate import respond
 from pneuopt.evaluation.requirements import (
     IAE,
@@ -23,12 +25,17 @@ from pneuopt.evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
-from pneuopt.models.friction import Stribeck
+from pneuopt.evaluation.scenarios import NO_SCENARIOS
+from pneuopt.evaluation.specification import specify
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 
 FREE = {"pid.Kp": (1.0, 40.0), "pid.Ki": (5.0, 200.0)}
@@ -119,6 +126,49 @@ def test_a_dither_above_the_sampling_limit_is_refused_by_its_upper_bound() -> No
     free = wide | ParameterSet({"dither.frequency": replace(wide["dither.frequency"], lower=50.0, upper=900.0)})
     words = refusal((loop, free.freed("dither.frequency")), Step(0.2, horizon=0.3))
     assert "900 Hz cannot be sampled every 1 ms: it must lie below the Nyquist frequency 500 Hz" in words
+
+
+def counted(amplitude: float = 0.0, measured: str = "position") -> tuple[ClosedLoop, ParameterSet, Step]:
+    """A body seen in counts of 1 mm, or their differences, that is to stay within a band of a step of 20."""
+    loop = ClosedLoop(ForceDrive(Viscous()).system(), PID(1e-3), Dither(20.0), measured=measured, sensor=Encoder(1e-3))
+    given = loop.parameters.with_values(
+        {"pid.Kp": 100.0, "pid.Kd": 20.0, "pid.Tf": 0.01, "dither.amplitude": amplitude}
+    )
+    return loop, given.with_bounds({"pid.Kp": (50.0, 200.0)}).freed("pid.Kp"), Step(0.02, horizon=0.4)
+
+
+def check(model: tuple[ClosedLoop, ParameterSet, Step], asked: Requirement) -> None:
+    loop, given, step = model
+    space, spec = search_space(loop, given), specify(asked)
+    check_feasibility(loop, cases([step], NO_SCENARIOS, space.parameters, space.names), space, spec)
+
+
+def test_a_band_below_half_a_count_is_refused() -> None:
+    loop, given, step = counted()
+    words = refusal((loop, given), step, minimise=SettlingTime(band=0.02))
+    assert "reference 0 to 0.02: the settling band of +-0.4 mm is narrower than half the encoder's count of 1" in words
+    assert "cannot tell inside from outside; take band = 0.025 or more, a larger step or a finer" in words
+    assert "narrower than half" in refusal((loop, given), step, [SettlingTime(0.02, max=0.1)], IAE())
+    check((loop, given, step), SettlingTime(band=0.025))
+    finer = given | ParameterSet({"sensor.resolution": replace(given["sensor.resolution"], value=8e-4)})
+    check((loop, finer, step), SettlingTime(band=0.02))
+
+
+def test_the_band_that_is_named_is_wide_enough() -> None:
+    loop, given, _ = counted()
+    for size in (0.0123, -0.0277, 0.0099, 0.6e-3):
+        words = refusal((loop, given), Step(size, horizon=0.4), minimise=SettlingTime(band=1e-3))
+        wide = float(words.partition("take band = ")[2].split()[0])
+        assert wide == pytest.approx(0.5e-3 / abs(size), rel=0.01)
+        check((loop, given, Step(size, horizon=0.4)), SettlingTime(band=wide))
+    assert "outside; take a larger step" in refusal((loop, given), Step(3e-4, horizon=0.4))
+
+
+def test_a_band_below_half_a_count_is_not_refused_where_it_may_be_kept() -> None:
+    """A ripple shows what lies between counts, many samples a speed; and who asks for no settling needs no band."""
+    check(counted(1.0), SettlingTime())
+    check(counted(), IAE())
+    check((*counted(measured="speed")[:2], Step(1.0, horizon=0.4)), SettlingTime())
 
 
 TUBE = ((0.0, -0.1, 1.5), (0.5, 0.7, 0.9))

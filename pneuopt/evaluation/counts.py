@@ -1,0 +1,54 @@
+"""`describe_counts`: a settling band that a controller cannot see, because its sensor reads in coarser counts."""
+
+from math import ceil, floor, log10
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Step
+from pneuopt.control.sensor import Encoder
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import write_value
+
+# Relative excess of half a count over the band's half width that counts as none: below, rounding refuses a band of just
+# half a count; above, a band that is too narrow passes.
+COUNT_TOLERANCE = 1e-9
+
+
+def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Step, band: float) -> str | None:
+    """Sentence for a settling band narrower than half of what one count changes the reading by; None for others.
+
+    A position inside half a count of the reference reads as the reference, inside the band or outside, so that nothing
+    holds it in a narrower band. Of a speed only the instants are that coarse: over many samples the counts add up.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+        Every parameter of the loop.
+    reference : Step
+    band : float
+        Half width, a fraction of the step.
+    """
+    count, size, unit = loop.count_size(parameters), abs(reference.nominal_size), loop.feedback.unit
+    if count / 2 <= band * size * (1 + COUNT_TOLERANCE):
+        return None
+    told = f"the settling band of +-{write_value(band * size, unit, 3)} is narrower than half"
+    change, wider = write_value(count, unit, 3), _wider_band(count / 2 / size)
+    if sees_speed(loop):
+        remedy = "a finer encoder or a longer filter of the sensor"
+        return f"{told} the {change} by which one count changes the reading; {wider}{remedy}"
+    ripple = loop.dither_period(parameters) is not None
+    tells = "tells inside from outside only by its dither's ripple" if ripple else "cannot tell inside from outside"
+    remedy = "a larger step or a finer encoder"
+    return f"{told} the encoder's count of {change}, the controller {tells}; {wider}{remedy}"
+
+
+def _wider_band(least: float) -> str:
+    """The words that name a wide enough band, rounded up to three digits; none where no fraction is wide enough."""
+    unit = 10.0 ** (floor(log10(least)) - 2)
+    rounded = ceil(least / unit * (1 - COUNT_TOLERANCE)) * unit
+    return f"take band = {rounded:.3g} or more, " if rounded < 1 else "take "
+
+
+def sees_speed(loop: ClosedLoop) -> bool:
+    """Whether the controller sees a speed that an encoder differentiates."""
+    return isinstance(loop.sensor, Encoder) and loop.feedback.name != loop.sensor.position
