@@ -146,23 +146,31 @@ class PointFinder:
     def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage, reach: Array) -> Array:
         """The plant's state and the command at the fastest sample, without ripple."""
         begin = np.maximum(own.fastest - np.round(periods / 2 / grid.spacing).astype(np.intp), 0)
-        out, ends = self._run_up_to(grid, p, begin, own)
+        out, ends = self._run_up_to(grid, p, begin, own, periods > 0)
         for period, rows in _by_period(periods):
             along = self._period(grid, ends[rows], p[rows], grid.t[begin[rows]], period)
             share = (grid.t[own.fastest[rows]] - grid.t[begin[rows]]) / period
             _put_finite(out, rows, move_towards(_at(along, share), _mean(along), reach[rows]))
         return out
 
-    def _run_up_to(self, grid: ReferenceGrid, p: Array, last: Indices, own: Passage) -> tuple[Array, Array]:
-        """The plant's state and the command at a sample of each lane, and the loop's state there."""
+    def _run_up_to(
+        self, grid: ReferenceGrid, p: Array, last: Indices, own: Passage, goes_on: Mask
+    ) -> tuple[Array, Array]:
+        """The plant's state and the command at a sample of each lane, and the loop's state there.
+
+        Lanes wait there for the latest of them, between two samples of a held controller: at a sample it would act
+        again and again. That of lanes that go on from there has not acted yet.
+        """
         out, order = np.empty((len(p), len(self.loop.plant.states) + 1)), np.argsort(last, kind="stable")
         ends, u, t, h = np.empty_like(own.starts), *grid.pad(len(grid.t))
         for rows in np.split(order, np.arange(LANES_TO_FASTEST, len(order), LANES_TO_FASTEST)):
             k = np.minimum(np.arange(last[rows].max() + 1), last[rows][:, None])
             steps = np.where(np.arange(k.shape[1]) < last[rows][:, None], h[k], 0.0)
+            waits = np.arange(k.shape[1]) + goes_on[rows, None] > last[rows][:, None]
+            at = t[k] + (0.5 * grid.spacing * waits if self.loop.pid.sample_time is not None else 0.0)
             with np.errstate(all="ignore"):
                 substeps = rk4_substeps(self.rate, grid.spacing)
-                run = self.rollout.run(own.starts[rows], u[k], p[rows], t[k], steps, substeps=substeps)
+                run = self.rollout.run(own.starts[rows], u[k], p[rows], at, steps, substeps=substeps)
             ends[rows] = run.x_end
             out[rows] = np.column_stack([run.x_end[:, : out.shape[1] - 1], run.y[:, -1, CONTROL_OUTPUT]])
         return out, ends

@@ -107,3 +107,15 @@ def test_a_searchs_margins_do_not_jump_where_a_dither_begins() -> None:
     for name in ROWS:
         assert [table[name] for table in tables[1:]] == pytest.approx([tables[0][name]] * 2, rel=2e-3), name
         assert tables[1][name] == pytest.approx(certified[name], rel=0.01), name
+
+
+def test_margins_do_not_depend_on_what_runs_beside() -> None:
+    """Lanes that wait for the latest one at a sample of the controller would act again there."""
+    loop, given, step, ranges = sampled_axis()
+    given = given.with_values({n: sum(r) / 2 for n, r in ranges.items()}).with_bounds(ranges).freed(*ranges)
+    space = search_space(loop, given)
+    simulator = Simulator(loop, [step], space, spec=SPEC)
+    points = space.from_unit(np.random.default_rng(2).random((8, len(ranges))))
+    together = simulator.values(points, SPEC)["MaxSensitivity"]
+    alone = [simulator.values(point[None], SPEC)["MaxSensitivity"][0] for point in points]
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
