@@ -111,11 +111,13 @@ def test_a_searchs_margins_do_not_jump_where_a_dither_begins() -> None:
 
 def test_margins_do_not_depend_on_what_runs_beside() -> None:
     """Lanes that wait for the latest one at a sample of the controller would act again there."""
-    loop, given, step, ranges = sampled_axis()
-    given = given.with_values({n: sum(r) / 2 for n, r in ranges.items()}).with_bounds(ranges).freed(*ranges)
-    space = search_space(loop, given)
-    simulator = Simulator(loop, [step], space, spec=SPEC)
-    points = space.from_unit(np.random.default_rng(2).random((8, len(ranges))))
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(1e-3), Dither(80.0))
+    values = {"friction.coulomb": 40.0, "friction.static": 70.0, "friction.viscous": 80.0, "pid.Kp": 200.0}
+    bounds = {"pid.Kp": (10.0, 1000.0), "pid.Ki": (1.0, 10000.0), "dither.amplitude": (0.0, 50.0)}
+    given = loop.parameters.with_values({**values, "pid.Ki": 500.0, "pid.lower": -300.0, "pid.upper": 300.0})
+    space = search_space(loop, given.with_bounds(bounds).freed(*bounds))
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], space, spec=SPEC)
+    points = space.from_unit(np.random.default_rng(0).random((24, len(bounds))))
     together = simulator.values(points, SPEC)["MaxSensitivity"]
     alone = [simulator.values(point[None], SPEC)["MaxSensitivity"][0] for point in points]
     np.testing.assert_allclose(together, alone, rtol=1e-12)
