@@ -28,6 +28,9 @@ GROWTH_SHARE, EDGE_SHARE = 0.5, 0.9
 # Share of the range over half the record that a drift in one direction must cover to be creep: with less, slow hunting
 # is creep too; with all of it, the least ringing on the drift hides it.
 MIN_DRIFT_SHARE = 0.9
+# Horizons within which a response must be in its band for good. With fewer, a design is refused whose user only
+# underrated its settling; with more, one counts as settled that for its user's purposes never does.
+LATEST_SETTLING = 4.0
 
 
 class Defect(Enum):
@@ -166,6 +169,12 @@ def _describe_defect(ending: Ending, rest_error: float) -> tuple[Defect, str] | 
         return Defect.STANDS_STILL, f"stands still: {until} it has moved by {100 * max(moved, 0.0):.2g} % of the step"
     if cycle is not None and ending.growth > MIN_GROWTH:
         return Defect.GROWS, f"swings more and more: {until} it has {cycle.describe(course.loop.feedback.unit)}"
+    if ending.is_settled and ending.settling_time > LATEST_SETTLING * course.horizon:
+        times = f"{ending.settling_time / course.horizon:.2g} times its horizon"
+        return (
+            Defect.CREEPS,
+            f"creeps: it is in the band for good only {ending.settling_time:.3g} s after the step, {times}",
+        )
     rests = ending.stands and abs(ending.final_error) <= rest_error
     return None if ending.is_settled or rests else _describe_unrest(ending, cycle, until)
 

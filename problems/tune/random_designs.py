@@ -162,12 +162,13 @@ def find_faults(
         wrong.append("unstable: the swing grows")
     outside = np.flatnonzero(np.abs(error) > BAND + SLACK)
     last = t[outside[-1]] if len(outside) else 0.0
-    if np.isnan(settled):  # not asked for: the design comes to rest beyond its horizon, and its certificate says so
+    asked = np.isfinite(settled)
+    if not asked:  # not asked for: the design comes to rest beyond its horizon, and its certificate says so
         settled = STAYS * t[-1]
     if not last <= settled + LATE * horizon:
         wrong.append(f"leaves the band at {last:.4g} s, certified {settled:.4g} s")
     within = np.flatnonzero(np.abs(error[t <= horizon]) > BAND)
-    deviation = abs(t[within[-1]] - settled) / horizon if len(within) else 0.0
+    deviation = abs(t[within[-1]] - settled) / horizon if len(within) and asked else 0.0
     first = t <= horizon
     most = float(np.max(np.sign(step.size) * (mean[first] - step.final))) / abs(step.size)
     if most > spec.limit(po.Overshoot) + SLACK:

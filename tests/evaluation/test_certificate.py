@@ -210,3 +210,14 @@ def test_certified_figures_are_those_of_a_plain_integration(Kp: float, Ki: float
     assert ours["Overshoot"] == pytest.approx(100 * max(0.0, error.max()), abs=1e-4)
     assert ours["IAE"] == pytest.approx(run.y[2, -1], abs=1e-6)
     assert ours["ITAE"] == pytest.approx(run.y[3, -1], abs=1e-6)
+
+
+def test_a_design_that_takes_many_horizons_creeps() -> None:
+    """An integral alone on a lag of .1 s is in the 2 % band after 3.59 s (its slow pole at -1.127: ln(1.14 50)/1.127)."""
+    loop, p = first_order(0.0, 1.0)
+    (found,) = certificate(loop, Step(1.0, horizon=0.5), p).findings
+    assert found.defect is Defect.CREEPS
+    assert "in the band for good only 3.59" in found.sentence
+    late = certificate(loop, Step(1.0, horizon=1.5), p)
+    assert late.findings == ()
+    assert any("beyond the horizon" in note for note in late.notes)
