@@ -7,6 +7,7 @@ A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or s
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
@@ -17,7 +18,7 @@ from pneuopt.evaluation.budget import check_steps
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
-from pneuopt.evaluation.requirements import PeakControl, Requirement
+from pneuopt.evaluation.requirements import PeakControl, Requirement, requirement_values
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
@@ -29,12 +30,16 @@ from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import choose_method
 from pneuopt.tuning.on_rig import certify_on_rig, check_rig
+from pneuopt.tuning.responses import worst_values
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, relax
 from pneuopt.tuning.space import Space, clip_level, search_space
 from pneuopt.tuning.validation import validate_design
 
 __all__ = ["TuningResult", "prepare_search", "prepare_task", "tune"]
+# Starts that must end in the same optimum for a search to be believed alone: a single one may be the nearest of many;
+# more search twice where two have confirmed each other.
+MIN_AGREEING = 2
 # Endings of a search that contradictory limits may have caused: `tune` then seeks how far they have to give way.
 INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)
 
@@ -121,12 +126,7 @@ def tune(
     task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios, accept, max_steps)
     if rig is not None:
         check_rig(rig, task)
-    search = prepare_search(task, method, progress)
-    result = search.run()
-    successor = search.method.successor
-    if method is None and successor is not None and result.status.code not in (Code.CONVERGED, Code.INTERRUPTED):
-        search = prepare_search(task, successor, progress)
-        result = search.run()
+    search, result = _search(task, method, progress)
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     tuned = search.space.names
     untuned = [n for n in task.space.names if n not in tuned]
@@ -146,6 +146,28 @@ def tune(
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
     return result
+
+
+def _search(task: TuningTask, method: Method | None, progress: ProgressCallback | None) -> tuple[Search, TuningResult]:
+    """The search of a method, by default the first that suits, and where its answer is in doubt the better of two."""
+    search = prepare_search(task, method, progress)
+    result = search.run()
+    successor = search.method.successor
+    found_once = result.stats.get("starts_agreeing", inf) < MIN_AGREEING
+    doubtful = not result.status.converged or found_once
+    if method is not None or successor is None or not doubtful or result.status.code is Code.INTERRUPTED:
+        return search, result
+    other = prepare_search(task, successor, progress)
+    found = other.run()
+    worse = not found.status.converged or _certified_objective(task, found) >= _certified_objective(task, result)
+    return (search, result) if result.status.converged and worse else (other, found)
+
+
+def _certified_objective(task: TuningTask, result: TuningResult) -> float:
+    """The objective by a result's certificate, the worst over the cases."""
+    return task.spec.objective(
+        worst_values([requirement_values(dict(column)) for _, column in result.certified.items()])
+    )
 
 
 def _try_on_plants(
