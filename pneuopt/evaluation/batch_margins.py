@@ -12,7 +12,7 @@ from pneuopt.control.linear_controller import controller_matrices, linear_gains,
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.margins import ComplexArray, are_stable, batch_frequency_response, controller_parts
-from pneuopt.evaluation.operating_points import counted_points
+from pneuopt.evaluation.operating_points import NOISE_GAIN, counted_points
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arrays import Array
 
@@ -23,9 +23,11 @@ PEAK_REFINEMENTS = 3
 PEAK_GRID_POINTS = 9
 
 
-def batch_margin_function(
-    loop: ClosedLoop, omega: ArrayLike
-) -> Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]:
+MarginFunction = Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]
+"""``(p, x, u, only) -> found``; see `batch_margin_function`."""
+
+
+def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: float = 0.0) -> MarginFunction:
     """Function that gives margins, sensitivities and noise gains for many gains and operating points at once.
 
     Parameters
@@ -33,6 +35,8 @@ def batch_margin_function(
     loop : ClosedLoop
     omega : array_like, shape (n,)
         [rad/s], positive, increasing.
+    lowest_noise : float
+        Frequency from which on a noise gain counts (`lowest_noise_frequency`) [rad/s].
 
     Returns
     -------
@@ -46,6 +50,7 @@ def batch_margin_function(
         checked.
     """
     w = np.asarray(omega, dtype=float)
+    first = {NOISE_GAIN: int(np.searchsorted(w, (1 - 1e-9) * lowest_noise))}
     plants, command = _plant_responses(loop, w), names(loop.plant.inputs).index(loop.command.name)
 
     def read_margins(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
@@ -65,11 +70,11 @@ def batch_margin_function(
         L, C = responses(w)
         with np.errstate(all="ignore"):
             found = {n: crossing(L) for n, crossing in _MARGIN_FUNCTIONS.items() if n in only}
-            found |= {
-                n: _refine_peaks(size, responses, w, size(L, C)) for n, size in _PEAK_FUNCTIONS.items() if n in only
-            }
-        if "NoiseGain" in only:
-            found["NoiseGain"] = np.maximum(found["NoiseGain"], np.abs(Kp + Kd / Tf)[:, 0])
+            for n, size in ((n, size) for n, size in _PEAK_FUNCTIONS.items() if n in only):
+                k = first.get(n, 0)
+                found[n] = _refine_peaks(size, responses, w[k:], size(L[:, k:], C[:, k:]))
+        if NOISE_GAIN in only:
+            found[NOISE_GAIN] = np.maximum(found[NOISE_GAIN], np.abs(Kp + Kd / Tf)[:, 0])
         if "MaxSensitivity" in only:  # at infinity the loop is open
             found["MaxSensitivity"] = np.maximum(found["MaxSensitivity"], 1.0)
         stable = are_stable(_closed_loop_poles(matrices, controller_matrices(gains, loop.dead_time)))
@@ -188,7 +193,7 @@ _MARGIN_FUNCTIONS: dict[str, Callable[[ComplexArray], Array]] = {
 _PEAK_FUNCTIONS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
     "MaxSensitivity": lambda L, _: 1 / np.abs(1 + L),
     "MaxComplementarySensitivity": lambda L, _: np.abs(L / (1 + L)),
-    "NoiseGain": lambda L, C: np.abs(C / (1 + L)),
+    NOISE_GAIN: lambda L, C: np.abs(C / (1 + L)),
 }
 
 

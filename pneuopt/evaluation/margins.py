@@ -28,6 +28,9 @@ from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
 
 ComplexArray = NDArray[np.complex128]
+# Angle over a horizon of the slowest noise that counts [rad]. With a smaller one the noise gain is that of a drift, far
+# slower than the response; with a larger one a resonance of slow loops is missed.
+NOISE_ANGLE = 0.3
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,20 @@ def margins(open_loop: Linearisation) -> Margins:
     return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, stable)
 
 
-def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float]) -> float:
+def lowest_noise_frequency(horizon: float) -> float:
+    """Frequency from which on a noise gain counts over a horizon [s]: slower noise is a drift that it does not show.
+
+    Examples
+    --------
+    >>> lowest_noise_frequency(0.5)
+    0.6
+    """
+    return NOISE_ANGLE / horizon
+
+
+def noise_gain(
+    open_loop: Linearisation, gains: tuple[float, float, float, float], lowest_frequency: float = 0.0
+) -> float:
     """``max |C(jw)/(1 + L(jw))|``: the largest gain from measurement noise to the command.
 
     The maximum control sensitivity of B. Kristiansson and B. Lennartson, Robust and optimal tuning of PI and PID
@@ -119,6 +135,9 @@ def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float
         ``L = C P`` (`open_loop`), strictly proper.
     gains : (float, float, float, float)
         Kp, Ki, Kd, Tf of the PID C, with Tf > 0.
+    lowest_frequency : float
+        [rad/s]; what lies below does not count. An integral answers a constant error of a measured speed without bound
+        where the plant cannot go on moving so, a piston whose chambers fill for example.
 
     Returns
     -------
@@ -139,7 +158,9 @@ def noise_gain(open_loop: Linearisation, gains: tuple[float, float, float, float
         a, b = controller_parts(gains, w)
         return np.asarray((a + 1j * b) / (1 + frequency_response(open_loop, w)))
 
-    return _response_peak(control_response, frequency_grid(open_loop), Kp + Kd / Tf)[0]
+    omega = frequency_grid(open_loop)
+    omega = np.unique(np.append(omega[omega > lowest_frequency], max(lowest_frequency, omega[0])))
+    return _response_peak(control_response, omega, Kp + Kd / Tf)[0]
 
 
 def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:

@@ -31,7 +31,7 @@ from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.dither_ripple import remove_ripple
-from pneuopt.evaluation.margins import margins, noise_gain
+from pneuopt.evaluation.margins import lowest_noise_frequency, margins, noise_gain
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arrays import Array, Indices
@@ -109,7 +109,8 @@ def margin_rows(
 ) -> tuple[dict[str, Any], ...]:
     """The rows of `operating_point_margins`."""
     return tuple(
-        _margin_row(loop, parameters, point) for point in operating_points(loop, parameters, reference, response)
+        _margin_row(loop, parameters, point, reference.horizon)
+        for point in operating_points(loop, parameters, reference, response)
     )
 
 
@@ -206,15 +207,15 @@ def _find_points(
     yield point(AT_THE_END, -1)
 
 
-def _margin_row(loop: ClosedLoop, parameters: ParameterSet, point: OperatingPoint) -> dict[str, Any]:
-    linear = open_loop(loop, parameters, point.x, point.inputs)
+def _margin_row(loop: ClosedLoop, parameters: ParameterSet, point: OperatingPoint, horizon: float) -> dict[str, Any]:
+    linear, lowest = open_loop(loop, parameters, point.x, point.inputs), lowest_noise_frequency(horizon)
     robust = margins(linear)
     found = {
         "MaxSensitivity": robust.max_sensitivity,
         "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
         "GainMargin": robust.gain_margin,
         "PhaseMargin": robust.phase_margin,
-        NOISE_GAIN: noise_gain(linear, operating_gains(loop, parameters, point.x, point.inputs)),
+        NOISE_GAIN: noise_gain(linear, operating_gains(loop, parameters, point.x, point.inputs), lowest),
     }
     if not robust.stable:
         found = {n: nan if n.endswith("Margin") else inf for n in found}

@@ -233,7 +233,10 @@ class PhaseMargin(AtLeast):
 
 @final
 class NoiseGain(AtMost):
-    """``max |C(jw)/(1 + L(jw))|``, the gain from measurement noise to the command [its unit/measured unit]."""
+    """``max |C(jw)/(1 + L(jw))|``, the gain from measurement noise to the command [its unit/measured unit].
+
+    It counts from 0.3 rad over the horizon on: slower noise is a drift of the sensor.
+    """
 
     metric = Metric("NoiseGain", "{command}/({measured})", Source.LINEAR_LOOP)
 

@@ -9,8 +9,9 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.rollout import Rollout
-from pneuopt.evaluation.batch_margins import batch_margin_function
+from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
 from pneuopt.evaluation.cases import cases
+from pneuopt.evaluation.margins import lowest_noise_frequency
 from pneuopt.evaluation.meter import check_channels, needed_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, ROBUSTNESS_REQUIREMENTS
@@ -102,7 +103,7 @@ class Simulator:
         self._grid_of = np.tile(np.arange(len(references)), len(self.cases) // max(1, len(references)))
         self._rate = max(self._fastest_eigenvalue(references), dither_resolution_rate(loop, space.parameters))
         self.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in self.grids]
-        self.robustness = batch_margin_function(loop, self._frequencies(references))  # about `operating_points`
+        self.robustness = self._margin_function(references)  # about `operating_points`
         self._find_points = PointFinder(loop, self.rollout, self._rate)
 
     def coarse(self, spec: Specification, bands: Sequence[float] = ()) -> "Simulator":
@@ -346,11 +347,13 @@ class Simulator:
         k = speed_output(self.loop, self.meter_channels)
         return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period or 0.0)
 
-    def _frequencies(self, references: Sequence[Step]) -> Array:
-        """Frequencies at which loops are read [rad/s], from where a slow integral swings against a resting drive on."""
-        slowest, h = 1 / max(r.horizon for r in references), self.loop.pid.sample_time
+    def _margin_function(self, references: Sequence[Step]) -> MarginFunction:
+        """Margins of many loops, read from the frequency on at which a slow integral swings against a resting drive."""
+        horizon, h = max(r.horizon for r in references), self.loop.pid.sample_time
+        slowest, lowest = 1 / horizon, lowest_noise_frequency(horizon)
         fastest = max(self._rate, 1e3 * slowest, MAX_SAMPLE_ANGLE / h if h else 0.0)
-        return np.concatenate([np.geomspace(3e-5, 0.29, 60) * slowest, np.geomspace(0.3 * slowest, fastest, 150)])
+        slow, fast = np.geomspace(3e-5 * slowest, 0.97 * lowest, 60), np.geomspace(lowest, fastest, 150)
+        return batch_margin_function(self.loop, np.concatenate([slow, fast]), lowest)
 
     def _dither_rates(self, p: Array) -> Array:
         if self.loop.dither is None:

@@ -13,7 +13,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import define
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.requirements import GainMargin, MaxSensitivity, PhaseMargin, SettlingTime
+from pneuopt.evaluation.requirements import GainMargin, MaxSensitivity, NoiseGain, PhaseMargin, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
@@ -22,8 +22,8 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 
-ROWS = ("MaxSensitivity", "GainMargin", "PhaseMargin")
-SPEC = specify(SettlingTime(), [MaxSensitivity(2.0), GainMargin(2.0), PhaseMargin(30.0)])
+ROWS = ("MaxSensitivity", "GainMargin", "PhaseMargin", "NoiseGain")
+SPEC = specify(SettlingTime(), [MaxSensitivity(2.0), GainMargin(2.0), PhaseMargin(30.0), NoiseGain(1e9)])
 
 
 def cylinder() -> tuple[ClosedLoop, ParameterSet, Step, dict[str, tuple[float, float]]]:
