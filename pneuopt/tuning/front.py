@@ -30,8 +30,8 @@ from pneuopt.tuning.method import LimitPath, Method, SearchResult
 from pneuopt.tuning.relaxation import limits_with_settling
 from pneuopt.tuning.responses import to_records
 from pneuopt.tuning.result import TuningResult
-from pneuopt.tuning.screening import first_population
 from pneuopt.tuning.search import Search, end_point
+from pneuopt.tuning.shade import first_population
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,16 +18,11 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
+from pneuopt.tuning.merit import SIMULATION_PEAK_MARGIN, BestPoint, screening_result
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race, may_be_cut
-from pneuopt.tuning.screening import (
-    SIMULATION_PEAK_MARGIN,
-    BestPoint,
-    first_population,
-    screening_result,
-)
-from pneuopt.tuning.shade import SuccessHistory
+from pneuopt.tuning.shade import SuccessHistory, first_population
 from pneuopt.tuning.simulator import Simulator
 
 # Shares of the trials that the starts get on coarse samples; the rest is for fine ones. Less for the first ends in the

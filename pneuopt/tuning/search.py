@@ -16,6 +16,7 @@ from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.tuning.certifier import MAX_CERTIFIED_EXCESS, Certifier
 from pneuopt.tuning.confirmation import confirm_infeasible, describe_confirmation
 from pneuopt.tuning.feasibility import check_feasibility
+from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.method import Method, SearchResult, TuningTask
 from pneuopt.tuning.relaxation import (
     limit_excess,
@@ -26,7 +27,6 @@ from pneuopt.tuning.relaxation import (
 )
 from pneuopt.tuning.responses import to_records
 from pneuopt.tuning.result import TuningResult, relaxation_share, with_relaxations
-from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 

@@ -99,6 +99,14 @@ class SuccessHistory:
         self._entry = (self._entry + 1) % MEMORY_SIZE
 
 
+def first_population(members: int, start: Array, rng: np.random.Generator) -> Array:
+    """Draw a Latin hypercube of the unit cube, with the start as its first point, shape (members, n)."""
+    cells = np.array([rng.permutation(members) for _ in start]).T
+    found: Array = (cells + rng.random(cells.shape)) / members
+    found[0] = np.clip(start, 0.0, 1.0)
+    return found
+
+
 def _others(m: int, size: int, rng: np.random.Generator) -> tuple[Indices, Indices]:
     """For each of m members another one, and a third out of `size`, shapes (m,): neither is the member itself."""
     own = np.arange(m)

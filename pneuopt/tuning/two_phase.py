@@ -22,9 +22,9 @@ from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.shooting.full_space import FullSpace, FullSpaceProblem, follow_path, prepare_full_space, solve_from
 from pneuopt.shooting.solution import Solution
 from pneuopt.tuning.agreement import Agreement, compare_starts
+from pneuopt.tuning.merit import WIDEN_BOUNDS
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.racing import Racing
-from pneuopt.tuning.screening import WIDEN_BOUNDS
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue
 from pneuopt.tuning.two_phase_transcription import BAND_PARAMETER, transcribe_two_phase, without_clip

@@ -42,9 +42,9 @@ from scipy.optimize import differential_evolution
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.plotting import BLUE, GREY, axes_grid
-from pneuopt.tuning.screening import MeritFunction, first_population
+from pneuopt.tuning.screening import MeritFunction
 from pneuopt.tuning.search import Search
-from pneuopt.tuning.shade import SuccessHistory
+from pneuopt.tuning.shade import SuccessHistory, first_population
 from pneuopt.tuning.tune import prepare_search, prepare_task
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame

@@ -26,9 +26,9 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.specification import Objective, specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
+from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.race import Race, may_be_cut
 from pneuopt.tuning.readings import loop_pieces
-from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 

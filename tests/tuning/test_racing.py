@@ -12,10 +12,10 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.status import Code
+from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.method import TuningTask
 from pneuopt.tuning.race import Race
 from pneuopt.tuning.racing import Racing, RacingResult, run_racing
-from pneuopt.tuning.screening import compute_merits
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 
