@@ -16,6 +16,7 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.solution import Fit
 
@@ -185,14 +186,17 @@ class _Refits:
         return math.exp(z) if self.parameter.log else z
 
     def refit_at(self, z: float) -> _ProfilePoint:
-        """The fit with the parameter held there."""
+        """The fit with the parameter held there; raises `KeyboardInterrupt` if it was interrupted."""
         start = self.start
         if self.points:
             start = self.problem.start_from(min(self.points, key=lambda known: abs(known.z - z)).fit)
         transcription = self.problem.transcription(start)
         held = replace(self.parameter, value=self.value(z), lower=self.value(z), upper=self.value(z))
         transcription = replace(transcription, parameters=transcription.parameters | ParameterSet({self.name: held}))
-        point = _ProfilePoint(z, solve_least_squares(transcription, self.method))
+        fit = solve_least_squares(transcription, self.method)
+        if fit.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        point = _ProfilePoint(z, fit)
         self.points.append(point)
         return point
 

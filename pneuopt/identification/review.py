@@ -66,7 +66,7 @@ def review_fit(
         The result with its verdict; where the search did not converge, without any interval, and with the worst place
         in its status. Doubtful intervals are replaced by those of the profile likelihood; a parameter with an open
         interval, or one that the logged motion does not excite, has no standard deviation. Ctrl-C leaves the other
-        intervals as they are.
+        intervals as they are, and the status says so.
     """
     start = problem.start_from(result)
     if not result.status.converged:
@@ -85,7 +85,7 @@ def review_fit(
             verdict=verdict,
         )
     result = replace(result, estimates=_blank_intervals(result.estimates, unidentifiable))
-    profiles = _profiles(problem, result)
+    profiles, waiting = _profiles(problem, result)
     trusted = result.stats["chi_square_ratio"] <= MAX_CHI_SQUARE_RATIO
     verdict = verdict_from_covariance(
         problem, start, _blank_covariance(result.covariance, unidentifiable), trusted=trusted
@@ -96,7 +96,7 @@ def review_fit(
         verdict = add_unidentifiable(verdict, unidentifiable, local, _names_at_given_value(problem))
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
-    status = result.status.with_details(_name_unidentifiable(verdict))
+    status = _name_interruption(result.status, waiting).with_details(_name_unidentifiable(verdict))
     return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
 
 
@@ -128,8 +128,20 @@ def _verdict_at(problem: EstimationProblem, start: Start, result: Identification
     )
 
 
-def _profiles(problem: EstimationProblem, result: IdentificationResult) -> dict[str, Profile]:
-    """Profiles of parameters with doubtful linear intervals, and of those that move far along an open profile."""
+def _name_interruption(status: Status, waiting: Sequence[str]) -> Status:
+    """The status of a fit, interrupted where intervals still waited for their profiles."""
+    if not waiting:
+        return status
+    verdict = f"the estimates are found, the interval of {waiting[0]} is not"
+    detail = f"the intervals of {join_names(waiting)} are of the linear model, which is doubtful here"
+    return Status(Code.INTERRUPTED, (verdict, detail, *status.sentences[1:], "run again for the intervals"))
+
+
+def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple[dict[str, Profile], list[str]]:
+    """Profiles of parameters with doubtful linear intervals, and of those that move far along an open profile.
+
+    The second value names the parameters that Ctrl-C left without one.
+    """
     found: dict[str, Profile] = {}
     rows = result.estimates
     known = rows.index[np.isfinite(rows["stderr"])]
@@ -137,17 +149,17 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> dict[
     waiting = [n for n in known if unknowns[n].log and rows["stderr"][n] > MAX_LINEAR_DEVIATION * rows["value"][n]]
     try:
         while waiting:
-            name = waiting.pop(0)
+            name = waiting[0]
             found[name] = trace_profile(problem, result, name)
             dragged = [
                 n
                 for n in _parameters_outside_interval(found[name], rows)
                 if n in known and n not in found and n not in waiting
             ]
-            waiting += dragged if found[name].is_open else []
+            waiting = [*waiting[1:], *(dragged if found[name].is_open else [])]
     except KeyboardInterrupt:
-        return found
-    return found
+        return found, waiting
+    return found, []
 
 
 def _parameters_outside_interval(profile: Profile, estimates: "pd.DataFrame") -> Iterator[str]:

@@ -1,10 +1,12 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System
+from pneuopt.identification import profiles
 from pneuopt.identification.identify import identify
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult
@@ -13,7 +15,11 @@ from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
+from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.transcription import Transcription
 
 LEVELS = {"friction.coulomb": 30.0, "friction.static": 42.0, "friction.stribeck_velocity": 0.025}
 CURVE = ("friction.coulomb", "friction.static", "friction.stribeck_velocity")
@@ -87,6 +93,28 @@ def test_a_curve_that_is_not_there_has_open_ends_and_no_interval() -> None:
     assert f"the logs do not identify {name}: anything from 0.0001 to 1 m/s fits as well; log" in str(result.verdict)
     assert np.isnan(result.covariance[name]).all()
     assert f"the logs do not identify {name}" in result.status.sentences
+
+
+@pytest.mark.parametrize("refits", [0, 3])
+def test_an_interruption_between_or_within_refits_is_told(refits: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C within a refit gives a fit that is marked, between two of them an exception."""
+    fits: list[Fit] = []
+
+    def interrupted(transcription: Transcription, method: LeastSquares) -> Fit:
+        if not refits:
+            raise KeyboardInterrupt
+        fits.append(solve_least_squares(transcription, method))
+        return fits[-1] if len(fits) < refits else replace(fits[-1], status=Status(Code.INTERRUPTED))
+
+    monkeypatch.setattr(profiles, "solve_least_squares", interrupted)
+    rig, name = MotionDrive(Stribeck(), chamber=False), "friction.stribeck_velocity"
+    given = rig.parameters.with_values({**LEVELS, "friction.viscous": 60.0}).freed(*CURVE)
+    result = identify(rig.system(), [moved(42.0, 16.0)], given, throw=False)
+    assert len(fits) == refits
+    assert result.status.code is Code.INTERRUPTED
+    assert result.status.verdict == f"the estimates are found, the interval of {name} is not"
+    row = result.estimates.loc[name]
+    assert np.isfinite(row[["stderr", "ci_low", "ci_high"]].to_numpy(dtype=float)).all()
 
 
 def test_bad_input_is_named() -> None:
