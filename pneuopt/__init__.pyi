@@ -107,6 +107,7 @@ from .plotting import (
     save_figure,
 )
 from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
+from .quantities.intersample import Intersample
 from .quantities.parameters import Parameter, ParameterSet, Quantity
 from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
@@ -165,6 +166,7 @@ __all__ = [
     "IdentificationResult",
     "InputError",
     "Integrator",
+    "Intersample",
     "IsentropicNozzle",
     "Iso6358",
     "Karnopp",

@@ -18,6 +18,7 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.linearised import LinearisedProblem
@@ -110,7 +111,13 @@ def axis_logs(axis_truth: dict[str, float]) -> dict[str, str]:
     for seed, name in enumerate(("run_01", "run_02")):
         t = np.arange(0, 1.0, 2e-3)
         force = 60 * np.sin(2 * np.pi * 1.7 * t) + 30 * np.sin(2 * np.pi * 3.1 * t + seed)
-        run = simulate(system, Trajectory(t, {"force": force}), system.parameters.with_values(axis_truth), rtol=1e-6)
+        run = simulate(
+            system,
+            Trajectory(t, {"force": force}),
+            system.parameters.with_values(axis_truth),
+            rtol=1e-6,
+            intersample={"force": Intersample.LINEAR},
+        )
         position = 1e3 * (run["position"] + 2e-5 * np.random.default_rng(seed).standard_normal(len(t)))
         rows = [f"{a:.4f},{b:.5f},{c:.5f}" for a, b, c in zip(t, force, position, strict=True)]
         texts[name] = "\n".join(["time [s],force [N],position [mm]", *rows]) + "\n"

@@ -75,6 +75,7 @@ PUBLIC_NAMES = [
     "identify",
     "InputError",
     "Integrator",
+    "Intersample",
     "ISE",
     "IsentropicNozzle",
     "Iso6358",

@@ -8,16 +8,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
 
 
 class Log(NamedTuple):
-    """One log as a start hook reads it: its channels, and the parameters that hold in it, its conditions included."""
+    """One log as a start hook reads it: its channels, and the parameters that hold in it, its conditions included.
+
+    `intersample` says of inputs how they run between two samples; an absent one is held.
+    """
 
     measured: Trajectory
     parameters: ParameterSet
+    intersample: Mapping[str, Intersample] = {}
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,9 @@
 """`simulate`: tight integration of a plant or a loop, which shares nothing with the optimiser but the equations.
 
-The ODE is integrated by LSODA to 1e-10, stiff or not; inputs are held, and the integration restarts only where one
-changes or where a sampled controller acts. The controller's exact update runs at each sample. A plant with Karnopp's
-friction sticks and slips between events that are located (`stick_slip`).
+The ODE is integrated by LSODA to 1e-10, stiff or not; inputs are held, or run linearly from sample to sample where
+`intersample` says so. The integration restarts only where an input or a slope changes, or where a sampled controller
+acts. The controller's exact update runs at each sample. A plant with Karnopp's friction sticks and slips between events
+that are located (`stick_slip`).
 """
 
 import warnings
@@ -10,17 +11,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.hooks import Contact
+from pneuopt.dynamics.ramps import slopes
 from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable
 from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
 from pneuopt.quantities.arguments import check_argument, check_parameters
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ModelError, PhysicsWarning, check_names, require
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -53,6 +56,7 @@ def simulate(
     *,
     initial: Mapping[str, float] | ArrayLike | None = None,
     t_out: ArrayLike | None = None,
+    intersample: Mapping[str, Intersample] | None = None,
     rtol: float = 1e-10,
     atol: float = 1e-12,
     max_steps: float = MAX_STEPS,
@@ -65,7 +69,8 @@ def simulate(
         A loop with a sampled PID takes its samples at ``inputs.t[0]`` plus whole
         sample times.
     inputs : Trajectory
-        A column an input of the model, held from each of its instants to the next; others are not read.
+        A column an input of the model, held from each of its instants to the next, unless `intersample` says otherwise;
+        others are not read.
     parameters : ParameterSet
         A missing one keeps the model's default.
     initial : mapping of state to value, or array of shape (n_states,), optional
@@ -74,6 +79,8 @@ def simulate(
         plant knows no rest.
     t_out : array_like, shape (n,), optional
         Instants to report [s], within the inputs' time; by default those of the inputs.
+    intersample : mapping of str to Intersample, optional
+        By input, whether it is held or runs linearly to the next instant, as a measured force; absent ones are held.
     rtol, atol : float
         Tolerances of a step; atol is relative to each state's nominal value.
     max_steps : float
@@ -107,7 +114,7 @@ def simulate(
     0.632121
     """
     _check_samples(as_runnable(model, "model"), inputs, max_steps)
-    run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol))
+    run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), intersample=intersample)
     warn_contacts(met)
     return run.trajectory()
 
@@ -119,6 +126,7 @@ def simulate_stick_slip(
     *,
     initial: Mapping[str, float] | ArrayLike | None = None,
     t_out: ArrayLike | None = None,
+    intersample: Mapping[str, Intersample] | None = None,
     rtol: float = 1e-10,
     atol: float = 1e-12,
 ) -> StickSlipResult:
@@ -139,7 +147,7 @@ def simulate_stick_slip(
     >>> [(round(e.t, 4), e.kind.value) for e in run.events]
     [(0.1, 'breaks away'), (0.4364, 'sticks')]
     """
-    run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol))
+    run, met = _integrate(model, inputs, parameters, initial, t_out, (rtol, atol), intersample=intersample)
     if not isinstance(run, StickSlipIntegration):
         raise ModelError("the model has no Karnopp friction, say ForceDrive(Karnopp(Stribeck())); take simulate")
     warn_contacts(met)
@@ -237,6 +245,7 @@ def _integrate(
     t_out: ArrayLike | None,
     tolerances: tuple[float, float],
     *,
+    intersample: Mapping[str, Intersample] | None = None,
     continues: bool = False,
 ) -> tuple[Integration, tuple[Contact, ...]]:
     model = as_runnable(model, "model")
@@ -248,14 +257,18 @@ def _integrate(
     x = np.array(initial, dtype=float) if continues else initial_state(model, parameters, initial)
     p = parameter_vector(system.parameters, parameters)
     slack = _time_tolerance(inputs.t)
-    breaks, is_sample = _restart_times(inputs.t, u, motion.sample_time, slack)
+    linear = _linear_inputs(system.inputs, intersample or {})
+    slope = slopes(inputs.t, u, linear)
+    breaks, is_sample = _restart_times(inputs.t, np.where(linear, slope, u), motion.sample_time, slack)
     is_sample[0] &= not continues
-    rows = u[np.searchsorted(inputs.t, breaks + slack, side="right") - 1]
+    at_sample = np.searchsorted(inputs.t, breaks + slack, side="right") - 1
+    rows = u[at_sample] + slope[at_sample] * (breaks - inputs.t[at_sample])[:, None]
+    rising = slope[at_sample] if linear.any() else [None] * len(breaks)
     run, done = new_integration(system, p, grid, *tolerances), 0
     watch = LimitMonitor(model.plant, parameters, inputs.t[0], x)
     with watch.report_contacts():
-        for at, end, row, acts in zip(breaks, [*breaks[1:], np.inf], rows, is_sample, strict=True):
-            run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row)
+        for at, end, row, rise, acts in zip(breaks, [*breaks[1:], np.inf], rows, rising, is_sample, strict=True):
+            run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row, rise)
             until = int(np.searchsorted(grid, end - slack))
             for t in grid[done:until]:
                 watch.advance(run, t)
@@ -266,6 +279,12 @@ def _integrate(
                 break
             x, done = watch.advance(run, end), until
     return run, watch.contacts
+
+
+def _linear_inputs(inputs: Sequence[Quantity], intersample: Mapping[str, Intersample]) -> Mask:
+    """Which of a model's inputs run linearly."""
+    check_names("input", intersample, names(inputs), "intersample")
+    return np.array([intersample.get(n) is Intersample.LINEAR for n in names(inputs)], dtype=bool)
 
 
 def input_rows(wanted: Sequence[Quantity], inputs: Trajectory) -> Array:
@@ -294,8 +313,11 @@ def _time_tolerance(t: Array) -> float:
     return float(max(1e-6 * np.min(np.diff(t), initial=1.0), 4 * np.spacing(np.abs(t).max())))
 
 
-def _restart_times(t: Array, u: Array, sample_time: float | None, slack: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Instants at which the integration restarts: the start, changes of an input, samples; and which are samples."""
+def _restart_times(t: Array, u: Array, sample_time: float | None, slack: float) -> tuple[Array, Mask]:
+    """Instants at which the integration restarts: the start, changes of u, samples; and which are samples.
+
+    u is each input that is held, and each slope of one that is linear.
+    """
     changes = t[np.append(True, np.any(u[1:] != u[:-1], axis=1))]
     if sample_time is None:
         return changes, np.zeros(len(changes), dtype=bool)

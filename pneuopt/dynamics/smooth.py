@@ -14,6 +14,7 @@ from scipy import integrate
 
 from pneuopt.dynamics.compiled.rollout import compile_function
 from pneuopt.dynamics.hooks import Contact
+from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.system import System, names
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
@@ -29,8 +30,8 @@ LIMIT_CHECK_PERIOD = 1e-3
 class Integration(Protocol):
     """An integration under way: restarted where an input jumps, advanced from instant to instant, recorded at some."""
 
-    def restart(self, t: float, x: Array, u: Array) -> None:
-        """Begin anew at t from x under the input u."""
+    def restart(self, t: float, x: Array, u: Array, slope: Array | None = None) -> None:
+        """Begin anew at t from x under the input u, which is held, or rises from there on."""
         ...
 
     def advance(self, t: float) -> Array:
@@ -138,18 +139,18 @@ class SmoothIntegration:
     def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
         self._system, self._p, self._ode = system, p, compile_function(system.ode)
         self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
-        self._u = np.zeros(len(system.inputs))
+        self._inputs = Ramp(0.0, np.zeros(len(system.inputs)))
         self._record = Recorder(system, grid)
         scale = np.array([q.nominal for q in system.states])
         options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MAX_INTERNAL_STEPS}
         self._integrator = integrate.ode(self._rate).set_integrator(**options)
 
     def _rate(self, t: float, x: Array) -> Array:
-        return self._ode(self._origin + t, x, self._u, self._p)[0]
+        return self._ode(self._origin + t, x, self._inputs.at(t), self._p)[0]
 
-    def restart(self, t: float, x: Array, u: Array) -> None:
+    def restart(self, t: float, x: Array, u: Array, slope: Array | None = None) -> None:
         """See `Integration`."""
-        self._u = u
+        self._inputs = Ramp(t - self._origin, u, slope)
         self._integrator.set_initial_value(x, t - self._origin)
 
     def advance(self, t: float) -> Array:
@@ -166,7 +167,8 @@ class SmoothIntegration:
 
     def outputs(self) -> Array:
         """See `Integration`."""
-        return self._ode(self._origin + self._integrator.t, self._integrator.y, self._u, self._p)[1]
+        t = self._integrator.t
+        return self._ode(self._origin + t, self._integrator.y, self._inputs.at(t), self._p)[1]
 
     def record(self) -> None:
         """See `Integration`."""

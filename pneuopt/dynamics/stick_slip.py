@@ -18,6 +18,7 @@ import numpy as np
 from scipy import integrate, optimize
 
 from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.smooth import Recorder
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
 from pneuopt.quantities.arrays import Array
@@ -86,9 +87,9 @@ class StickSlipIntegration:
         """The events up to now."""
         return tuple(self._events)
 
-    def restart(self, t: float, x: Array, u: Array) -> None:
+    def restart(self, t: float, x: Array, u: Array, slope: Array | None = None) -> None:
         """See `Integration`."""
-        self._u = u
+        self._inputs = Ramp(t - self._origin, u, slope)
         if abs(x[self._speed]) > self._standstill_speed:
             self._begin_mode(t - self._origin, x, int(np.sign(x[self._speed])))
         else:
@@ -113,7 +114,7 @@ class StickSlipIntegration:
         p = self._p[self._mode or 0]
         if self._mode == 0:
             p = self._with_direction(p, self._balance_direction(self._now, self._x))
-        return self._ode(self._origin + self._now, self._x, self._u, p)[1]
+        return self._ode(self._origin + self._now, self._x, self._inputs.at(self._now), p)[1]
 
     def record(self) -> None:
         """See `Integration`."""
@@ -146,7 +147,7 @@ class StickSlipIntegration:
     def _rate(self, t: float, x: Array) -> Array:
         """Rate of the state; while stuck, the speed's entry is its rate without friction, for the step size to heed."""
         at_rest = x if self._mode else self._with_zero_speed(x)
-        return self._ode(self._origin + t, at_rest, self._u, self._p[self._mode or 0])[0]
+        return self._ode(self._origin + t, at_rest, self._inputs.at(t), self._p[self._mode or 0])[0]
 
     def _step(self) -> None:
         t, x = self._solver.t, np.array(self._solver.y)
@@ -204,13 +205,13 @@ class StickSlipIntegration:
 
         def acceleration(direction: float) -> float:
             p = self._with_direction(self._p[0], direction)
-            return float(self._ode(self._origin + t, x, self._u, p)[0][self._speed])
+            return float(self._ode(self._origin + t, x, self._inputs.at(t), p)[0][self._speed])
 
         return float(optimize.brentq(acceleration, -1.0, 1.0))
 
     def _breakaway_accelerations(self, t: float, x: Array) -> tuple[float, float]:
         """Accelerations that a mass at rest would have if it slid forwards, and backwards [m/s^2]."""
-        forward, backward = self._accelerations(self._origin + t, x, self._u, self._p[0])[0]
+        forward, backward = self._accelerations(self._origin + t, x, self._inputs.at(t), self._p[0])[0]
         return float(forward), float(backward)
 
     def _state_at(self, t: float) -> Array:

@@ -22,6 +22,7 @@ from pneuopt.evaluation.rig import Rig, Sensor
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -33,8 +34,8 @@ class Recording:
     Attributes
     ----------
     experiment : Experiment
-        The log at the rig's samples: commands, references, readings with their noise; "feedback" is the signal that
-        the controller used.
+        The log at the rig's samples: inputs, which are held, references, readings with their noise; "feedback" is the
+        signal that the controller used.
     truth : Trajectory
         States and outputs of the plant at the same instants, "control" after the actuator, and "stuck" with Karnopp's
         friction.
@@ -117,9 +118,10 @@ def record(
     logged |= dict(zip(rig.channels, readings.T, strict=True))
     truth = run.trajectory().with_columns({"control": control})
     warn_contacts(contacts(truth, rig.plant, parameters))
+    held = dict.fromkeys(names(rig.plant.inputs), Intersample.HELD)
     spread = {n: s.standard_deviation for n, s in rig.sensors.items() if s.standard_deviation > 0}
     return Recording(
-        Experiment(Trajectory(log_inputs.t, logged), spread, name=name),
+        Experiment(Trajectory(log_inputs.t, logged), spread, name=name, intersample=held),
         truth.select(n for n in truth.names if not n.startswith("sensor.")),
         run.events if isinstance(run, StickSlipIntegration) else (),
         parameters,

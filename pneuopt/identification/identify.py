@@ -30,6 +30,7 @@ from pneuopt.identification.problem import (
     EstimationProblem,
     apply_conditions,
     as_estimation_model,
+    input_behaviour,
 )
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.review import review_fit
@@ -179,14 +180,15 @@ def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSe
 
 def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
     inputs, known = experiment.trajectory, apply_conditions(fixed, experiment)
+    runs = input_behaviour(system, experiment)
     if not system.states:
-        return simulate(system, inputs, known, initial={})
+        return simulate(system, inputs, known, initial={}, intersample=runs)
     method = LeastSquares()  # over the whole log in one segment, stiction would trap the start in a local optimum
     problem = EstimationProblem(system, (experiment,), fixed, method)
     start = problem.candidates()[0]
     initial = solve_least_squares(problem.transcription(start), method).trajectories[0]
     state = {s.name: float(initial[s.name][0]) for s in system.states}
-    return simulate(system, inputs, known, initial=state)
+    return simulate(system, inputs, known, initial=state, intersample=runs)
 
 
 def _result(

@@ -3,19 +3,22 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.ramps import add_slopes, append_slopes
 from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable
-from pneuopt.dynamics.system import names
+from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.logged_loop import LoggedLoop
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.intersample import Intersample, usual_intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
@@ -50,8 +53,10 @@ class EstimationProblem:
 
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
-        logs = {e.name: Log(e.trajectory, apply_conditions(self.parameters, e)) for e in self.experiments}
-        return self.system.starts(logs)
+        known = {
+            e.name: (apply_conditions(self.parameters, e), input_behaviour(self.system, e)) for e in self.experiments
+        }
+        return self.system.starts({e.name: Log(e.trajectory, *known[e.name]) for e in self.experiments})
 
     def start_from(self, fit: Fit | IdentificationResult, label: str = "fit") -> Start:
         """The start from a fit of these logs; parameters without an estimate begin at their given values."""
@@ -87,13 +92,29 @@ class EstimationProblem:
         parameters = self.unknowns().with_values(candidate.parameters)
         held = {n: replace(parameters[n], value=v, lower=v, upper=v) for n, v in self.held.items()}
         parameters = parameters | ParameterSet(held)
-        return Transcription(self.system.discrete(), parameters, phases, residuals)
+        return Transcription(self._discrete, parameters, phases, residuals)
+
+    @cached_property
+    def _discrete(self) -> DiscreteSystem:
+        """The system's sampled step, to which the slopes of all inputs that are linear in some log are added."""
+        return add_slopes(self.system.discrete(), self._linear)
+
+    @cached_property
+    def _linear(self) -> Mask:
+        """Which inputs are linear between the samples of some log, shape (n_inputs,)."""
+        return np.any([self._rising(e) for e in self.experiments], axis=0)
+
+    def _rising(self, experiment: Experiment) -> Mask:
+        """Which inputs of the sampled step are linear between the samples of this log."""
+        linear = [n for n, kind in input_behaviour(self.system, experiment).items() if kind is Intersample.LINEAR]
+        return np.asarray(np.isin(names(self.system.discrete().inputs), linear))
 
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
         nodes, guess = regular_nodes(len(t), self._samples_a_segment(h)), states.matrix(names(self.system.states))
         driven = self.system.input_matrix(experiment.trajectory, experiment.name)
+        driven = append_slopes(t, driven, self._linear, self._rising(experiment))
         start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
         return Phase(experiment.name, t, h, driven, nodes, start, guess=guess)
 
@@ -116,6 +137,12 @@ def as_estimation_model(model: HasSystem | ClosedLoop | Fittable) -> Fittable:
     """The model as an identification reads it from a log: of a drive its system, of a loop a `LoggedLoop`."""
     runnable = as_runnable(model)
     return LoggedLoop(runnable) if isinstance(runnable, ClosedLoop) else runnable
+
+
+def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Intersample]:
+    """How each of the system's inputs runs between two samples of a log: as the log says, or as is usual."""
+    said = experiment.intersample
+    return {q.name: said.get(q.name) or usual_intersample(q.name, q.unit) for q in system.inputs}
 
 
 def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:

@@ -14,12 +14,10 @@ from pneuopt.logs.columns import CHANNELS, read_channels
 from pneuopt.logs.readers import read_table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, check_names, require
+from pneuopt.quantities.intersample import Intersample, usual_intersample
 from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import read_si, read_value
-
-COMMAND_CHANNELS = ("valve_voltage", "speed_reference", "position_reference")
-"""Channels that a controller holds from sample to sample; the others vary in between."""
 
 
 class Plant(Protocol):
@@ -54,6 +52,9 @@ class Experiment:
         Of the file's bytes, for provenance.
     units : mapping of str to str
         SI units of channels for which `CHANNELS` says none, or another: an angular speed's "rad/s".
+    intersample : mapping of str to Intersample
+        How channels run between two samples, where that is not the usual: a command is held, what is measured is linear
+        (`usual_intersample`).
 
     Raises
     ------
@@ -73,6 +74,7 @@ class Experiment:
     name: str = ""
     sha256: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
+    intersample: Mapping[str, Intersample] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         where = self.name or "experiment"
@@ -83,6 +85,7 @@ class Experiment:
             )
         for parameter, value in self.conditions.items():
             require(math.isfinite(value), f"{where}: condition {parameter!r} must be finite, got {value}")
+        check_names("channel", self.intersample, self.trajectory, f"{where}: intersample")
         object.__setattr__(self, "noise", dict(self.noise))
         object.__setattr__(self, "conditions", dict(self.conditions))
 
@@ -93,11 +96,17 @@ class Experiment:
     def select(self, names: Iterable[str]) -> "Experiment":
         """Keep the named channels, in that order, by copy."""
         kept = self.trajectory.select(names)
-        return replace(self, trajectory=kept, noise={n: s for n, s in self.noise.items() if n in kept})
+        noise = {n: sigma for n, sigma in self.noise.items() if n in kept}
+        intersample = {n: kind for n, kind in self.intersample.items() if n in kept}
+        return replace(self, trajectory=kept, noise=noise, intersample=intersample)
 
     def with_noise(self, noise: Mapping[str, float]) -> "Experiment":
         """Give the named channels a standard deviation [SI], by copy."""
         return replace(self, noise={**self.noise, **noise})
+
+    def with_intersample(self, intersample: Mapping[str, Intersample]) -> "Experiment":
+        """Say how the named channels run between two samples, by copy."""
+        return replace(self, intersample={**self.intersample, **intersample})
 
     def with_conditions(self, conditions: Mapping[str, float]) -> "Experiment":
         """Override the named parameters [SI] in this log, by copy."""
@@ -124,7 +133,8 @@ def read_log(
         `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied, or an encoder's "8192 count/rev"). Without
         either, the header has to say "position [mm]" or "position_mm".
     sidecar : str or Path, optional
-        TOML with [columns], [noise], [conditions]; by default the file of the same name, if there is one.
+        TOML with [columns], [noise], [conditions], [intersample] (force = "held", or "linear"); by default the file of
+        the same name, if there is one.
     plant : System, optional
         Its inputs and outputs, and their references, are channels in its units, beside and before the usual ones:
         torque [N*m] and angle [rad], say.
@@ -149,7 +159,8 @@ def read_log(
     conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
     noise = _read_noise(sections.get("noise", {}), trajectory, f"{side}: noise", channels)
     own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
-    return Experiment(trajectory, noise, conditions, path.stem, sha256, own)
+    between = _read_intersample(sections.get("intersample", {}), trajectory, f"{side}: intersample")
+    return Experiment(trajectory, noise, conditions, path.stem, sha256, own, between)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
@@ -193,7 +204,7 @@ def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
 
 
 def resample(experiment: Experiment, step: float) -> Experiment:
-    """Bring onto a uniform grid: commands hold their last value, other channels are interpolated linearly.
+    """Bring onto a uniform grid: channels that are held keep their last value, others are interpolated linearly.
 
     Parameters
     ----------
@@ -217,7 +228,8 @@ def resample(experiment: Experiment, step: float) -> Experiment:
     grid[-1] = min(grid[-1], old.t[-1])
     # A grid point that rounding puts just before its sample still belongs to that sample.
     held = np.searchsorted(old.t, grid + 1e-9 * step, side="right") - 1
-    values = {n: c[held] if n in COMMAND_CHANNELS else np.interp(grid, old.t, c) for n, c in old.values.items()}
+    runs = {n: experiment.intersample.get(n) or usual_intersample(n, experiment.unit(n)) for n in old}
+    values = {n: np.interp(grid, old.t, c) if runs[n] is Intersample.LINEAR else c[held] for n, c in old.values.items()}
     return replace(experiment, trajectory=Trajectory(grid, values))
 
 
@@ -301,7 +313,7 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
         raise LogError(f"{side}: not valid TOML: {error}") from None
     other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
     require(sidecar is not None or "drive" not in sections, other, LogError)
-    check_names("key", sections, ("columns", "noise", "conditions"), str(side))
+    check_names("key", sections, ("columns", "noise", "conditions", "intersample"), str(side))
     for key, section in sections.items():
         require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
     return side, sections
@@ -319,3 +331,15 @@ def _read_noise(
     check_names("channel", entries, trajectory, where)
     # A noise is a difference, so a pressure's takes no (a) or (g).
     return {c: read_value(v, channels[c].partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}
+
+
+def _read_intersample(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, Intersample]:
+    check_names("channel", entries, trajectory, where)
+    known = {kind.value: kind for kind in Intersample}
+    for channel, word in entries.items():
+        require(
+            isinstance(word, str) and word in known,
+            f"{where}.{channel} is {word!r}; it must be " + " or ".join(map(repr, known)),
+            LogError,
+        )
+    return {channel: known[word] for channel, word in entries.items()}

@@ -59,7 +59,8 @@ class Fitted:
 
 
 def main(path: Path) -> "pd.DataFrame":
-    windows = po.split(po.read_log(path, columns=COLUMNS), WINDOW)
+    log = po.read_log(path, columns=COLUMNS)
+    windows = po.split(log.with_intersample({"force": po.Intersample.HELD}), WINDOW)  # the drive's command
     claims = [
         Claim("windows", len(windows)),
         Claim("smoothing", SMOOTHING, "m/s", bound="<= 1e-3"),

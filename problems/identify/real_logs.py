@@ -128,7 +128,10 @@ def wrong_noise(draws: int = 40) -> list[Claim]:
     truth = system.parameters.with_values({"load.mass": 3.0, "friction.coulomb": 30.0, "friction.viscous": 60.0})
     free, t = ("load.mass", "friction.coulomb", "friction.viscous"), np.arange(1000) * 1e-3
     push = 50 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t)
-    run = po.simulate(system, po.Trajectory(t, {"force": push}), truth).select(["position", "speed"])
+    linear = {"force": po.Intersample.LINEAR}  # as a measured force is read
+    run = po.simulate(system, po.Trajectory(t, {"force": push}), truth, intersample=linear).select(
+        ["position", "speed"]
+    )
     run, claims = run.with_columns({"force": push}), []
     cases = {"right": (1.0, False), "too_large": (10.0, False), "too_small": (0.1, False), "estimated": (10.0, True)}
     for name, (factor, estimated) in cases.items():

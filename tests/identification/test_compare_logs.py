@@ -11,6 +11,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import LogError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
@@ -22,7 +23,12 @@ def pushed(name: str, seed: int, **other: float) -> Experiment:
     t = np.arange(1000) * 1e-3
     force = 50 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t + seed)
     truth = {**TRUTH, **{n.replace("__", "."): v for n, v in other.items()}}
-    run = simulate(DRIVE, Trajectory(t, {"force": force}), DRIVE.parameters.with_values(truth))
+    run = simulate(
+        DRIVE,
+        Trajectory(t, {"force": force}),
+        DRIVE.parameters.with_values(truth),
+        intersample={"force": Intersample.LINEAR},
+    )
     noisy = run["position"] + 2e-5 * np.random.default_rng(seed).standard_normal(t.size)
     return Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": 2e-5}, name=name)
 

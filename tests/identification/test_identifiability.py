@@ -15,6 +15,7 @@ from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, Stribeck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -26,7 +27,7 @@ def pushed(friction: FrictionModel, force: Array = SWING, **values: float) -> tu
     """A drive under a known force, 20 um of noise on its position."""
     drive = ForceDrive(friction)
     truth = drive.parameters.with_values({n.replace("__", "."): v for n, v in values.items()})
-    run = simulate(drive.system(), Trajectory(TIME, {"force": force}), truth)
+    run = simulate(drive.system(), Trajectory(TIME, {"force": force}), truth, intersample={"force": Intersample.LINEAR})
     noisy = run["position"] + 2e-5 * np.random.default_rng(0).standard_normal(TIME.size)
     return truth, Experiment(Trajectory(TIME, {"force": force, "position": noisy}), {"position": 2e-5}, name="run")
 

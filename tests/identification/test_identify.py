@@ -18,6 +18,7 @@ from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
+from pneuopt.quantities.intersample import Intersample, usual_intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
@@ -34,13 +35,21 @@ NOISE = {"position": 2e-5, "speed": 1e-3, "force": 0.2}
 def generated(
     system: System, inputs: Mapping[str, Array], t: Array, truth: Mapping[str, float], seed: int, *channels: str
 ) -> Experiment:
-    """A noisy log from rest, by 40 steps of RK4 a sample; never the estimator's own steps."""
+    """A noisy log from rest, by 40 steps of RK4 a sample; never the estimator's own steps.
+
+    Within a sample each step has an input of its own where that is not held.
+    """
     sampled, rng = discretise(system), np.random.default_rng(seed)
     known = {n: v for n, v in truth.items() if n in system.parameters}
     p = parameter_vector(system.parameters, system.parameters.with_values(known))
     u, h = np.column_stack(list(inputs.values())), np.append(np.diff(t), t[-1] - t[-2])
+    linear = [usual_intersample(q.name, q.unit) is Intersample.LINEAR for q in system.inputs]
+    rise = np.where(linear, np.diff(u, axis=0, append=u[-1:]), 0.0)
+    within = (np.arange(40) + 0.5) / 40
+    fine_u = (u[:, None] + within[:, None] * rise[:, None]).reshape(-1, u.shape[1])
+    fine_h, fine_t = np.repeat(h / 40, 40), (t[:, None] + h[:, None] * np.arange(40) / 40).ravel()
     x0 = np.zeros((1, len(system.states)))
-    y = Rollout(Pieces(sampled.step)).run(x0, u[None], p, t[None], h[None], substeps=40).y[0]
+    y = Rollout(Pieces(sampled.step)).run(x0, fine_u[None], p, fine_t[None], fine_h[None]).y[0, ::40]
     found = dict(zip(names(system.outputs), y.T, strict=True))
     noisy = {c: found[c] + NOISE[c] * rng.standard_normal(t.size) for c in channels}
     return Experiment(Trajectory(t, {**inputs, **noisy}), name=f"run {seed}")

@@ -13,6 +13,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
@@ -24,7 +25,12 @@ FREE = DRIVE.parameters.freed(*TRUTH)
 def exact() -> Trajectory:
     t = np.arange(1000) * 1e-3
     force = 50 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t)
-    run = simulate(DRIVE, Trajectory(t, {"force": force}), DRIVE.parameters.with_values(TRUTH))
+    run = simulate(
+        DRIVE,
+        Trajectory(t, {"force": force}),
+        DRIVE.parameters.with_values(TRUTH),
+        intersample={"force": Intersample.LINEAR},
+    )
     return run.select(["position", "speed"]).with_columns({"force": force})
 
 

@@ -11,6 +11,7 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 
@@ -20,7 +21,9 @@ DRIVE = ForceDrive(Viscous())
 
 def problem() -> EstimationProblem:
     force = 50 * np.sin(20 * TIME)
-    run = simulate(DRIVE.system(), Trajectory(TIME, {"force": force}), DRIVE.parameters)
+    run = simulate(
+        DRIVE.system(), Trajectory(TIME, {"force": force}), DRIVE.parameters, intersample={"force": Intersample.LINEAR}
+    )
     log = Experiment(Trajectory(TIME, {"force": force, "position": run["position"]}), {"position": 1e-5}, name="run")
     free = DRIVE.parameters.freed("load.mass", "friction.viscous")
     return EstimationProblem(DRIVE.system(), (log,), free, LeastSquares())

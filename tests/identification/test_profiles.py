@@ -14,6 +14,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.errors import InputError, UnknownNameError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
@@ -58,7 +59,7 @@ def test_of_a_drive_with_soft_gaps_it_is_the_linear_interval() -> None:
     truth = ForceDrive(Coulomb()).parameters.with_values({"load.mass": 3.0})
     t = np.arange(0, 1.0, 1e-3)
     force = 60 * np.sin(2 * np.pi * 2 * t) + 30 * np.sin(2 * np.pi * 5 * t)
-    run = simulate(system, Trajectory(t, {"force": force}), truth)
+    run = simulate(system, Trajectory(t, {"force": force}), truth, intersample={"force": Intersample.LINEAR})
     noisy = run["position"] + 2e-5 * np.random.default_rng(0).standard_normal(t.size)
     log = Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": 2e-5}, name="run")
     result = identify(system, [log], truth.freed("load.mass", "friction.coulomb", "friction.viscous"))

@@ -16,6 +16,7 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import LuGre, Stribeck
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -41,7 +42,9 @@ DRIVE = ForceDrive(LuGre())
 @cache
 def slide(seed: int = 0) -> Experiment:
     """A LuGre drive that slides one way, always fast, with 20 um of noise on its position."""
-    run = simulate(DRIVE.system(), Trajectory(TIME, {"force": FORCE}), DRIVE.parameters)
+    run = simulate(
+        DRIVE.system(), Trajectory(TIME, {"force": FORCE}), DRIVE.parameters, intersample={"force": Intersample.LINEAR}
+    )
     noisy = run["position"] + 2e-5 * np.random.default_rng(seed).standard_normal(TIME.size)
     log = Trajectory(TIME, {"force": FORCE, "position": noisy})
     return Experiment(log.rows(300, TIME.size), {"position": 2e-5}, name="slide")

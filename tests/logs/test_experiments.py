@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
 from pneuopt.quantities.errors import InputError, LogError, UnitError, UnknownNameError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, si_conversion
 
@@ -363,3 +364,22 @@ def test_an_experiment_is_checked_and_edited_by_copy() -> None:
         run.with_noise({"position": 0.0})
     with pytest.raises(InputError, match=r"condition 'load\.mass' must be finite"):
         run.with_conditions({"load.mass": float("nan")})
+
+
+def test_a_sidecar_says_how_channels_run_between_samples(tmp_path: Path) -> None:
+    log = read_log(written(tmp_path, HEADER + BODY, '[intersample]\nposition = "held"\n'))
+    assert log.intersample == {"position": Intersample.HELD}
+    assert log.select([n for n in log.trajectory if n != "position"]).intersample == {}
+    assert log.with_intersample({"position": Intersample.LINEAR}).intersample == {"position": Intersample.LINEAR}
+    for wrong in ('"foh"', "1", '["held"]'):
+        with pytest.raises(LogError, match=r"intersample\.position is .*; it must be 'held' or 'linear'"):
+            read_log(written(tmp_path, HEADER + BODY, f"[intersample]\nposition = {wrong}\n"))
+    with pytest.raises(UnknownNameError, match="positoin"):
+        read_log(written(tmp_path, HEADER + BODY, '[intersample]\npositoin = "held"\n'))
+
+
+def test_resample_holds_what_is_said_to_be_held() -> None:
+    plain = ramp()
+    held = resample(plain.with_intersample({"position": Intersample.HELD}), 2.5e-3)
+    assert not np.array_equal(held.trajectory["position"], resample(plain, 2.5e-3).trajectory["position"])
+    assert set(held.trajectory["position"]) <= set(plain.trajectory["position"])

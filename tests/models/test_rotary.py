@@ -18,6 +18,7 @@ from pneuopt.models.friction import Coulomb, LuGre, PressureDependent
 from pneuopt.models.load_dependent import LoadDependent
 from pneuopt.models.rotary import RotaryDrive
 from pneuopt.quantities.errors import LogError, ModelError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import tune
 
@@ -49,7 +50,12 @@ def servo(tmp_path_factory: pytest.TempPathFactory) -> tuple[RotaryDrive, Identi
     assert isinstance(drive, RotaryDrive)
     t = np.arange(2000) * 1e-3
     torque = 0.5 * np.sin(2 * np.pi * 1.5 * t) + 0.25 * np.sin(2 * np.pi * 4.3 * t)
-    run = simulate(drive.system(), Trajectory(t, {"torque": torque}), given.with_values(TRUTH))
+    run = simulate(
+        drive.system(),
+        Trajectory(t, {"torque": torque}),
+        given.with_values(TRUTH),
+        intersample={"torque": Intersample.LINEAR},
+    )
     counts = np.floor(run["angle"] / (2 * np.pi) * COUNTS + 0.5)
     rows = "\n".join(f"{1e3 * s:.9g},{1e3 * m:.9g},{n:.0f}" for s, m, n in zip(t, torque, counts, strict=True))
     (folder / "run.csv").write_text(f"t [ms],torque [N*mm],encoder\n{rows}\n", encoding="utf-8")
@@ -107,7 +113,9 @@ def test_the_torque_is_the_load_of_load_dependent_friction() -> None:
     assert parameters["friction.load_rounding"].unit == "N*m"
     t = np.arange(2000) * 1e-3
     torque = 0.9 * np.sin(2 * np.pi * 1.5 * t) + 0.6 * np.sin(2 * np.pi * 4.3 * t)
-    run = simulate(drive.system(), Trajectory(t, {"torque": torque}), parameters)
+    run = simulate(
+        drive.system(), Trajectory(t, {"torque": torque}), parameters, intersample={"torque": Intersample.LINEAR}
+    )
     noise = 1e-3 * np.random.default_rng(0).standard_normal(t.size)
     log = Experiment(Trajectory(t, {"torque": torque, "angle": run["angle"] + noise}))
     known = drive.parameters.with_values({"load.inertia": 2e-3, "friction.load_rounding": 0.02})

@@ -16,6 +16,7 @@ from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.sensing import coarse_delay, with_sensors
 from pneuopt.quantities.errors import UnknownNameError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory
 
 TRUTH = {"load.mass": 3.0, "load.force": 5.0, "friction.coulomb": 30.0, "friction.viscous": 60.0}
@@ -27,7 +28,12 @@ def pushed(seed: int = 0, late: int = 0, off: float = 0.0, n: int = 1500) -> Exp
     """A log of a force-driven load whose position comes whole samples late, and whose speed is off."""
     t = np.arange(n + late) * 1e-3
     force = 50 * np.sin(2 * np.pi * t + seed) + 40 * np.sin(2 * np.pi * 2.3 * t)
-    run = simulate(DRIVE, Trajectory(t, {"force": force}), DRIVE.parameters.with_values(TRUTH))
+    run = simulate(
+        DRIVE,
+        Trajectory(t, {"force": force}),
+        DRIVE.parameters.with_values(TRUTH),
+        intersample={"force": Intersample.LINEAR},
+    )
     random = np.random.default_rng(seed)
     columns = {"force": force[late:], "position": run["position"][:n], "speed": run["speed"][late:] + off}
     noisy = {c: columns[c] + s * random.standard_normal(n) for c, s in NOISE.items()}

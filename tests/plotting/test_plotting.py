@@ -34,6 +34,7 @@ from pneuopt.plotting import (
     save_figure,
 )
 from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
@@ -67,7 +68,9 @@ def fit_of(
 def fitted(seed: int = 0) -> tuple[Experiment, Trajectory]:
     t = np.arange(0, 1.0, 2e-3)
     force = 80 * np.sin(2 * np.pi * 1.5 * t + seed)
-    run = simulate(DRIVE.system(), Trajectory(t, {"force": force}), TRUTH, rtol=1e-6)
+    run = simulate(
+        DRIVE.system(), Trajectory(t, {"force": force}), TRUTH, rtol=1e-6, intersample={"force": Intersample.LINEAR}
+    )
     return Experiment(Trajectory(t, {"force": force, "position": run["position"]}), name=f"run_{seed}"), run
 
 

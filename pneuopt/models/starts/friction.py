@@ -53,7 +53,7 @@ def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[S
         If a log has neither position nor speed.
     """
     rows = {}
-    for name, (measured, parameters) in logs.items():
+    for name, (measured, parameters, _) in logs.items():
         position, speed, acceleration = filter_motion(measured)
         columns, states = load_columns(parameters, position, acceleration), {"position": position, "speed": speed}
         rows[name] = RegressionRows(measured, parameters, speed, measured["force"], columns, states)
@@ -63,7 +63,7 @@ def force_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[S
 def motion_starts(friction: FrictionModel, logs: Mapping[str, Log]) -> Sequence[Start]:
     """Starts of a `MotionDrive`: parameters from the measured force at the imposed speed and pressure."""
     rows = {}
-    for name, (measured, parameters) in logs.items():
+    for name, (measured, parameters, _) in logs.items():
         force, rig = measured["force"], {"rig.force_offset": np.ones(len(measured))}
         if "rig.area" in parameters:
             push = parameters.value("rig.area") * (measured["pressure_a"] - parameters.value("ambient.pressure"))

@@ -14,6 +14,7 @@ from scipy import optimize, signal
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
@@ -161,7 +162,9 @@ def _resample_log(name: str, log: Log, source: str, output: str) -> _EvenLog:
     require(len(t) >= MIN_START_SAMPLES, few, LogError)
     step = float(np.median(np.diff(t)))
     grid = t[0] + step * np.arange(int((t[-1] - t[0]) / step + 1e-6) + 1)
-    held = u[np.searchsorted(t, grid + 1e-3 * step, side="right") - 1]
+    linear = log.intersample.get(source) is Intersample.LINEAR
+    # the mean over a sample stands for a line, to the second order
+    held = np.interp(grid + step / 2, t, u) if linear else u[np.searchsorted(t, grid + 1e-3 * step, side="right") - 1]
     even = np.interp(grid, t, y)
     noise = 1.4826 * np.median(np.abs(np.diff(even))) + 1e-3 * np.ptp(even) + 1e-300
     known_gain = None if gain.free else gain.value

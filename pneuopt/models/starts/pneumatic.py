@@ -85,7 +85,7 @@ class PneumaticLog:
     """A log with its filtered motion and pressures, and the states that follow from them for a given valve."""
 
     def __init__(self, log: Log, simulator_for: Callable[[tuple[str, ...]], AirSimulator], push: AirForce) -> None:
-        self.measured, self.parameters = log
+        self.measured, self.parameters = log.measured, log.parameters
         self._simulator_for, self._air_force = simulator_for, push
         position, speed, self._acceleration = filter_motion(self.measured)
         if "position" not in self.measured:

@@ -136,7 +136,7 @@ def _rate_sum_of_squares(log: Log, name: str) -> float:
 
 def _shift_zero(log: Log, remedy: ZeroShift) -> Log:
     """Log with the zero points shifted by whole atmospheres."""
-    measured, p = log
+    measured, p = log.measured, log.parameters
     measured = measured.with_columns({n: measured[n] + remedy.sensors * ATMOSPHERE for n in _pressure_channels(log)})
     moved = {SUPPLY_PRESSURE: p.value(SUPPLY_PRESSURE) + remedy.supply * ATMOSPHERE}
     return Log(measured, p.with_bounds(dict.fromkeys(moved, (0.0, math.inf))).with_values(moved))
