@@ -1,15 +1,80 @@
-"""`noise_level`: the standard deviation of a channel's white noise, estimated from the channel alone."""
+"""`estimate_noise`: a channel's white noise and its resolution, from itself alone; `noise_level`: what a fit counts.
 
+A difference of k-th order cancels any motion that is a polynomial below that order over k + 1 samples, and keeps white
+noise. Which order a log needs depends on how fast it moves for its sampling, so all are tried, in blocks of the log.
+"""
+
+import functools
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.quantities.arrays import Array
 
+ORDERS = (
+    1,
+    2,
+    3,
+    4,
+    6,
+    8,
+    10,
+)  # of the differences; without the high ones motion at a tenth of the rate counts as noise
+# Differences of a block; shorter blocks have uncertain levels, longer ones leave none that is quiet.
+BLOCK = 100
+MIN_BLOCKS = 4  # with fewer a quarter of them is none
+QUIET_QUARTILE = -0.674  # of a normal variable: a quarter of the blocks need to be quiet
+MAD_SPREAD = 1.17  # standard deviation of the median absolute deviation of n normal numbers, over itself, times sqrt(n)
+# Distance of a value from the lattice of a resolution, in its steps [1]: rounded decimals lie nearer, noise farther.
+LATTICE_TOLERANCE = 0.02
+ROUNDING = 1e-12  # share of the largest value [1] that is rounding of doubles; above, fine steps are missed
+
+
+class NoiseEstimate(NamedTuple):
+    """What a channel shows of its noise.
+
+    Attributes
+    ----------
+    random : float
+        Standard deviation of its white noise [unit of the channel]; NaN for a constant channel.
+    resolution : float
+        Step of the lattice on which its values lie [unit of the channel]; 0 where they lie on none.
+    """
+
+    random: float
+    resolution: float
+
+    @property
+    def level(self) -> float:
+        """Standard deviation [unit of the channel], at least the step / sqrt(12) of a rounding to the resolution."""
+        return max(self.random, self.resolution / math.sqrt(12))
+
+    @property
+    def is_quantisation(self) -> bool:
+        """Whether the resolution is what limits the channel."""
+        return self.resolution > math.sqrt(12) * self.random
+
 
 def noise_level(column: ArrayLike, t: ArrayLike | None = None) -> float:
-    """Estimate white noise from the distances of samples from the line through their neighbours.
+    """The standard deviation of a channel's white noise or of its rounding, the larger one; see `estimate_noise`.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> round(noise_level(np.sin(np.linspace(0, 6, 4000)) + 0.01 * rng.standard_normal(4000)), 3)
+    0.01
+    """
+    return estimate_noise(column, t).level
+
+
+def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstimate:
+    """Estimate white noise and resolution from a channel alone.
+
+    The level is that of the lowest order of differences which shows hardly more than the least of all orders, in the
+    quietest quarter of the log. Motion slower than a tenth of the sampling rate does not count, nor do steps and
+    outliers.
 
     Parameters
     ----------
@@ -20,33 +85,100 @@ def noise_level(column: ArrayLike, t: ArrayLike | None = None) -> float:
 
     Returns
     -------
-    float
-        Standard deviation [unit of the channel]: 1.4826 times the median absolute deviation of those distances, each
-        divided by the deviation that unit noise gives it. Motion much slower than the sampling hardly changes it. It is
-        at least q / sqrt(12), the deviation of a rounding to the resolution q, the smallest difference between two
-        samples. NaN for a constant channel, which shows no noise.
+    NoiseEstimate
+    """
+    y = np.asarray(column, dtype=float)
+    time = np.arange(y.size, dtype=float) if t is None else _without_rounding(np.asarray(t, dtype=float))
+    known = np.isfinite(y)
+    if not np.any(np.diff(y[known])):
+        return NoiseEstimate(math.nan, 0.0)
+    resolution = find_resolution(y[known])
+    # a lattice leaves medians on its steps; a uniform dither of its step takes them off, and its variance is known
+    dithered = y + resolution * (np.random.default_rng(0).random(y.size) - 0.5)
+    levels = _levels(time, dithered) or _levels(time[known], dithered[known])  # every other sample may be missing
+    level = next(found for found, tolerance in levels if found <= (1 + tolerance) * min(f for f, _ in levels))
+    return NoiseEstimate(math.sqrt(max(level**2 - resolution**2 / 12, 0.0)), resolution)
+
+
+def find_resolution(values: ArrayLike) -> float:
+    """The step of the lattice on which all values lie, as an encoder's do; 0 where there is none.
+
+    Parameters
+    ----------
+    values : array_like, shape (n,)
 
     Examples
     --------
-    >>> rng = np.random.default_rng(0)
-    >>> round(noise_level(np.sin(np.linspace(0, 6, 4000)) + 0.01 * rng.standard_normal(4000)), 3)
-    0.01
+    >>> x = np.cumsum(np.linspace(0.0, 0.3, 50))
+    >>> round(find_resolution(np.round(x / 0.02) * 0.02), 9), find_resolution(x)
+    (0.02, 0.0)
     """
-    column = np.asarray(column, dtype=float)
-    time = np.arange(column.size, dtype=float) if t is None else np.asarray(t, dtype=float)
-    known = np.isfinite(column)
-    steps = np.abs(np.diff(column[known]))
-    if not np.any(steps > 0):
-        return math.nan
-    off = _line_deviation(time, column)  # not across a hole, as long as some samples have both neighbours
-    off = off[np.isfinite(off)] if np.isfinite(off).any() else _line_deviation(time[known], column[known])
-    random = 1.4826 * float(np.median(np.abs(off - np.median(off)))) if off.size else 0.0
-    resolution = float(np.min(steps[steps > 1e-9 * np.max(steps)])) / math.sqrt(12)
-    return max(random, resolution)
+    values = np.asarray(values, dtype=float)
+    smallest = ROUNDING * float(np.max(np.abs(values), initial=0.0))
+    # second differences are on the same lattice, and small however fast the motion is; of a perfect ramp there are none
+    for order in (2, 1):
+        sizes = np.sort(np.abs(np.diff(values, order)))
+        gaps = np.diff(sizes, prepend=0.0)
+        gaps = gaps[gaps > smallest]
+        if gaps.size:
+            break
+    else:
+        return 0.0
+    step, offsets = float(gaps.min()), values - values[0]
+    counts = np.round(offsets / step)
+    step = float(offsets @ counts / (counts @ counts)) if counts.any() else 0.0
+    lies_on = float(np.max(np.abs(offsets - step * counts))) < LATTICE_TOLERANCE * step
+    return step if lies_on and smallest < LATTICE_TOLERANCE * step else 0.0
 
 
-def _line_deviation(t: Array, y: Array) -> Array:
-    """Distance of inner samples from the line through their neighbours, scaled to the noise of one sample."""
-    left = (t[2:] - t[1:-1]) / (t[2:] - t[:-2])
-    distance = y[1:-1] - left * y[:-2] - (1 - left) * y[2:]
-    return np.asarray(distance / np.sqrt(1 + left**2 + (1 - left) ** 2))
+def _without_rounding(t: Array) -> Array:
+    """The time, counted in samples where they are even but for the rounding of doubles: coarse from 1.7e9 s on."""
+    steps = np.diff(t)
+    rounding = max(1e-6 * np.max(steps, initial=0.0), 4 * np.spacing(np.max(np.abs(t), initial=0.0)))
+    even = not steps.size or np.ptp(steps) <= rounding
+    return np.arange(t.size, dtype=float) if even else t - t[0]
+
+
+def _levels(t: Array, y: Array) -> list[tuple[float, float]]:
+    """By order of difference, the standard deviation of white noise that would show as much, and its uncertainty."""
+    out = []
+    for order in (k for k in ORDERS if 2 * k < y.size):
+        off = _differences(t, y, order)
+        off = off[np.isfinite(off)]
+        if off.size > order:
+            out.append(_quiet_level(off, order))
+    return out
+
+
+def _quiet_level(off: Array, order: int) -> tuple[float, float]:
+    """The deviation of all differences, or of the quietest quarter of the blocks where that is certainly less.
+
+    Returns
+    -------
+    level, uncertainty : float
+        The uncertainty is the level's standard deviation by chance, over the level.
+    """
+    # neighbours share samples: this many count as one
+    shared = math.comb(4 * order, 2 * order) / math.comb(2 * order, order) ** 2
+    uncertainty = MAD_SPREAD * math.sqrt(shared / off.size)
+    whole = 1.4826 * float(np.median(np.abs(off)))
+    blocks = np.array_split(off, max(1, off.size // BLOCK))
+    if len(blocks) < MIN_BLOCKS:
+        return whole, uncertainty
+    deviations = [1.4826 * float(np.median(np.abs(block))) for block in blocks]
+    quiet = float(np.quantile(deviations, 0.25)) / (1 + QUIET_QUARTILE * uncertainty * math.sqrt(len(blocks)))
+    return whole if whole < (1 + 4 * uncertainty) * quiet else quiet, uncertainty
+
+
+def _differences(t: Array, y: Array, order: int) -> Array:
+    """Differences of an order, each scaled to the noise of one sample; NaN beside a missing sample."""
+    steps = np.diff(t)
+    if np.ptp(steps) == 0:
+        return np.asarray(np.diff(y, order) / math.sqrt(math.comb(2 * order, order)))
+    n, usual = y.size - order, float(np.median(steps))
+    times, total, squares = [t[j : j + n] / usual for j in range(order + 1)], np.zeros(n), np.zeros(n)
+    for j in range(order + 1):
+        others = [times[j] - times[m] for m in range(order + 1) if m != j]
+        weight = 1 / functools.reduce(np.multiply, others)
+        total, squares = total + weight * y[j : j + n], squares + weight**2
+    return np.asarray(total / np.sqrt(squares))

@@ -25,12 +25,7 @@ FREE = DRIVE.parameters.freed(*TRUTH)
 def exact() -> Trajectory:
     t = np.arange(1000) * 1e-3
     force = 50 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t)
-    run = simulate(
-        DRIVE,
-        Trajectory(t, {"force": force}),
-        DRIVE.parameters.with_values(TRUTH),
-        intersample={"force": Intersample.LINEAR},
-    )
+    run = simulate(DRIVE, Trajectory(t, {"force": force}), DRIVE.parameters.with_values(TRUTH))
     return run.select(["position", "speed"]).with_columns({"force": force})
 
 
@@ -40,7 +35,7 @@ RUN = exact()
 def noisy(seed: int) -> Experiment:
     random = np.random.default_rng(seed)
     columns = {n: RUN[n] + s * random.standard_normal(len(RUN)) for n, s in NOISE.items()}
-    return Experiment(RUN.with_columns(columns), NOISE, name=f"run {seed}")
+    return Experiment(RUN.with_columns(columns), NOISE, name=f"run {seed}", intersample={"force": Intersample.HELD})
 
 
 def spoiled(seed: int) -> Experiment:

@@ -1,9 +1,43 @@
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from pneuopt.logs.noise import noise_level
+from pneuopt.logs.noise import estimate_noise, find_resolution, noise_level
+from pneuopt.quantities.arrays import Array
+
+FACTOR = 1.6  # of the level, either way, for logs of 1000 samples and more; a shorter one may be off by `SHORT_FACTOR`
+SHORT_FACTOR = 2.5
+
+
+def staircase(t: Array, _rate: float) -> Array:
+    """Steps of 50 mm to and fro, each settled after 0.1 s, as a position loop makes them."""
+    since = [np.maximum(t - 0.8 * k, 0.0) / 0.02 for k in range(int(t[-1] / 0.8) + 1)]
+    return np.asarray(sum(0.05 * (-1) ** k * (1 - (1 + s) * np.exp(-s)) for k, s in enumerate(since)))
+
+
+def stick_slip(t: Array, _rate: float) -> Array:
+    """Two thirds of the time at rest, with jumps of the acceleration at both ends."""
+    return np.asarray(0.05 * np.cumsum(np.maximum(np.abs(np.sin(4.4 * t)) - 0.85, 0.0)) / t.size)
+
+
+def chirp(t: Array, rate: float) -> Array:
+    """From 0.2 Hz to 20 Hz, or to a tenth of the sampling rate."""
+    end = min(20.0, rate / 10)
+    return np.asarray(0.02 * np.sin(2 * math.pi * (0.2 * t + (end - 0.2) * t**2 / (2 * t[-1]))))
+
+
+MOTIONS: dict[str, Callable[[Array, float], Array]] = {
+    "staircase": staircase,
+    "stick-slip": stick_slip,
+    "chirp": chirp,
+    "cruise": lambda t, _: 0.0987 * t,
+    "sine of 1 Hz": lambda t, _: 0.1 * np.sin(2 * math.pi * t),
+    "rest": lambda t, _: 0.0 * t,
+}
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-2])
@@ -12,6 +46,56 @@ def test_noise_is_told_from_motion(noise: float) -> None:
     column = np.sin(3 * t) + noise * rng.standard_normal(t.size)
     column[rng.random(t.size) < 0.05] = math.nan
     assert noise_level(column) == pytest.approx(noise, rel=0.1)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.sampled_from(sorted(MOTIONS)),
+    st.floats(50, 1e4),
+    st.integers(200, 4000),
+    st.floats(-6.5, -3).map(lambda e: 10**e),
+    st.sampled_from([0.0, 0.1, 1.0, 10.0]),
+    st.booleans(),
+    st.integers(0, 1000),
+)
+def test_the_level_of_white_noise_on_any_motion(
+    motion: str, rate: float, n: int, noise: float, steps: float, jitter: bool, seed: int
+) -> None:
+    """With and without a resolution of `steps` times the noise, from 50 Hz to 10 kHz."""
+    rng = np.random.default_rng(seed)
+    t = (np.arange(n) + (0.3 * rng.random(n) if jitter else 0.0)) / rate
+    y, resolution = MOTIONS[motion](t, rate) + noise * rng.standard_normal(n), steps * noise
+    y = np.round(y / resolution) * resolution if resolution else y
+    if not np.any(np.diff(y)):
+        return
+    found, factor = estimate_noise(y, t if jitter else None), FACTOR if n >= 1000 else SHORT_FACTOR
+    # rounding adds its variance where the noise or the motion spreads it, and at rest stands still
+    low, high = (
+        max(noise if steps < 1 else 0.0, resolution / math.sqrt(12)),
+        math.hypot(noise, resolution / math.sqrt(12)),
+    )
+    assert low / factor < found.level < high * factor
+
+
+@pytest.mark.parametrize("begin", [0.0, 3.0, 1.7e9])
+def test_a_cruise_is_not_noise(begin: float) -> None:
+    """0.1 mm a sample, with 10 nm of noise: the smallest step between two samples is the motion's."""
+    rng = np.random.default_rng(0)
+    t = begin + 1e-3 * np.arange(1000)
+    ramp = 1e-4 * np.arange(1000) + 1e-8 * rng.standard_normal(1000)
+    found = estimate_noise(ramp, t)
+    assert found.level == pytest.approx(1e-8, rel=0.15)
+    assert found.resolution == 0
+
+
+def test_windows_of_250_ms_of_a_fast_servo_read_the_encoder() -> None:
+    """A count of 1 um at up to 0.5 m/s: each window's smallest step is hundreds of counts."""
+    t = np.arange(20_000) * 1e-3
+    axis = np.round((0.1 * np.sin(5 * t) + 2e-7 * np.random.default_rng(0).standard_normal(t.size)) / 1e-6) * 1e-6
+    for k in range(0, t.size, 250):
+        found = estimate_noise(axis[k : k + 250], t[k : k + 250])
+        assert found.resolution == pytest.approx(1e-6, rel=1e-6)
+        assert 1e-6 / math.sqrt(12) / 1.1 < found.level < 2 * 1e-6 / math.sqrt(12)
 
 
 def test_a_step_and_outliers_do_not_count_as_noise() -> None:
@@ -23,7 +107,40 @@ def test_a_step_and_outliers_do_not_count_as_noise() -> None:
 
 def test_quantisation_is_the_floor() -> None:
     t = np.linspace(0, 5, 5000)
-    assert noise_level(np.round(np.sin(t) / 1e-3) * 1e-3) == pytest.approx(1e-3 / math.sqrt(12), rel=1e-6)
+    found = estimate_noise(np.round(np.sin(t) / 1e-3) * 1e-3)
+    assert found.level == pytest.approx(1e-3 / math.sqrt(12), rel=0.05)
+    assert found.is_quantisation
+
+
+def test_noise_beyond_the_resolution_is_no_quantisation() -> None:
+    column = np.round(3e-3 * np.random.default_rng(0).standard_normal(2000), 3)
+    found = estimate_noise(column)
+    assert found.resolution == pytest.approx(1e-3)
+    assert found.level == pytest.approx(math.hypot(3e-3, 1e-3 / math.sqrt(12)), rel=0.1)
+    assert not found.is_quantisation
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.floats(-9, 2).map(lambda e: 10**e), st.floats(-1e3, 1e3), st.integers(20, 500), st.integers(0, 1000))
+def test_the_resolution_of_a_lattice(step: float, origin: float, n: int, seed: int) -> None:
+    """Also of one that begins anywhere, as far as doubles carry its step."""
+    counts = np.random.default_rng(seed).integers(-20, 20, n).cumsum()
+    values = step * (counts + origin)
+    assert find_resolution(values) == pytest.approx(step, rel=1e-6)
+
+
+def test_values_on_no_lattice_have_no_resolution() -> None:
+    rng = np.random.default_rng(0)
+    for n in (10, 100, 10_000):
+        assert find_resolution(rng.standard_normal(n)) == 0
+        assert find_resolution(np.arange(n) * 1e-4 + 1e-8 * rng.standard_normal(n)) == 0
+
+
+def test_every_other_sample_may_be_missing() -> None:
+    t = np.arange(2000) * 1e-3
+    column = np.sin(6 * t) + 1e-3 * np.random.default_rng(0).standard_normal(t.size)
+    column[1::2] = math.nan
+    assert noise_level(column, t) == pytest.approx(1e-3, rel=0.15)
 
 
 @pytest.mark.parametrize("column", [[1.0] * 10, [math.nan] * 10, [2.0], []])
