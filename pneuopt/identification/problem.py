@@ -102,7 +102,7 @@ class EstimationProblem:
     @cached_property
     def _linear(self) -> Mask:
         """Which inputs are linear between the samples of some log, shape (n_inputs,)."""
-        return np.any([self._rising(e) for e in self.experiments], axis=0)
+        return np.logical_or.reduce([self._rising(e) for e in self.experiments])
 
     def _rising(self, experiment: Experiment) -> Mask:
         """Which inputs of the sampled step are linear between the samples of this log."""

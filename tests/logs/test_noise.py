@@ -64,7 +64,8 @@ def test_the_level_of_white_noise_on_any_motion(
     """With and without a resolution of `steps` times the noise, from 50 Hz to 10 kHz."""
     rng = np.random.default_rng(seed)
     t = (np.arange(n) + (0.3 * rng.random(n) if jitter else 0.0)) / rate
-    y, resolution = MOTIONS[motion](t, rate) + noise * rng.standard_normal(n), steps * noise
+    exact, resolution = MOTIONS[motion](np.asarray(t), rate), steps * noise
+    y = exact + noise * rng.standard_normal(n)
     y = np.round(y / resolution) * resolution if resolution else y
     if not np.any(np.diff(y)):
         return
