@@ -97,17 +97,22 @@ class EstimationProblem:
     @cached_property
     def _discrete(self) -> DiscreteSystem:
         """The system's sampled step, to which the slopes of all inputs that are linear in some log are added."""
-        return add_slopes(self.system.discrete(), self._linear)
+        return add_slopes(self._held, self._linear)
+
+    @cached_property
+    def _held(self) -> DiscreteSystem:
+        """The system's sampled step with every input held."""
+        return self.system.discrete()
 
     @cached_property
     def _linear(self) -> Mask:
         """Which inputs are linear between the samples of some log, shape (n_inputs,)."""
-        return np.logical_or.reduce([self._rising(e) for e in self.experiments])
+        return np.asarray(np.logical_or.reduce([self._rising(e) for e in self.experiments]))
 
     def _rising(self, experiment: Experiment) -> Mask:
         """Which inputs of the sampled step are linear between the samples of this log."""
         linear = [n for n, kind in input_behaviour(self.system, experiment).items() if kind is Intersample.LINEAR]
-        return np.asarray(np.isin(names(self.system.discrete().inputs), linear))
+        return np.asarray(np.isin(names(self._held.inputs), linear))
 
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
