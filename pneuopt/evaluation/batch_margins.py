@@ -1,6 +1,7 @@
 """Margins and sensitivity peaks of many loops at once, for searches; `margins` gives one loop's exactly."""
 
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from math import inf, nan
 from typing import Any
 
@@ -14,13 +15,11 @@ from pneuopt.dynamics.system import names
 from pneuopt.evaluation.margins import ComplexArray, are_stable, batch_frequency_response, controller_parts
 from pneuopt.evaluation.operating_points import NOISE_GAIN, counted_points
 from pneuopt.evaluation.requirements import METRICS
+from pneuopt.evaluation.sensitivity_peaks import PEAK_GRID_POINTS, PEAK_REFINEMENTS, sensitivity_peaks
 from pneuopt.quantities.arrays import Array
 
+MAX_SENSITIVITY = "MaxSensitivity"
 Matrices = tuple[Array, Array, Array]  # A, B, C of m plants, shapes (m, n, n), (m, n, 1), (m, 1, n)
-# Finer grids about a coarse peak, each within two steps of the last, and the frequencies of each grid: fewer of either
-# show a sharp resonance too low, more cost time in proportion.
-PEAK_REFINEMENTS = 3
-PEAK_GRID_POINTS = 9
 
 
 MarginFunction = Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]
@@ -50,8 +49,7 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
         checked.
     """
     w = np.asarray(omega, dtype=float)
-    first = {NOISE_GAIN: int(np.searchsorted(w, (1 - 1e-9) * lowest_noise))}
-    plants, command = _plant_responses(loop, w), names(loop.plant.inputs).index(loop.command.name)
+    linearise, command = _plants(loop), names(loop.plant.inputs).index(loop.command.name)
 
     def read_margins(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
         k, m = x.shape[:2]
@@ -59,28 +57,42 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
         return {n: _worst_in_columns(n, v.reshape(k, m)[-counted_points(n, k) :]) for n, v in found.items()}
 
     def read_points(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
-        response, matrices, measured = plants(p, x, u)
-        gains = linear_gains(loop, p.T, measured, u[:, command]).full()
-        Kp, Ki, Kd, Tf = gains[..., None]
-
-        def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
-            a, b = controller_parts((Kp, Ki, Kd, Tf), w)
-            return response(w) * (a + 1j * b), a + 1j * b
-
-        L, C = responses(w)
-        with np.errstate(all="ignore"):
-            found = {n: crossing(L) for n, crossing in _MARGIN_FUNCTIONS.items() if n in only}
-            for n, size in ((n, size) for n, size in _PEAK_FUNCTIONS.items() if n in only):
-                k = first.get(n, 0)
-                found[n] = _refine_peaks(size, responses, w[k:], size(L[:, k:], C[:, k:]))
-        if NOISE_GAIN in only:
-            found[NOISE_GAIN] = np.maximum(found[NOISE_GAIN], np.abs(Kp + Kd / Tf)[:, 0])
-        if "MaxSensitivity" in only:  # at infinity the loop is open
-            found["MaxSensitivity"] = np.maximum(found["MaxSensitivity"], 1.0)
-        stable = are_stable(_closed_loop_poles(matrices, controller_matrices(gains, loop.dead_time)))
+        plants = linearise(p, x, u)
+        gains = linear_gains(loop, p.T, plants.measured, u[:, command]).full()
+        controllers, matrices = controller_matrices(gains, loop.dead_time), plants.with_sensor()
+        closed = _closed_loop_poles(matrices, controllers)
+        if set(only) == {MAX_SENSITIVITY} and not plants.D.any():
+            opened = np.concatenate([_poles(matrices[0]), _poles(controllers[0])], axis=1)
+            found = {MAX_SENSITIVITY: sensitivity_peaks(opened, closed, w[0], w[-1])}
+        else:
+            found = _read_responses(gains, plants.response(loop.dead_time, w), w, lowest_noise, only)
+        if MAX_SENSITIVITY in only:  # at infinity the loop is open
+            found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], 1.0)
+        stable = are_stable(closed)
         return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
 
     return read_margins
+
+
+def _read_responses(
+    gains: Array, plant: Callable[[Array], ComplexArray], w: Array, lowest_noise: float, only: Collection[str]
+) -> dict[str, Array]:
+    """Margins and peaks of loops on frequencies of shape (n,), crossings interpolated and peaks refined."""
+    Kp, Ki, Kd, Tf = gains[..., None]
+
+    def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
+        a, b = controller_parts((Kp, Ki, Kd, Tf), w)
+        return plant(w) * (a + 1j * b), a + 1j * b
+
+    (L, C), noisy = responses(w), int(np.searchsorted(w, (1 - 1e-9) * lowest_noise))
+    with np.errstate(all="ignore"):
+        found = {n: crossing(L) for n, crossing in _MARGIN_FUNCTIONS.items() if n in only}
+        for n, size in ((n, size) for n, size in _PEAK_FUNCTIONS.items() if n in only):
+            k = noisy if n == NOISE_GAIN else 0
+            found[n] = _refine_peaks(size, responses, w[k:], size(L[:, k:], C[:, k:]))
+    if NOISE_GAIN in only:
+        found[NOISE_GAIN] = np.maximum(found[NOISE_GAIN], np.abs(Kp + Kd / Tf)[:, 0])
+    return found
 
 
 def _worst_in_columns(metric: str, values: Array) -> Array:
@@ -115,25 +127,43 @@ def _refine_peaks(
     return np.asarray(largest)
 
 
-def _plant_responses(
-    loop: ClosedLoop, w: Array
-) -> Callable[[Array, Array, Array], tuple[Callable[[Array], ComplexArray], Matrices, Array]]:
-    """Function that gives responses of plants with sensor and hold, A, B, C of plants with sensor, measured signals.
+@dataclass(frozen=True, eq=False)
+class _Plants:
+    """m plants in states scaled by their nominal values, shapes as `PlantMatrices`, and sensors' lags, shape (m, 1)."""
 
-    The responses are functions of frequencies of shape (n,) or (m, n); on the frequencies `w` it is checked that
-    partial fractions are exact enough.
-    """
-    average, scale = AveragedPlant(loop, compiled=True), np.array([s.nominal for s in loop.plant.states])
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    measured: Array
+    lag: Array
 
-    def linearise(p: Array, x: Array, u: Array) -> tuple[Callable[[Array], ComplexArray], Matrices, Array]:
-        A, B, C, D, measured = average(p, x, u)
-        A, B, C = A * scale / scale[:, None], B / scale, C * scale  # so the matrix of eigenvectors is well conditioned
-        plant, lag = _partial_fraction_response(A, B, C, w), np.reshape(loop.sensor_lag(p.T), (-1, 1))
+    def response(self, dead_time: float, typical: Array) -> Callable[[Array], ComplexArray]:
+        """Responses with sensor and hold, a function of frequencies of shape (n,) or (m, n).
+
+        On the frequencies `typical` it is checked that partial fractions are exact enough.
+        """
+        plant = _partial_fraction_response(self.A, self.B, self.C, typical)
 
         def response(w: Array) -> ComplexArray:
-            return np.asarray((plant(w) + D[:, None]) * pade_delay_response(w, loop.dead_time) / (1 + 1j * w * lag))
+            delay = pade_delay_response(w, dead_time)
+            return np.asarray((plant(w) + self.D[:, None]) * delay / (1 + 1j * w * self.lag))
 
-        return response, _add_sensor((A, B[..., None], C[:, None]), lag), measured
+        return response
+
+    def with_sensor(self) -> Matrices:
+        """A, B and C of the plants with their sensors."""
+        return _add_sensor((self.A, self.B[..., None], self.C[:, None]), self.lag)
+
+
+def _plants(loop: ClosedLoop) -> Callable[[Array, Array, Array], _Plants]:
+    """Function that linearises the plants of many loops, as `AveragedPlant` does."""
+    average, scale = AveragedPlant(loop, compiled=True), np.array([s.nominal for s in loop.plant.states])
+
+    def linearise(p: Array, x: Array, u: Array) -> _Plants:
+        A, B, C, D, measured = average(p, x, u)
+        A, B, C = A * scale / scale[:, None], B / scale, C * scale  # so the matrix of eigenvectors is well conditioned
+        return _Plants(A, B, C, D, measured, np.reshape(loop.sensor_lag(p.T), (-1, 1)))
 
     return linearise
 
@@ -153,10 +183,14 @@ def _add_sensor(plant: Matrices, lag: Array) -> Matrices:
 def _closed_loop_poles(plant: Matrices, controller: tuple[Array, Array, Array, Array]) -> ComplexArray:
     """Poles of m loops with negative feedback, shape (m, n); NaN matrices count as unstable."""
     (A, B, C), (Ac, Bc, Cc, Dc) = plant, controller
-    closed = np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]])
-    sound = np.isfinite(closed).all(axis=(1, 2))
-    closed[~sound] = np.eye(closed.shape[-1])
-    return np.asarray(np.linalg.eigvals(closed), dtype=complex)
+    return _poles(np.block([[A - B @ Dc @ C, B @ Cc], [-Bc @ C, Ac]]))
+
+
+def _poles(A: Array) -> ComplexArray:
+    """Eigenvalues of m matrices, shape (m, n); those of NaN matrices are 1."""
+    sound = np.asarray(np.isfinite(A).all(axis=(1, 2)))
+    tame = A if sound.all() else np.where(sound[:, None, None], A, np.eye(A.shape[-1]))
+    return np.asarray(np.linalg.eigvals(tame), dtype=complex)
 
 
 def _gain_margins(L: ComplexArray) -> Array:
@@ -191,7 +225,7 @@ _MARGIN_FUNCTIONS: dict[str, Callable[[ComplexArray], Array]] = {
     "PhaseMargin": _phase_margins,
 }
 _PEAK_FUNCTIONS: dict[str, Callable[[ComplexArray, ComplexArray], Array]] = {
-    "MaxSensitivity": lambda L, _: 1 / np.abs(1 + L),
+    MAX_SENSITIVITY: lambda L, _: 1 / np.abs(1 + L),
     "MaxComplementarySensitivity": lambda L, _: np.abs(L / (1 + L)),
     NOISE_GAIN: lambda L, C: np.abs(C / (1 + L)),
 }
