@@ -30,8 +30,9 @@ RIPPLE_PHASES = 32
 # Newton steps, halved ones included, that the balance of the first harmonic may take. With fewer, a swing across
 # Stribeck's minimum is left unbalanced; more are spent on lanes that have no balance at all.
 MAX_BALANCE_STEPS = 40
-# Step at which the balance counts as solved, a fraction of the swing. Above, Ms is off by as much; below, rounding.
-BALANCE_TOLERANCE = 1e-7
+# Newton step at which the balance counts as solved, a fraction of the swing; what is left is about its square. A larger
+# one shows in Ms (0.01: 1e-4); a smaller one costs a step and changes nothing.
+BALANCE_TOLERANCE = 1e-4
 MIN_BALANCE_FRACTION = 1e-3  # of a Newton step: a swing that a smaller one does not improve is kept as it is
 
 
@@ -135,18 +136,23 @@ class AveragedPlant:
             return best
         point = best.output[:, -1], u[:, names(loop.plant.inputs).index(loop.command.name)]
         waves = replace(waves, feedback=controller_response(loop, p, waves.frequency, *point))
-        step, size = _newton_step(best, waves)
+        left = _imbalance(best, waves)
+        step, size = _newton_step(best, waves, left), np.linalg.norm(left, axis=1)
         fraction, k = np.ones(len(x)), np.arange(len(x))
         for _ in range(MAX_BALANCE_STEPS):
             moved = fraction[k, None] * step[k]
             trial = self._moments(q[k], x[k], u[k], waves.select(k), best.swing[k] + moved)
-            after, left = _newton_step(trial, waves.select(k))
-            better = left < size[k]
-            for mine, theirs in zip((*best, step, size), (*trial, after, left), strict=True):
+            left = _imbalance(trial, waves.select(k))
+            after = np.linalg.norm(left, axis=1)
+            better = after < size[k]
+            for mine, theirs in ((best.swing, trial.swing), (best.J, trial.J), (best.output, trial.output)):
                 mine[k[better]] = theirs[better]
-            fraction[k] = np.where(better, 1.0, fraction[k] / 2)
+            size[k[better]], fraction[k] = after[better], np.where(better, 1.0, fraction[k] / 2)
             done = np.abs(moved).max(axis=1) <= BALANCE_TOLERANCE * np.abs(trial.swing).max(axis=1)
-            k = k[~done & (fraction[k] >= MIN_BALANCE_FRACTION)]
+            goes_on = ~done & (fraction[k] >= MIN_BALANCE_FRACTION)
+            new = np.flatnonzero(better & goes_on)
+            step[k[new]] = _newton_step(trial.select(new), waves.select(k[new]), left[new])
+            k = k[goes_on]
             if not len(k):
                 break
         return best
@@ -160,14 +166,19 @@ def is_affine(plant: System) -> bool:
     return not ca.depends_on(ca.jacobian(ca.vertcat(*plant.ode(0, x, u, p)), z), z)
 
 
-def _newton_step(found: Moments, waves: Waves) -> tuple[Array, Array]:
-    """Newton's step of the swing, shape (m, 2 n), and the size of the imbalance that it removes, shape (m,).
-
-    Balance: ``2 mean(f sin) = -w b`` and ``2 mean(f cos) = w a``; the command swings by -feedback times the output.
-    """
+def _imbalance(found: Moments, waves: Waves) -> Array:
+    """What is left of the balance ``2 mean(f sin) = -w b`` and ``2 mean(f cos) = w a``, over w, shape (m, 2 n)."""
     n, w = found.J.shape[1], waves.frequency
     a, b = found.swing[:, :n], found.swing[:, n:]
-    imbalance = np.concatenate([2 / w * found.rates[:, :n] + b, 2 / w * found.rates[:, n:] - a], axis=1)
+    return np.concatenate([2 / w * found.rates[:, :n] + b, 2 / w * found.rates[:, n:] - a], axis=1)
+
+
+def _newton_step(found: Moments, waves: Waves, imbalance: Array) -> Array:
+    """Newton's step of the swing that removes the imbalance, shape (m, 2 n).
+
+    The command swings by -feedback times the output.
+    """
+    n, w = found.J.shape[1], waves.frequency
     C, real, imaginary = found.output[:, None, :n], waves.feedback.real, waves.feedback.imag
     ss, sc, cc = (2 / w * M for M in (found.J_ss, found.J_sc, found.J - found.J_ss))
     into_sine, into_cosine = ((-real, imaginary), (-imaginary, -real))  # of the command, by a and by b
@@ -181,4 +192,4 @@ def _newton_step(found: Moments, waves: Waves) -> tuple[Array, Array]:
     above = np.concatenate([block(ss, sc, ss, 0), block(ss, sc, sc, 1) + one], axis=2)
     below = np.concatenate([block(sc, cc, sc, 0) - one, block(sc, cc, cc, 1)], axis=2)
     slope = np.concatenate([above, below], axis=1)
-    return np.linalg.solve(slope, -imbalance[..., None])[..., 0], np.asarray(np.linalg.norm(imbalance, axis=1))
+    return np.asarray(np.linalg.solve(slope, -imbalance[..., None])[..., 0])

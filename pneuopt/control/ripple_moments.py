@@ -64,6 +64,10 @@ class Moments(NamedTuple):
     J_sc: Array
     output: Array
 
+    def select(self, rows: Indices) -> "Moments":
+        """The moments of some of the plants."""
+        return Moments(*(field[rows] for field in self))
+
 
 @dataclass(frozen=True, eq=False)
 class RippleMoments:
