@@ -24,7 +24,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
-from pneuopt.tuning.passage import Passage
+from pneuopt.tuning.passage import KEPT_STATES, Passage
 from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid, loop_pieces
 from pneuopt.tuning.responses import is_sound
 from pneuopt.tuning.rows import Lanes, reading_times
@@ -225,7 +225,7 @@ class LinearisedProblem:
         p, starts = self._simulator.lanes(points, rows, case)
         u, instants, h, steps = self._simulator.pad(case)
         with np.errstate(all="ignore"):
-            found = self._rollout.run(starts, u, p, instants, h, substeps=steps)
+            found = self._rollout.run(starts, u, p, instants, h, substeps=steps, states=KEPT_STATES)
         assert found.dy is not None
         sound = is_sound(found.y, found.x_end) & np.isfinite(found.dy[:, -1]).all(axis=(1, 2))
         if not sound.all():
@@ -247,7 +247,7 @@ class LinearisedProblem:
             if kind.metric.slope is not None and self._spec.concerns(kind)
         }
         if self._spec.concerns(ROBUSTNESS_REQUIREMENTS):
-            rows_of |= self._robustness_rows(p, sound, self._points(grid, p, case, starts, found), points[rows], case)
+            rows_of |= self._robustness_rows(p, sound, self._points(grid, p, case, found), points[rows], case)
         return LinearisedResponse(
             np.where(sound[:, None], error, np.inf),
             by_gain,
@@ -255,14 +255,13 @@ class LinearisedProblem:
             {kind: slopes for kind, (_, slopes) in rows_of.items()},
         )
 
-    def _points(
-        self, grid: ReferenceGrid, p: Array, case: Indices, starts: Array, found: RolloutResult
-    ) -> tuple[Array, Array]:
+    def _points(self, grid: ReferenceGrid, p: Array, case: Indices, found: RolloutResult) -> tuple[Array, Array]:
         """The operating points of lanes on one grid, states and inputs."""
         fastest = np.zeros(len(p), dtype=np.intp)
         for period, rows in self._simulator.lanes_by_dither_period(p, np.ones(len(p), dtype=bool)):
             fastest[rows] = self._simulator.fastest_samples(grid, found.y[rows], period)
-        passage = Passage(starts, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
+        assert found.x is not None
+        passage = Passage(found.x, found.x_end, fastest, found.y[:, -1, CONTROL_OUTPUT])
         return self._simulator.operating_points(p, case, passage)
 
     def _chain(self, points: Array, rows: Indices, case: Indices) -> Array:

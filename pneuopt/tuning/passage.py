@@ -23,9 +23,9 @@ from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.readings import CONTROL_OUTPUT, ReferenceGrid
 from pneuopt.tuning.space import rk4_substeps
 
-# Lanes that run up to their fastest samples together, as far as the latest of them. More run longer than they need;
-# fewer leave a processor's lanes empty.
-LANES_TO_FASTEST = 8
+# Samples between two states that a run keeps, from which a second one sets out for the fastest sample. Fewer take
+# memory and time to write; more lengthen that second run.
+KEPT_STATES = 64
 
 
 class Passage(NamedTuple):
@@ -33,27 +33,29 @@ class Passage(NamedTuple):
 
     Attributes
     ----------
-    starts, ends : ndarray, shape (m, n_states)
+    states : ndarray, shape (m, k, n_states)
+        At every `KEPT_STATES`-th sample.
+    ends : ndarray, shape (m, n_states)
     fastest : ndarray of int, shape (m,)
         Sample of the largest speed, under dither of the speed without its ripple.
     command : ndarray, shape (m,)
         The commands in which they end.
     """
 
-    starts: Array
+    states: Array
     ends: Array
     fastest: Indices
     command: Array
 
     @staticmethod
-    def empty(m: int, n_states: int) -> "Passage":
-        """Arrays to be filled in."""
-        states = np.zeros((m, n_states)), np.zeros((m, n_states))
+    def empty(m: int, n: int, n_states: int) -> "Passage":
+        """Arrays for m lanes of n samples to be filled in."""
+        states = np.zeros((m, -(-n // KEPT_STATES), n_states)), np.zeros((m, n_states))
         return Passage(*states, np.zeros(m, dtype=np.intp), np.zeros(m))
 
     def select(self, rows: Indices | Mask) -> "Passage":
         """The passage of some lanes."""
-        return Passage(self.starts[rows], self.ends[rows], self.fastest[rows], self.command[rows])
+        return Passage(self.states[rows], self.ends[rows], self.fastest[rows], self.command[rows])
 
 
 def fastest_samples(grid: ReferenceGrid, speed: Array, period: float) -> Indices:
@@ -140,8 +142,8 @@ class PointFinder:
         u = np.zeros((len(p), 1, grid.u.shape[1]))
         u[:, 0, 0] = grid.reference.initial
         none = np.zeros((len(p), 1))
-        control = self.rollout.run(own.starts, u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
-        return np.column_stack([own.starts[:, : len(self.loop.plant.states)], control])
+        control = self.rollout.run(own.states[:, 0], u, quiet, none, none).y[:, 0, CONTROL_OUTPUT]
+        return np.column_stack([own.states[:, 0, : len(self.loop.plant.states)], control])
 
     def _sliding(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage, reach: Array) -> Array:
         """The plant's state and the command at the fastest sample, without ripple."""
@@ -161,19 +163,18 @@ class PointFinder:
         Lanes wait there for the latest of them, between two samples of a held controller: at a sample it would act
         again and again. That of lanes that go on from there has not acted yet.
         """
-        out, order = np.empty((len(p), len(self.loop.plant.states) + 1)), np.argsort(last, kind="stable")
-        ends, u, t, h = np.empty_like(own.starts), *grid.pad(len(grid.t))
-        for rows in np.split(order, np.arange(LANES_TO_FASTEST, len(order), LANES_TO_FASTEST)):
-            k = np.minimum(np.arange(last[rows].max() + 1), last[rows][:, None])
-            steps = np.where(np.arange(k.shape[1]) < last[rows][:, None], h[k], 0.0)
-            waits = np.arange(k.shape[1]) + goes_on[rows, None] > last[rows][:, None]
-            at = t[k] + (0.5 * grid.spacing * waits if self.loop.pid.sample_time is not None else 0.0)
-            with np.errstate(all="ignore"):
-                substeps = rk4_substeps(self.rate, grid.spacing)
-                run = self.rollout.run(own.starts[rows], u[k], p[rows], at, steps, substeps=substeps)
-            ends[rows] = run.x_end
-            out[rows] = np.column_stack([run.x_end[:, : out.shape[1] - 1], run.y[:, -1, CONTROL_OUTPUT]])
-        return out, ends
+        kept, rows = last // KEPT_STATES, np.arange(len(p))
+        left = (last - kept * KEPT_STATES)[:, None]
+        k, (u, t, h) = np.arange(left.max() + 1), grid.pad(len(grid.t))
+        at = kept[:, None] * KEPT_STATES + np.minimum(k, left)
+        waits = k + goes_on[:, None] > left
+        instants = t[at] + (0.5 * grid.spacing * waits if self.loop.pid.sample_time is not None else 0.0)
+        with np.errstate(all="ignore"):
+            substeps = rk4_substeps(self.rate, grid.spacing)
+            steps = np.where(k < left, h[at], 0.0)
+            run = self.rollout.run(own.states[rows, kept], u[at], p, instants, steps, substeps=substeps)
+        plant = run.x_end[:, : len(self.loop.plant.states)]
+        return np.column_stack([plant, run.y[:, -1, CONTROL_OUTPUT]]), run.x_end
 
     def _at_end(self, grid: ReferenceGrid, p: Array, periods: Array, own: Passage) -> tuple[Array, Array]:
         """The plant's state and the command at the end, without ripple, and how far ripple lets them be moved.

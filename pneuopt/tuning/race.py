@@ -21,6 +21,7 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.tuning.merit import VIOLATION_PENALTY, compute_merits
+from pneuopt.tuning.passage import KEPT_STATES
 from pneuopt.tuning.readings import WORST_MERIT
 from pneuopt.tuning.responses import RUNAWAY_LEVEL, Responses
 from pneuopt.tuning.simulator import Simulator
@@ -117,7 +118,8 @@ class Race:
         merits, worst, through = np.full(m, np.inf), outcome.loser.copy(), outcome.loser < 0
         if through.any():
             lanes = through[row]
-            run = starts[lanes], y[through].reshape(-1, n, outputs), outcome.x_end[through].reshape(-1, starts.shape[1])
+            states, ends = (a[through].reshape(-1, *a.shape[2:]) for a in (outcome.x, outcome.x_end))
+            run = states, y[through].reshape(-1, n, outputs), ends
             responses = simulator.read(p[lanes], case[lanes], run, (int(through.sum()), C), self._spec.band)
             merits[through], worst[through] = self._complete_merits(responses, rivals[through])
         return merits, worst
@@ -181,7 +183,9 @@ def _course(simulator: Simulator) -> RaceCourse:
         for g, r in ((g, g.reference) for g in grids)
     ]
     length, first = np.array([[len(g.t), g.step_index] for g in grids]).T
-    return RaceCourse(u, t, h, grid, length[grid], first[grid], np.array(settings)[grid], max(simulator.substeps))
+    return RaceCourse(
+        u, t, h, grid, length[grid], first[grid], np.array(settings)[grid], max(simulator.substeps), KEPT_STATES
+    )
 
 
 def _merit_bounds(spec: Specification, bands: Sequence[float]) -> RaceMerit:

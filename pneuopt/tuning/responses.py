@@ -89,9 +89,10 @@ class LaneMetrics:
     passage: Passage
 
     @staticmethod
-    def empty(m: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
-        """Metrics of m lanes to be filled in; until then they read as running away."""
-        return LaneMetrics({n: np.full(m, np.inf) for n in read}, np.zeros(m, dtype=bool), Passage.empty(m, n_states))
+    def empty(m: int, n: int, n_states: int, read: Sequence[str]) -> "LaneMetrics":
+        """Metrics of m lanes of n samples to be filled in; until then they read as running away."""
+        passage = Passage.empty(m, n, n_states)
+        return LaneMetrics({name: np.full(m, np.inf) for name in read}, np.zeros(m, dtype=bool), passage)
 
 
 def to_records(values: Mapping[str, Array]) -> list[dict[str, float]]:

@@ -19,7 +19,7 @@ from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.tuning.grids import reference_grids, refine_grids
-from pneuopt.tuning.passage import Passage, PointFinder, fastest_samples
+from pneuopt.tuning.passage import KEPT_STATES, Passage, PointFinder, fastest_samples
 from pneuopt.tuning.readings import (
     CONTROL_OUTPUT,
     SIGNAL_OUTPUT,
@@ -50,7 +50,7 @@ STIFFEST_CORNERS = 8
 # Highest frequency at which a sampled loop is read, times its sample time [rad]: below ten, its last crossings are
 # missed; more thin out the grid.
 MAX_SAMPLE_ANGLE = 20.0
-LaneRun = tuple[Array, Array, Array]  # start states, outputs and end states of lanes
+LaneRun = tuple[Array, Array, Array]  # states at every `KEPT_STATES`-th sample, outputs and end states of lanes
 
 
 class Simulator:
@@ -190,7 +190,7 @@ class Simulator:
         wanted = np.ones((len(points), len(self.cases)), dtype=bool) if lanes is None else lanes
         rows, case = np.nonzero(wanted)
         p, starts = self.lanes(points, rows, case)
-        measured = LaneMetrics.empty(len(rows), starts.shape[1], self.response_metrics)
+        measured = LaneMetrics.empty(len(rows), self._longest, starts.shape[1], self.response_metrics)
         for chunk in self._chunks(case):
             self._measure(measured, chunk, case[chunk], starts[chunk], p[chunk], band)
         return Responses(wanted, p, measured, MarginReader(self.margin_metrics, self._read_margins))
@@ -282,6 +282,11 @@ class Simulator:
         u, t, h = (np.array([full[g][k] for g in own.tolist()]) for k in range(3))
         return u, t, h, max(self.substeps[g] for g in np.unique(own))
 
+    @property
+    def _longest(self) -> int:
+        """The samples of the longest reference."""
+        return max(len(grid.t) for grid in self.grids)
+
     def _chunks(self, case: Indices) -> Iterator[Indices]:
         """Indices of lanes that run together: all at once if they are few, otherwise those on the same grid."""
         if len(case) <= MAX_MIXED_LANES:
@@ -297,8 +302,9 @@ class Simulator:
             return
         u, t, h, steps = self.pad(case)
         with np.errstate(all="ignore"):
-            found = self.rollout.run(starts, u, p, t, h, substeps=steps)
-        self._read(out, chunk, case, p, (starts, found.y, found.x_end), band)
+            found = self.rollout.run(starts, u, p, t, h, substeps=steps, states=KEPT_STATES)
+        assert found.x is not None
+        self._read(out, chunk, case, p, (found.x, found.y, found.x_end), band)
 
     def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: float) -> Responses:
         """The responses of candidates on every case, of which the outputs and end states are known.
@@ -307,21 +313,21 @@ class Simulator:
         ----------
         p : ndarray, shape (m n_cases, n_parameters)
         case : ndarray of int, shape (m n_cases,)
-        run : tuple of ndarray, shapes (m n_cases, n_states), (m n_cases, n, n_outputs) and (m n_cases, n_states)
-            Start states, outputs and end states.
+        run : tuple of ndarray, shapes (m n_cases, k, n_states), (m n_cases, n, n_outputs) and (m n_cases, n_states)
+            States at every `KEPT_STATES`-th sample, outputs and end states.
         shape : tuple of int
             m and n_cases.
         band : float
         """
-        measured = LaneMetrics.empty(len(p), run[0].shape[1], self.response_metrics)
+        measured = LaneMetrics.empty(len(p), self._longest, run[0].shape[2], self.response_metrics)
         for chunk in self._chunks(case):
             self._read(measured, chunk, case[chunk], p[chunk], (run[0][chunk], run[1][chunk], run[2][chunk]), band)
         return Responses(np.ones(shape, dtype=bool), p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
     def _read(self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: LaneRun, band: float) -> None:
-        """Fill the rows `chunk` of `out` from start states, outputs and end states."""
-        starts, outputs, ends = run
-        out.passage.starts[chunk], out.passage.ends[chunk] = starts, ends
+        """Fill the rows `chunk` of `out` from states, outputs and end states."""
+        states, outputs, ends = run
+        out.passage.states[chunk, : states.shape[1]], out.passage.ends[chunk] = states, ends
         planes = np.ascontiguousarray(np.moveaxis(outputs, 2, 0))  # reading is over time, several times faster so
         for g in np.unique(self._grid_of[case]).tolist():
             own, grid = self._grid_of[case] == g, self.grids[g]

@@ -12,7 +12,7 @@ enum { FINAL, SIZE, INITIAL, SPACING, OFFSET, IS_STEP, SETTINGS };
 #define ROUNDING 1e-9 /* share by which a bound must pass: at 0 a rounding would drop what ties; more runs longer */
 
 typedef struct {
-  Count cases, samples, bands;   /* cases, samples of the longest, settling bands */
+  Count cases, samples, bands, every; /* cases, samples of the longest, settling bands, samples between states kept */
   int substeps;
   double worst_merit, penalty, runaway;
   const double *u, *t, *h;       /* by grid: inputs, instants and steps of each sample */
@@ -22,7 +22,7 @@ typedef struct {
   const Count *order;            /* by candidate: its cases in the order in which they run */
   const double *rival;           /* by candidate: the merit to beat */
   const double *band, *weight, *limit; /* half widths of the bands; the objective's weights and the limits of the values */
-  double *y, *x_end;             /* by candidate and case: outputs of each sample, and the last state */
+  double *y, *x, *x_end;         /* by candidate and case: outputs of each sample, states kept, and the last state */
   Count *loser;                  /* by candidate: the case by which it lost; -1: it came through */
   double *worst;                 /* by candidate: VALUES, the worst over its cases so far */
 } Race;
@@ -134,7 +134,9 @@ EXPORT void race(const Race *r, Count begin, Count end) {
     if (entered) start(&s);
     for (int lane = 0; lane < LANES; lane++) {
       if (run[lane].candidate < 0) continue;
-      const Count row = r->grid[run[lane].which] * r->samples + run[lane].sample;
+      const Count row = r->grid[run[lane].which] * r->samples + run[lane].sample, k = run[lane].sample / r->every;
+      if (run[lane].sample % r->every == 0)
+        for (int i = 0; i < NX; i++) r->x[(run[lane].pair * ((r->samples - 1) / r->every + 1) + k) * NX + i] = GET(s.x[i], lane);
       PUT(s.t[0], lane, r->t[row]), PUT(s.h[0], lane, r->h[row]);
       for (int i = 0; i < NU; i++) PUT(s.u[i], lane, r->u[row * NU + i]);
     }

@@ -32,6 +32,8 @@ class RaceCourse:
         `first` after the step [s], and 1 for a step, 0 for a disturbance.
     substeps : int
         RK4 steps a sample.
+    every : int
+        Samples between two states that are kept.
     """
 
     u: Array
@@ -42,6 +44,7 @@ class RaceCourse:
     first: Indices
     settings: Array
     substeps: int
+    every: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +81,14 @@ class RaceOutcome:
         The case by which each candidate lost; -1: it came through.
     y : ndarray, shape (m, n_cases, n, n_outputs)
         The outputs of those that came through.
+    x : ndarray, shape (m, n_cases, k, n_states)
+        Their states at every `RaceCourse.every`-th sample.
     x_end : ndarray, shape (m, n_cases, n_states)
     """
 
     loser: Indices
     y: Array
+    x: Array
     x_end: Array
 
 
@@ -90,12 +96,12 @@ class _Race(ctypes.Structure):
     """The struct Race of race.c."""
 
     _fields_ = (
-        *((n, ctypes.c_longlong) for n in ("cases", "samples", "bands")),
+        *((n, ctypes.c_longlong) for n in ("cases", "samples", "bands", "every")),
         ("substeps", ctypes.c_int),
         *((n, ctypes.c_double) for n in ("worst_merit", "penalty", "runaway")),
         *((n, ctypes.c_void_p) for n in ("u", "t", "h", "grid", "length", "first", "settings")),
         *((n, ctypes.c_void_p) for n in ("p", "x0", "period", "order", "rival", "band", "weight", "limit")),
-        *((n, ctypes.c_void_p) for n in ("y", "x_end", "loser", "worst")),
+        *((n, ctypes.c_void_p) for n in ("y", "x", "x_end", "loser", "worst")),
     )
 
 
@@ -140,16 +146,32 @@ def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: Rac
     RaceOutcome
     """
     m, cases = candidates.order.shape
-    outcome = RaceOutcome(np.full(m, -1, dtype=np.int64), y, np.empty((m, cases, rollout.n_states)))
+    kept_states = np.empty((m, cases, -(-course.t.shape[1] // course.every), rollout.n_states))
+    outcome = RaceOutcome(np.full(m, -1, dtype=np.int64), y, kept_states, np.empty((m, cases, rollout.n_states)))
     given = vars(course) | vars(candidates) | {"band": merit.bands, "weight": merit.weights, "limit": merit.limits}
     given["rival"] = given.pop("rivals")
     whole = ("grid", "length", "first", "order")
     kept = {
         n: np.ascontiguousarray(a, dtype=np.int64 if n in whole else np.float64)
         for n, a in given.items()
-        if n != "substeps"
+        if n not in ("substeps", "every")
     }
-    kept |= {"y": y, "x_end": outcome.x_end, "loser": outcome.loser, "worst": np.zeros((m, len(RACE_VALUES)))}
-    sizes = (cases, course.t.shape[1], len(merit.bands), course.substeps, merit.worst, merit.penalty, merit.runaway)
+    kept |= {
+        "y": y,
+        "x": kept_states,
+        "x_end": outcome.x_end,
+        "loser": outcome.loser,
+        "worst": np.zeros((m, len(RACE_VALUES))),
+    }
+    sizes = (
+        cases,
+        course.t.shape[1],
+        len(merit.bands),
+        course.every,
+        course.substeps,
+        merit.worst,
+        merit.penalty,
+        merit.runaway,
+    )
     rollout.race(_Race(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, list(kept.values()))
     return outcome

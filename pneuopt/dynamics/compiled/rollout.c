@@ -86,14 +86,14 @@ static void step_through(Segment *s, int substeps) {
   }
 }
 
-EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stride,
+EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stride, Count every,
                                   const double *x0, const double *u, const double *p, const double *t, const double *h,
                                   const double *measured, const double *weight, double *y, double *dy, double *x,
                                   double *x_end, double *dx_end, double *gram, double *squares) {
   Segment s;
   for (Count i = first; i < last; i += LANES) {
     const int lanes = last - i < LANES ? (int)(last - i) : LANES;
-    Count row[LANES], sample[LANES];
+    Count row[LANES], sample[LANES], kept[LANES];
     /* idle lanes repeat the last segment and write nothing */
     for (int lane = 0; lane < LANES; lane++) row[lane] = i + (lane < lanes ? lane : lanes - 1);
     gather(s.x, x0, row, NX);
@@ -103,7 +103,10 @@ EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stri
     for (Count j = 0; j < n; j++) {
       for (int lane = 0; lane < LANES; lane++) sample[lane] = row[lane] * n + j;
       gather(s.u, u, sample, NU), gather(s.t, t, sample, 1), gather(s.h, h, sample, 1);
-      scatter(s.x, x, sample, NX, lanes);
+      if (j % every == 0) {
+        for (int lane = 0; lane < LANES; lane++) kept[lane] = row[lane] * ((n - 1) / every + 1) + j / every;
+        scatter(s.x, x, kept, NX, lanes);
+      }
       read_sample(&s);
       scatter(s.y, y, sample, NY, lanes), scatter(s.dy, dy, sample, NY * NS, lanes);
       if (gram) {

@@ -145,7 +145,7 @@ class Rollout:
         h: ArrayLike,
         *,
         substeps: int = 1,
-        states: bool = False,
+        states: int = 0,
     ) -> RolloutResult:
         """Integrate m segments of n samples each.
 
@@ -159,8 +159,8 @@ class Rollout:
             Instant of each sample and the step that follows it [s]; h = 0 pads a short segment.
         substeps : int
             Integration steps a sample.
-        states : bool
-            Whether to return the state at each sample.
+        states : int
+            Return the state at each so many samples, from the first one on: 1, or True, at each sample; 0: none.
 
         Returns
         -------
@@ -216,28 +216,28 @@ class Rollout:
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}", ModelError)
         return x0, u, p, t, h
 
-    def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> RolloutResult:
+    def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
         if self._library is None:
             return self._run_vm(x0, u, p, t, h, substeps, states)
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
-        x = np.empty((m, n, nx)) if states else None
-        self._call_library((x0, u, p, t, h), substeps, (None, None, y, dy, x, x_end, dx_end, None, None))
+        x = np.empty((m, -(-n // states), nx)) if states else None
+        self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None))
         return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
 
     def _gram_native(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         m, nx, ns = len(given[0]), self.n_states, self.n_columns
         grams, squares = np.empty((m, ns + 1, ns + 1)), np.empty((m, self.n_outputs))
         y, x_end, dx_end = np.empty(measured.shape), np.empty((m, nx)), np.empty((m, ns, nx))
-        self._call_library(given, substeps, (measured, weight, y, None, None, x_end, dx_end, grams, squares))
+        self._call_library(given, substeps, 0, (measured, weight, y, None, None, x_end, dx_end, grams, squares))
         return Gram(grams, squares, y, x_end, np.swapaxes(dx_end, 1, 2))
 
     def _gram_vm(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         parts = []
         for i in range(0, len(measured), VM_BATCH):
             x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + VM_BATCH] for a in (*given, measured, weight))
-            run = self._run_vm(x0, u, p, t, h, substeps, states=False)
+            run = self._run_vm(x0, u, p, t, h, substeps, 0)
             dy = np.empty((*y.shape, 0)) if run.dy is None else run.dy
             dx_end = np.empty((*run.x_end.shape, 0)) if run.dx_end is None else run.dx_end
             e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
@@ -246,17 +246,21 @@ class Rollout:
             parts.append((np.swapaxes(flat, 1, 2) @ flat, np.sum(e[..., -1] ** 2, axis=1), run.y, run.x_end, dx_end))
         return Gram(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
-    def _call_library(self, given: tuple[Array, ...], substeps: int, others: tuple[Array | None, ...]) -> None:
+    def _call_library(
+        self, given: tuple[Array, ...], substeps: int, states: int, others: tuple[Array | None, ...]
+    ) -> None:
         """Run the machine code, the segments shared out to the threads."""
         assert self._library is not None
         p, (m, n) = given[2], given[3].shape
         function = self._library.rollout
-        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int, ctypes.c_longlong] + [ctypes.c_void_p] * 14
+        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int] + [ctypes.c_longlong] * 2 + [ctypes.c_void_p] * 14
         function.restype = None
         arrays = (*given, *others)
         pointers = [a.ctypes.data if a is not None else None for a in arrays]
         stride = p.shape[1] if p.ndim == 2 else 0
-        self._share_out(function, [(a, b, n, substeps, stride, *pointers) for a, b in self._parts(m)], arrays)
+        self._share_out(
+            function, [(a, b, n, substeps, stride, states or 1, *pointers) for a, b in self._parts(m)], arrays
+        )
 
     def race(self, course: ctypes.Structure, m: int, arrays: Sequence[Any]) -> None:
         """Run the race of m candidates that a struct Race of race.c describes, by pointers to `arrays`."""
@@ -280,7 +284,7 @@ class Rollout:
         for each in running:
             each.result()
 
-    def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: bool) -> RolloutResult:
+    def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         update, step, output = (f and f.map(m) for f in map(self._functions.get, ("update", "step", "output")))
         assert step is not None
@@ -290,7 +294,8 @@ class Rollout:
         xs, ys, dys = [], [], []
         for j in range(n):
             tj, hj, uj = (ca.DM(np.atleast_2d(a)) for a in (t[:, j], h[:, j] / substeps, u[:, j].T))
-            xs.append(x)
+            if states and j % states == 0:
+                xs.append(x)
             if update is not None:
                 x, S = update(tj, x, uj, numbers, S)
             y, dy = output(tj, x, uj, numbers, S)

@@ -90,6 +90,19 @@ def test_a_run_is_what_the_steps_give_one_by_one(name: str) -> None:
     assert run.dx_end is None
 
 
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("lanes", [None, 0])
+def test_states_may_be_kept_at_some_samples_only(name: str, lanes: int | None) -> None:
+    case = Case(name)
+    rollout, given = Rollout(case.system.pieces, lanes=lanes), (case.x0, case.u, case.p, case.t, case.h)
+    every, some, none = (rollout.run(*given, substeps=case.system.substeps, states=k).x for k in (1, 3, 0))
+    assert every is not None
+    assert some is not None
+    assert some.shape[1] == 2
+    assert_array_equal(some, every[:, ::3])
+    assert none is None
+
+
 def differences(case: Case, name: str, index: int, step: float) -> tuple[Array, Array]:
     """Central differences of outputs and end state to one entry of x0 or p, whose size is `step`."""
     rollout, base = case.rollout(), getattr(case, name)
