@@ -10,6 +10,7 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import System, names
+from pneuopt.identification.repairs import repair_log
 from pneuopt.logs.doctor import PISTON_CHANNELS, AxisChannels, Finding, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import noise_level
@@ -17,12 +18,13 @@ from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 
+# Factor [1] between a stated noise level and the one that the log shows: a smaller one doubts good estimates of short
+# logs and of noise that is not white, a larger one lets intervals through that are too narrow.
+MAX_NOISE_FACTOR = 3.0
 SETPOINT_CHANNELS = (
     "speed_reference",
     "position_reference",
 )  # a loop's set-points may stay in a log; no plant reads them
-# usual steps [1] without a sample: inputs in a longer pause are unknown, a lower limit refuses logs with lost samples
-MAX_PAUSE_STEPS = 50
 
 
 def as_experiments(experiments: Experiment | Iterable[Experiment]) -> tuple[Experiment, ...]:
@@ -50,7 +52,7 @@ def check_logs(
         system.check_log(experiment.trajectory, name)
         _check_channels(system, experiment, name, known)
         _check_conditions(system, experiment, parameters, name)
-        out.append(replace(experiment, name=name))
+        out.append(repair_log(system, replace(experiment, name=name))[0])
     return _fill_noise(system, out)
 
 
@@ -89,6 +91,20 @@ def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], param
     return tuple(found)
 
 
+def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> tuple[str, ...]:
+    """What was mended in logs, and stated noise levels that the logs themselves do not show; a sentence each."""
+    out: list[str] = []
+    for log, named in zip(given, checked, strict=True):
+        out += repair_log(system, replace(log, name=named.name))[1]
+        for channel in outputs_in_log(system, named):
+            stated, shown = log.noise.get(channel), noise_level(named.trajectory[channel], named.trajectory.t)
+            if stated is not None and not shown / MAX_NOISE_FACTOR <= stated <= shown * MAX_NOISE_FACTOR:
+                unit = next(q.unit for q in system.outputs if q.name == channel)
+                levels = f"stated as {stated:.2g} {unit}, the log itself shows {shown:.2g} {unit}"
+                out.append(f"{named.name}: the noise of {channel} is {levels}; leave it out to have it estimated")
+    return tuple(out)
+
+
 def _axis_channels(plant: System) -> AxisChannels:
     """The channels of the plant's axis: its motion, and the input that drives it; a piston's if it declares none."""
     if plant.axis is None:
@@ -109,19 +125,9 @@ def _check_conditions(system: Fittable, experiment: Experiment, parameters: Para
 def _check_channels(system: Fittable, experiment: Experiment, name: str, known: set[str]) -> None:
     trajectory = experiment.trajectory
     require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
-    steps = np.diff(trajectory.t)
-    widest, usual = int(np.argmax(steps)), float(np.median(steps))
-    pause = f"{name}: nothing is logged for {steps[widest]:g} s from t = {trajectory.t[widest]:g} s"
-    remedy = f"the usual step is {usual:g} s; cut the log in two there"
-    require(steps[widest] <= MAX_PAUSE_STEPS * usual, f"{pause}; {remedy}", LogError)
     for q in system.inputs:
         needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
         require(q.name in trajectory, needed + ", ".join(trajectory.names), LogError)
-        missing = np.flatnonzero(~np.isfinite(trajectory[q.name]))
-        where = f"t = {trajectory.t[missing[0]]:g} s" if missing.size else ""
-        require(
-            not missing.size, f"{name}: input {q.name!r} is missing at {where}; cut or fill the log there", LogError
-        )
     for channel in trajectory:
         remedy = "leave it out (Experiment.select, or the sidecar's [columns])"
         reads = ", ".join(sorted(n for n in known if not n.endswith("_reference")))

@@ -21,6 +21,7 @@ from pneuopt.identification.checks import (
     check_free,
     check_logs,
     emit_log_warnings,
+    log_remarks,
     outputs_in_log,
 )
 from pneuopt.identification.identifiability import rests_on_prior
@@ -30,8 +31,8 @@ from pneuopt.identification.problem import (
     EstimationProblem,
     apply_conditions,
     as_estimation_model,
-    input_behaviour,
 )
+from pneuopt.identification.repairs import input_behaviour, known_runs
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.review import review_fit
 from pneuopt.identification.statistics import (
@@ -106,10 +107,10 @@ def identify(
     experiments = as_experiments(experiments)
     if estimate_noise:
         experiments = [replace(e, noise={}) for e in experiments]
-    experiments = check_logs(model, experiments, parameters)
+    given, experiments = experiments, check_logs(model, experiments, parameters)
     check_free(experiments, parameters)
     check_content(model, experiments)
-    log_warnings = emit_log_warnings(model, experiments, parameters)
+    log_warnings = emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
     problem = EstimationProblem(model, tuple(experiments), model.parameters | parameters, method)
     held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
     result = review_fit(held, *_result(held, fit, label, loss))
@@ -165,7 +166,7 @@ def predict(system: HasSystem | ClosedLoop, experiment: Experiment, parameters: 
     Returns
     -------
     Trajectory
-        States and outputs on the log's grid.
+        States and outputs on the log's grid; NaN in holes of its inputs, behind which the state is fitted anew.
     """
     model = as_estimation_model(system)
     check_argument("experiment", experiment, Experiment, "an Experiment, as read_log(path) gives it")
@@ -180,15 +181,20 @@ def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSe
 
 def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
     inputs, known = experiment.trajectory, apply_conditions(fixed, experiment)
-    runs = input_behaviour(system, experiment)
+    behaviour = input_behaviour(system, experiment)
     if not system.states:
-        return simulate(system, inputs, known, initial={}, intersample=runs)
+        return simulate(system, inputs, known, initial={}, intersample=behaviour)
     method = LeastSquares()  # over the whole log in one segment, stiction would trap the start in a local optimum
     problem = EstimationProblem(system, (experiment,), fixed, method)
     start = problem.candidates()[0]
     initial = solve_least_squares(problem.transcription(start), method).trajectories[0]
-    state = {s.name: float(initial[s.name][0]) for s in system.states}
-    return simulate(system, inputs, known, initial=state, intersample=runs)
+    columns: dict[str, Array] = {}
+    for begin, end in known_runs(experiment):
+        state = {s.name: float(initial[s.name][begin]) for s in system.states}
+        run = simulate(system, inputs.rows(begin, end), known, initial=state, intersample=behaviour)
+        for name in run:
+            columns.setdefault(name, np.full(len(inputs), np.nan))[begin:end] = run[name]
+    return Trajectory(inputs.t, columns)
 
 
 def _result(

@@ -14,11 +14,12 @@ from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable
 from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.logged_loop import LoggedLoop
+from pneuopt.identification.repairs import input_behaviour
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.intersample import Intersample, usual_intersample
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
@@ -117,11 +118,17 @@ class EstimationProblem:
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
-        nodes, guess = regular_nodes(len(t), self._samples_a_segment(h)), states.matrix(names(self.system.states))
+        samples, breaks = (
+            self._samples_a_segment(h),
+            [end for begin, end in experiment.holes if begin > 0 and end < len(t)],
+        )
+        nodes, guess = regular_nodes(len(t), samples, breaks), states.matrix(names(self.system.states))
+        for begin, end in experiment.holes:
+            h[max(begin - 1, 0) : end] = 0.0  # the state stands still where its inputs are unknown
         driven = self.system.input_matrix(experiment.trajectory, experiment.name)
         driven = append_slopes(t, driven, self._linear, self._rising(experiment))
         start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
-        return Phase(experiment.name, t, h, driven, nodes, start, guess=guess)
+        return Phase(experiment.name, t, h, driven, nodes, start, guess=guess, breaks=np.array(breaks, dtype=np.intp))
 
     def _samples_a_segment(self, h: Array) -> int:
         """Samples between two nodes; a static map has no gaps, so its cut is only for batching."""
@@ -142,12 +149,6 @@ def as_estimation_model(model: HasSystem | ClosedLoop | Fittable) -> Fittable:
     """The model as an identification reads it from a log: of a drive its system, of a loop a `LoggedLoop`."""
     runnable = as_runnable(model)
     return LoggedLoop(runnable) if isinstance(runnable, ClosedLoop) else runnable
-
-
-def input_behaviour(system: Fittable, experiment: Experiment) -> dict[str, Intersample]:
-    """How each of the system's inputs runs between two samples of a log: as the log says, or as is usual."""
-    said = experiment.intersample
-    return {q.name: said.get(q.name) or usual_intersample(q.name, q.unit) for q in system.inputs}
 
 
 def apply_conditions(parameters: ParameterSet, experiment: Experiment) -> ParameterSet:

@@ -55,6 +55,9 @@ class Experiment:
     intersample : mapping of str to Intersample
         How channels run between two samples, where that is not the usual: a command is held, what is measured is linear
         (`usual_intersample`).
+    holes : tuple of (int, int)
+        Ranges of samples without inputs, empty ones between two rows far apart: the state behind a hole does not follow
+        from the state before it. `identify` finds them.
 
     Raises
     ------
@@ -75,6 +78,7 @@ class Experiment:
     sha256: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
     intersample: Mapping[str, Intersample] = field(default_factory=dict)
+    holes: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
         where = self.name or "experiment"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pneuopt.dynamics.system import names
 from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.shooting.transcription import Cost, Limit, Phase, Residuals, Transcription, Where, phases_of
 
@@ -181,6 +182,7 @@ def _simulate_guess(transcription: Transcription, phase: Phase, q: Array, x: Arr
 
 
 def _build_phase(transcription: Transcription, phase: Phase, nodes: ca.MX, q: ca.MX) -> _PhaseGraph:
+    require(not phase.breaks.size, f"{phase.name}: a phase with breaks needs another method", ModelError)
     length = _duration(transcription, phase, q)
     t, h, u = ca.MX(ca.DM(phase.t).T) * length, ca.MX(ca.DM(phase.h).T) * length, ca.DM(phase.inputs).T
     p = q[transcription.parameter_positions(phase).tolist()]

@@ -194,7 +194,8 @@ def segment(transcription: Transcription) -> Segments:
     t, h, inputs, y, noise, gather, linked, start, index, lengths = joined
     for i, phase in enumerate(transcription.phases[1:], 1):
         linked[np.flatnonzero(index == i)[0] - 1] = phase.follows
-    _fix_unobservable_states(transcription, start, np.flatnonzero(np.append(True, ~linked[:-1])), index)
+    nodes = np.concatenate([phase.nodes for phase in transcription.phases])
+    _fix_unobservable_states(transcription, start, np.flatnonzero(np.append(True, ~linked[:-1])), index, nodes)
     return Segments(transcription, t, h, inputs, y, noise, gather, linked, start, index, lengths)
 
 
@@ -247,13 +248,15 @@ def _state_rate(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
     return ca.substitute(ca.jacobian(x_next, symbols["h"]), symbols["h"], ca.SX(0)), symbols
 
 
-def _fix_unobservable_states(transcription: Transcription, start: Array, heads: Indices, index: Indices) -> None:
+def _fix_unobservable_states(
+    transcription: Transcription, start: Array, heads: Indices, index: Indices, nodes: Indices
+) -> None:
     """Hold unobservable states at their guess, at the head of each run of linked segments (changes `start`)."""
     for head, stop in zip(heads, [*heads[1:], len(index)], strict=True):
         guess = transcription.phases[index[head]].guess
         measured = {o for r in transcription.residuals if r.phase in index[head:stop] for o in r.outputs}
         idle = ~_observable_states(transcription.system, measured) & np.isnan(start[head])
-        start[head, idle] = 0.0 if guess is None else guess[0, idle]
+        start[head, idle] = 0.0 if guess is None else guess[nodes[head], idle]
 
 
 def _observable_states(system: DiscreteSystem, outputs: set[str]) -> Mask:
@@ -300,7 +303,7 @@ def _cut_phase(
         np.where(real[:, :, None], measured[rows], np.nan),
         noise[rows],
         np.tile(transcription.parameter_positions(phase), (m, 1)),
-        np.arange(m) < m - 1,
+        (np.arange(m) < m - 1) & ~np.isin(ends, phase.breaks),
         start,
         np.full(m, index),
         ends - phase.nodes,

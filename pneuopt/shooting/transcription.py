@@ -5,8 +5,9 @@ All numbers that a problem depends on stand in one `ParameterSet`; ``"name[phase
 ``"name"`` in that phase, which is how conditions of a log and parameters of its own (`per_log`) are written.
 """
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import casadi as ca
@@ -48,6 +49,8 @@ class Phase:
         Name of the parameter that is the phase's duration; `t` and `h` are then fractions of it.
     guess : ndarray, shape (n, n_states), optional
         States to start the solver from.
+    breaks : ndarray of int
+        Those of the nodes that do not continue the segment before them: holes of a log.
     """
 
     name: str
@@ -59,6 +62,7 @@ class Phase:
     follows: bool = False
     duration: str | None = None
     guess: Array | None = None
+    breaks: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
 
     def __post_init__(self) -> None:
         n = len(self.t)
@@ -68,6 +72,9 @@ class Phase:
         ordered = len(self.nodes) > 0 and self.nodes[0] == 0 and bool(np.all(np.diff(self.nodes) > 0))
         require(
             ordered and self.nodes[-1] < n, f"{self.name}: nodes must begin at 0 and increase below {n}", ModelError
+        )
+        require(
+            bool(np.isin(self.breaks, self.nodes[1:]).all()), f"{self.name}: a break must be an inner node", ModelError
         )
         require(
             not (self.follows and self.start is not None), f"{self.name}: it follows a phase, so no start", ModelError
@@ -189,15 +196,18 @@ class Transcription:
         return np.array([i for i, p in enumerate(self.parameters.values()) if p.free], dtype=np.intp)
 
 
-def regular_nodes(n: int, samples: int) -> Indices:
-    """Nodes at every `samples`-th of n samples; the last segment takes the rest.
+def regular_nodes(n: int, samples: int, breaks: Sequence[int] | Indices = ()) -> Indices:
+    """Nodes at every `samples`-th of n samples, counted anew from each break; the last segment takes the rest.
 
     Examples
     --------
     >>> regular_nodes(10, 4).tolist()
     [0, 4, 8]
+    >>> regular_nodes(10, 4, [5]).tolist()
+    [0, 4, 5, 9]
     """
-    return np.arange(0, n, max(1, samples), dtype=np.intp)
+    runs = itertools.pairwise([0, *breaks, n])
+    return np.concatenate([np.arange(a, b, max(1, samples), dtype=np.intp) for a, b in runs])
 
 
 def phases_of(term: Cost | Limit, transcription: Transcription) -> Sequence[int]:

@@ -22,6 +22,9 @@ from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 
+# Spread of the steps [1], over the usual one, that the filter takes as even: above, derivatives of a log that lacks
+# samples are wrong; below, every log with jitter is resampled.
+MAX_JITTER = 0.5
 # Window of the Savitzky-Golay filter of order 3 [s]: a shorter one leaves noise in the acceleration, a longer one
 # flattens stick and slip.
 FILTER_TIME = 0.031
@@ -97,8 +100,13 @@ def filter_motion(measured: Trajectory) -> tuple[Array, Array, Array]:
 
 
 def filter_channel(measured: Trajectory, name: str, derivative: int) -> Array:
-    """Channel, or its derivative by time, by a Savitzky-Golay filter; missing samples are interpolated."""
-    step = float(np.median(np.diff(measured.t)))
+    """Channel, or its derivative by time, by a Savitzky-Golay filter; missing and uneven samples are interpolated."""
+    steps = np.diff(measured.t)
+    step = float(np.median(steps))
+    if np.ptp(steps) > MAX_JITTER * step:
+        grid = np.linspace(measured.t[0], measured.t[-1], math.ceil(measured.duration / step) + 1)
+        even = Trajectory(grid, {name: np.interp(grid, measured.t, measured.fill_gaps(name))})
+        return np.interp(measured.t, grid, filter_channel(even, name, derivative))
     window = max(5, 2 * round(FILTER_TIME / step / 2) + 1)
     window = min(window, (len(measured) - 1) // 2 * 2 + 1)
     column = measured.fill_gaps(name)
