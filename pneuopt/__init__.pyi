@@ -117,7 +117,6 @@ from .studies.neighbours import search_again
 from .studies.sweep import grid, sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
-from .tuning.screening import Screening
 from .tuning.tune import TuningResult, tune
 from .tuning.two_phase import TwoPhase
 from .tuning.validation import DesignValidation, validate_design
@@ -205,7 +204,6 @@ __all__ = [
     "Ripple",
     "RiseTime",
     "RotaryDrive",
-    "Screening",
     "SecondOrder",
     "Sensor",
     "SensorLag",

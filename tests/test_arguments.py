@@ -33,9 +33,9 @@ def select(model: Any, logs: Any, parameters: Any) -> pd.DataFrame:
 
 
 def tune(model: Any, steps: Any, parameters: Any) -> pd.DataFrame:
-    method = po.Screening(members=5, generations=1, refinements=1)
+    method = po.Racing(members=5, trials=1, polish=0)
     loop = po.ClosedLoop(model, po.PID())
-    return po.tune(loop, steps, parameters, minimise=po.IAE(), method=method, throw=False).certified
+    return po.tune(loop, steps, parameters, minimise=po.IAE(), method=method, throw=False, plants={}).certified
 
 
 def simulate(model: Any, inputs: Any, parameters: Any) -> pd.DataFrame:
@@ -101,7 +101,7 @@ def test_what_are_no_parameters_is_named(name: str, parameters: Any) -> None:
 def test_what_is_no_loop_is_named(loop: Any) -> None:
     for verb in (
         lambda: po.evaluate(loop, STEP, GAINS),
-        lambda: po.tune(loop, STEP, TUNED, minimise=po.IAE()),
+        lambda: po.tune(loop, STEP, TUNED, minimise=po.IAE(), plants={}),
         lambda: po.validate_design(loop, STEP, GAINS, minimise=po.IAE(), scenarios={"same": {}}),
         lambda: po.judge_dither(loop, STEP, GAINS),
     ):

@@ -149,7 +149,6 @@ PUBLIC_NAMES = [
     "RotaryDrive",
     "samples",
     "save_figure",
-    "Screening",
     "SecondOrder",
     "search_again",
     "select_model",

@@ -5,10 +5,15 @@ from dataclasses import fields
 from typing import Any
 
 from pneuopt.files.loop import construct_at
-from pneuopt.quantities.errors import check_names, require
+from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.units import read_value
 from pneuopt.tuning.method import Method
 from pneuopt.tuning.methods import METHODS
+
+REPLACED_METHODS = {
+    "screening": "racing",
+    "condensed": "racing",
+}  # in files of older versions
 
 
 def read_method(table: Mapping[str, Any], where: str) -> Method | None:
@@ -33,20 +38,27 @@ def read_method(table: Mapping[str, Any], where: str) -> Method | None:
 
     Examples
     --------
-    >>> read_method({"kind": "screening", "members": 12, "margin": "2 %"}, "[method]").margin
+    >>> read_method({"kind": "racing", "members": 12, "margin": "2 %"}, "[method]").margin
     0.02
     """
     if not table:
         return None
     require("kind" in table, f"{where} has no kind; write kind = {' or '.join(map(repr, METHODS))}")
-    check_names("kind", [str(table["kind"])], METHODS, where)
-    kind = METHODS[str(table["kind"])]
-    defaults = {f.name: f.default for f in fields(kind) if isinstance(f.default, int | float | tuple)}
+    name = str(table["kind"])
+    if name in REPLACED_METHODS:
+        successor = REPLACED_METHODS[name]
+        options = ", ".join(_defaults(successor))
+        raise InputError(f"{where}: {name!r} is gone; write kind = {successor!r}, whose options are {options}")
+    check_names("kind", [name], METHODS, where)
+    kind, defaults = METHODS[name], _defaults(name)
     check_names("option", table, ("kind", *defaults), where)
-    options: dict[str, Any] = {
-        n: _read_option(given, defaults[n], f"{where} {n}") for n, given in table.items() if n != "kind"
-    }
-    return construct_at(lambda: kind(**options), where)
+    given = {n: _read_option(value, defaults[n], f"{where} {n}") for n, value in table.items() if n != "kind"}
+    return construct_at(lambda: kind(**given), where)
+
+
+def _defaults(name: str) -> dict[str, Any]:
+    """The options of a method, by their defaults; None: that of one which a file cannot state."""
+    return {f.name: f.default for f in fields(METHODS[name]) if isinstance(f.default, int | float | tuple)}
 
 
 def _read_option(given: Any, default: Any, where: str) -> Any:

@@ -1,7 +1,6 @@
-"""`compute_merits`: how searches by simulation rank points; `screening_result`: what they return of the best one."""
+"""`compute_merits`: how searches by simulation rank points; `search_result`: what they return of the best."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -54,27 +53,8 @@ def compute_merits(values: Mapping[str, Array], spec: Specification, scale: floa
     return np.where(missed > 0, WORST_MERIT * (1 + missed), np.minimum(total, WORST_MERIT))
 
 
-@dataclass(frozen=True, eq=False)
-class BestPoint:
-    """The best point that a search by simulation found.
-
-    Attributes
-    ----------
-    point : ndarray, shape (n,)
-        The gains with the least merit.
-    count : int
-        Candidates simulated.
-    is_complete : bool
-        False where Ctrl-C cut the search short.
-    """
-
-    point: Array
-    count: int
-    is_complete: bool
-
-
-def screening_result(task: TuningTask, simulator: Simulator, spec: Specification, best: BestPoint) -> SearchResult:
-    """The result of a search by simulation: its point with its status and what is active there.
+def search_result(task: TuningTask, simulator: Simulator, spec: Specification, point: Array) -> SearchResult:
+    """The result of a search by simulation: its best point, of shape (n,), with its status and what is active there.
 
     Parameters
     ----------
@@ -83,15 +63,14 @@ def screening_result(task: TuningTask, simulator: Simulator, spec: Specification
     simulator : Simulator
     spec : Specification
         The tightened one that was searched for.
-    best : BestPoint
+    point : ndarray, shape (n,)
     """
-    values = to_records(simulator.values(best.point[None], spec))[0]
-    stats = {"simulations": float(best.count), "optimum": spec.objective(values)}
-    active = _active_limits(task.space, spec, best.point, values)
-    return SearchResult(best.point, _screening_status(task.spec, values), active, stats, best.is_complete)
+    values = to_records(simulator.values(point[None], spec))[0]
+    active = _active_limits(task.space, spec, point, values)
+    return SearchResult(point, _search_status(task.spec, values), active, {"optimum": spec.objective(values)})
 
 
-def _screening_status(spec: Specification, values: Mapping[str, float]) -> Status:
+def _search_status(spec: Specification, values: Mapping[str, float]) -> Status:
     """The status of a search: converged where its point keeps the limits; otherwise it says which ones are broken."""
     broken = [
         f"{metric_name(q)} {', '.join(describe_value(q, values[metric_name(q)]))}"

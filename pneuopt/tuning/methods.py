@@ -5,13 +5,10 @@ from types import MappingProxyType
 
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.racing import Racing
-from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.two_phase import TwoPhase
 
 # By their key in a tuning's file; the first that suits a task is chosen: `Racing` suits every task.
-METHODS: Mapping[str, type[TwoPhase] | type[Racing] | type[Screening]] = MappingProxyType(
-    {"two_phase": TwoPhase, "racing": Racing, "screening": Screening}
-)
+METHODS: Mapping[str, type[TwoPhase] | type[Racing]] = MappingProxyType({"two_phase": TwoPhase, "racing": Racing})
 
 
 def choose_method(task: TuningTask) -> Method:

@@ -67,11 +67,14 @@ class Race:
         self.is_cut = any(len(a.t) < len(b.t) for a, b in zip(self._simulator.grids, self._whole.grids, strict=True))
         self._course = _course(self._simulator)
 
-    def merits(self, points: Array) -> tuple[Array, Indices]:
-        """The merit of each point on every case and on the whole response, and its worst case, shapes (m,)."""
+    def merits(self, points: Array, rivals: Array | None = None) -> tuple[Array, Indices]:
+        """The merit of each point on every case and on the whole response, and its worst case, shapes (m,).
+
+        Where `rivals`, shape (m,), are given, a point that is certain to be worse gets a bound above its rival's merit.
+        """
         self.count += len(points)
         responses = self._whole.respond(points, self._spec.band)
-        return self._complete_merits(responses, np.full(len(points), np.inf))
+        return self._complete_merits(responses, np.full(len(points), np.inf) if rivals is None else rivals)
 
     def race(self, points: Array, rivals: Array, first: Indices) -> tuple[Array, Indices]:
         """The merit of points that are no worse than their rivals; for the others a number above their rival's merit.

@@ -18,7 +18,7 @@ from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.status import ProgressCallback
-from pneuopt.tuning.merit import SIMULATION_PEAK_MARGIN, BestPoint, screening_result
+from pneuopt.tuning.merit import SIMULATION_PEAK_MARGIN, search_result
 from pneuopt.tuning.method import SearchResult, TuningTask
 from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race, may_be_cut
@@ -115,9 +115,10 @@ class Racing:
         """Search for the best point, from one that is close where a certificate has failed; see `Method.find`."""
         method = replace(self, bands=(), trials=max(1, self.trials // 3)) if attempt else self
         best = run_racing(task, simulator, spec, method, start, progress)
-        result = screening_result(task, simulator, spec, BestPoint(best.point, best.count, best.is_complete))
-        starts = {"starts": float(best.starts), "starts_agreeing": float(best.agreeing)}
-        return replace(result, stats={**result.stats, **starts})
+        result = search_result(task, simulator, spec, best.point)
+        counts = {"simulations": best.count, "starts": best.starts, "starts_agreeing": best.agreeing}
+        stats = {**result.stats, **{n: float(count) for n, count in counts.items()}}
+        return replace(result, stats=stats, is_complete=best.is_complete)
 
     def shorten(self, margin: float) -> "Racing":
         """The method for a short search from a point that is close."""

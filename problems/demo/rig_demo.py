@@ -49,7 +49,7 @@ RANGES = {
     "dither.offset": (-0.5, 0.5),
 }
 LIMITS = (po.Overshoot(0.04), po.MaxSensitivity(1.6))
-SEARCH = po.Screening(members=32, generations=6, refinements=100)
+SEARCH = po.Racing(members=24, trials=200)
 WITHIN = {  # relative distance of the estimates from the generating values: what the rig has and the model has not
     "valve.conductance": 0.02,
     "valve.dead_zone": 0.15,

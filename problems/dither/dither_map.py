@@ -50,8 +50,8 @@ GIVEN = {"pid.Kp": 2.0, "pid.Ki": 20.0, "pid.Tf": 0.01, "pid.lower": -5.0, "pid.
 GAINS = {"pid.Kp": (0.2, 30.0), "pid.Ki": (0.5, 300.0), "pid.Kd": (0.0, 0.5)}
 DITHER = {"dither.amplitude": (0.0, 1.5), "dither.frequency": (20.0, 120.0)}
 FIRST = {"dither.amplitude": 1.0}
-SEARCH = po.Screening(members=30, generations=10, refinements=150)
-LONGER = po.Screening(seed=1)  # for the rival: more members, generations and refinements, for fewer gains
+SEARCH = po.Racing(members=30, trials=300)
+LONGER = po.Racing(seed=1)  # for the rival: more members and trials, for fewer gains
 AMPLITUDES, FREQUENCIES = np.linspace(0.0, 1.2, 13), np.geomspace(20.0, 250.0, 12)  # [V], [Hz]
 SOONER = 0.95
 BOUNDS = {

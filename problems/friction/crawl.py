@@ -56,7 +56,7 @@ GAINS = {"pid.Kp": (1.0, 10.0), "pid.Ki": (5.0, 60.0), "pid.Kd": (0.0, 2.0), "pi
 DITHER = {"dither.amplitude": (0.0, 3.0), "dither.offset": (-0.5, 0.5)}
 STEPS = [po.Step(v, horizon=1.5) for v in CRAWL]
 BAND, SENSITIVITY = 0.1, 2.5
-SEARCH = po.Screening(members=24, generations=5, bands=(0.5, 0.2), refinements=100)
+SEARCH = po.Racing(members=24, trials=120)
 BOUNDS = {
     "hand.5.stuck": ">= 0.5", "hand.10.stuck": ">= 0.5", "hand.20.stuck": ">= 0.3", "hand.50.stuck": ">= 0.05",
     "hand.10.deviation": ">= 1", "hand.20.deviation": ">= 1",

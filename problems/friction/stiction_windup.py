@@ -41,7 +41,7 @@ PAPERS |= {"pid.lower": -CLIP, "pid.upper": CLIP}
 UNWINDING = (1.0, 0.1, 0.01)  # [s] Tt
 BANDS = (10.0, 20.0, 40.0, 60.0)  # [%] of the set speed
 RANGES = {"pid.Kp": (1.0, 40.0), "pid.Ki": (1.0, 200.0), "pid.Kd": (0.0, 2.0)}
-SEARCH = po.Screening(members=24, generations=6, refinements=100)
+SEARCH = po.Racing(members=24, trials=200)
 STEPS = [po.Step(v, horizon=2.0) for v in (FAST, SLOW)]
 LIMITS = (po.Overshoot(0.05), po.MaxSensitivity(1.6))
 PAPERS_PEAK = 1.225  # [V] that its gains command for 50 mm/s

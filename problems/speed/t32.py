@@ -42,7 +42,7 @@ from scipy.optimize import differential_evolution
 import pneuopt as po
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.plotting import BLUE, GREY, axes_grid
-from pneuopt.tuning.screening import MeritFunction
+from pneuopt.tuning.race import Race
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.shade import SuccessHistory, first_population
 from pneuopt.tuning.tune import prepare_search, prepare_task
@@ -93,7 +93,7 @@ class OutOfTimeError(Exception):
 class Clock:
     """A rival's merit function, which keeps its best points, and ends the search when its CPU time is over."""
 
-    merit: MeritFunction
+    merit: Callable[[Array, Array], Array]  # of points (m, n) and the merits (m,) above which a bound will do
     limit: float
     begun: float = field(default_factory=time.process_time)
     threshold: float = inf
@@ -103,7 +103,7 @@ class Clock:
         """The merits of points of the unit cube, shape (m, n); for hopeless ones a bound above the threshold."""
         if time.process_time() - self.begun > self.limit:
             raise OutOfTimeError
-        found = self.merit.race(unit, np.full(len(unit), self.threshold), None)[0]
+        found = self.merit(unit, np.full(len(unit), self.threshold))
         self.threshold = float(np.median(found)) if len(found) > 1 else inf
         points = [(float(m), tuple(p)) for m, p in zip(found, np.clip(unit, 0.0, 1.0).tolist(), strict=True)]
         self.kept = sorted({*self.kept, *points})[:REREAD]
@@ -199,13 +199,16 @@ def best_of(search: Search, find: Callable[[Clock, Array, int], None], limit: fl
     """The answer of a rival after a CPU time: the best on fine samples of its best on coarse ones."""
     space, spec = search.space, tight(search)
     start = space.to_unit(space.start)
-    coarse = MeritFunction(search.simulator.coarse(spec), space, spec, search.task.horizon, start)
-    clock = Clock(coarse, limit)
+    coarse, fine = (Race(s, spec, search.task.horizon) for s in (search.simulator.coarse(spec), search.simulator))
+
+    def merit(unit: Array, rivals: Array) -> Array:
+        return coarse.merits(space.from_unit(np.clip(unit, 0.0, 1.0)), rivals)[0]
+
+    clock = Clock(merit, limit)
     with suppress(OutOfTimeError):
         find(clock, start, seed)
-    points = np.array([point for _, point in clock.kept])
-    fine = MeritFunction(search.simulator, space, spec, search.task.horizon, start)
-    return space.from_unit(points[int(np.argmin(fine(points)))])
+    points = space.from_unit(np.array([point for _, point in clock.kept]))
+    return np.asarray(points[np.argmin(fine.merits(points)[0])])
 
 
 def certified(search: Search, point: Array, seconds: float) -> Run:

@@ -119,7 +119,7 @@ def _known(figures: dict[str, float]) -> float:
 
 def _first_margin(found: po.TuningResult) -> float:
     """What the first attempt tightens the limits by."""
-    return (po.TwoPhase if "starts" in found.stats else po.Screening)().margin
+    return (po.Racing if "simulations" in found.stats else po.TwoPhase)().margin
 
 
 def _worst(metrics: "pd.DataFrame") -> float:

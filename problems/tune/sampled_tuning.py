@@ -84,7 +84,7 @@ def _tuned(loop: po.ClosedLoop, given: po.ParameterSet) -> Run:
     """The best of some seeds."""
     found = []
     for seed in SEEDS:
-        method = po.Screening(seed=seed)
+        method = po.Racing(seed=seed)
         best = po.tune(
             loop, STEP, given, minimise=po.SettlingTime(BAND), subject_to=LIMITS, method=method, plants={}, throw=False
         )

@@ -16,7 +16,7 @@ from pneuopt.cli import study as study_module
 from pneuopt.cli.app import app
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.pareto import pareto_front
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 
 DRIVE = """
 [drive]
@@ -86,7 +86,7 @@ def front(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     edit("tuning.toml", "[limits]", '[limits]\npeak_control = "120 N"')
     edit("tuning.toml", 'max = "1 s"', 'max = "250 ms"')
     (folder / "front.toml").write_text(FRONT, encoding="utf-8")
-    monkeypatch.setattr(study_module, "pareto_front", partial(pareto_front, method=Screening(12, 6, (), 40)))
+    monkeypatch.setattr(study_module, "pareto_front", partial(pareto_front, method=Racing(8, 40)))
     return folder
 
 

@@ -95,8 +95,8 @@ def test_a_tuning_reckons_with_it() -> None:
     ignorant = ClosedLoop(loop.plant, PID(5e-3))
     quick = Racing(members=8, trials=40, polish=16)
     limits = [Overshoot(0.05)]
-    knowing = tune(loop, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)
-    blind = tune(ignorant, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick)
+    knowing = tune(loop, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick, plants={})
+    blind = tune(ignorant, STEP, given, minimise=SettlingTime(), subject_to=limits, method=quick, plants={})
     seen = evaluate(loop, STEP, blind.parameters)["0 to 0.1"]
     assert knowing.certified["0 to 0.1"]["Overshoot"] <= 5.0
     assert seen["Overshoot"] > 5.0 or not seen["SettlingTime"] <= knowing.certified["0 to 0.1"]["SettlingTime"]

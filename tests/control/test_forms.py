@@ -190,7 +190,15 @@ def test_gradients_are_those_of_finite_differences(
 def test_it_is_tuned_in_its_own_gains() -> None:
     loop, freed = friction_loop(Form.STANDARD, 2e-3)
     quick = Racing(members=8, trials=40, polish=16)
-    best = tune(loop, Step(0.1, horizon=0.3), freed, minimise=SettlingTime(), subject_to=[Overshoot(0.1)], method=quick)
+    best = tune(
+        loop,
+        Step(0.1, horizon=0.3),
+        freed,
+        minimise=SettlingTime(),
+        subject_to=[Overshoot(0.1)],
+        method=quick,
+        plants={},
+    )
     assert best.status.converged
     assert set(best.parameters.free_names) == {"pid.Kp", "pid.Ti", "pid.Td", "pid.N"}
     before = evaluate(loop, Step(0.1, horizon=0.3), freed)["0 to 0.1"]["SettlingTime"]

@@ -93,6 +93,7 @@ def test_tuning_knows_the_lag() -> None:
             minimise=SettlingTime(),
             subject_to=[MaxSensitivity(1.6)],
             method=TwoPhase((20, 25), starts=1),
+            plants={},
         )
         found[lag] = best.certified["0 to 1"]["SettlingTime"]
     assert found[2e-2] > 2 * found[1e-3]
@@ -208,7 +209,7 @@ def test_counts_are_tuned_without_gradients() -> None:
     def tuned(loop: ClosedLoop, method: Racing, scenarios: Scenarios) -> bool:
         step, limits = Step(0.1, horizon=0.3), [Overshoot(0.1)]
         goal = SettlingTime()
-        found = tune(loop, step, given, minimise=goal, subject_to=limits, method=method, scenarios=scenarios)
+        found = tune(loop, step, given, minimise=goal, subject_to=limits, method=method, scenarios=scenarios, plants={})
         return found.status.converged
 
     assert tuned(loop, QUICK, corners(given, {"load.mass": 0.1}))

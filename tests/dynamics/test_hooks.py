@@ -141,7 +141,11 @@ def test_impossible_hardware_is_refused_by_every_verb(name: str) -> None:
         lambda: identify(system, [log], p),
         lambda: loop.check(p),
         lambda: tune(
-            loop, Step(0.1), (loop.parameters | p.fixed(name)).with_bounds(Kp).freed(*Kp), minimise=SettlingTime()
+            loop,
+            Step(0.1),
+            (loop.parameters | p.fixed(name)).with_bounds(Kp).freed(*Kp),
+            minimise=SettlingTime(),
+            plants={},
         ),
     )
     for verb in verbs:

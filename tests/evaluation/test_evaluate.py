@@ -22,7 +22,7 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.tune import tune
 
 GAINS = {"pid.Kp": 150.0, "pid.Ki": 8000.0, "pid.lower": -60.0, "pid.upper": 60.0}
@@ -119,8 +119,8 @@ def test_an_end_stop_is_no_certificate() -> None:
     with pytest.warns(PhysicsWarning, match=r"front end stop .* at t = 0\.[34]"):
         evaluate(loop, step, p)
     free = p.with_values({"pid.Kp": 2.0, "pid.b": 3.0}).with_bounds({"pid.Kp": (2.0, 3.0)}).freed("pid.Kp")
-    method = Screening(members=5, generations=1, refinements=0)
-    result = tune(loop, Step(0.3, horizon=0.33), free, minimise=IAE(), method=method, throw=False)
+    method = Racing(members=5, trials=1, polish=0)
+    result = tune(loop, Step(0.3, horizon=0.33), free, minimise=IAE(), method=method, throw=False, plants={})
     assert result.status.code is Code.NOT_CERTIFIED
     assert "front end stop" in result.status.message
     assert "shorten the horizon" in result.status.message

@@ -82,7 +82,7 @@ def test_its_speed_loop_is_tuned_in_radians_per_second(servo: tuple[RotaryDrive,
     parameters = known.with_values({"pid.Kp": 0.05, "pid.Ki": 0.5}).with_bounds(bounds)
     limits = [Overshoot(max=0.05), PeakControl(max=5.0)]
     free = parameters.freed("pid.Kp", "pid.Ki")
-    best = tune(loop, [Step(50.0, horizon=0.4)], free, minimise=SettlingTime(), subject_to=limits)
+    best = tune(loop, [Step(50.0, horizon=0.4)], free, minimise=SettlingTime(), subject_to=limits, plants={})
     assert best.status.converged
     peak, settled = (best.certified.loc[n].iloc[0] for n in ("PeakControl", "SettlingTime"))
     assert peak <= 5.0

@@ -11,14 +11,14 @@ from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.confirmation import confirm_infeasible
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.search import relax
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
 GAIN, RATE, STEP = 0.1462, 3.073, Step(1.0, horizon=13.0)
-SMALL = Screening(8, 3, (), 0)
+SMALL = Racing(5, 1, (), 0)
 
 
 def problem() -> tuple[ClosedLoop, ParameterSet]:
@@ -88,6 +88,6 @@ def test_an_interrupted_exact_search_is_not_followed_by_another(throws_at: int) 
         if len(heard) == throws_at:
             raise KeyboardInterrupt
 
-    found = tune(loop, STEP, given, minimise=SettlingTime(), progress=stop, throw=False)
+    found = tune(loop, STEP, given, minimise=SettlingTime(), progress=stop, throw=False, plants={})
     assert found.status.code is Code.INTERRUPTED
     assert len(heard) == throws_at

@@ -34,13 +34,13 @@ from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.feasibility import check_feasibility
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
 
 FREE = {"pid.Kp": (1.0, 40.0), "pid.Ki": (5.0, 200.0)}
 CLIP = {"pid.lower": -5.0, "pid.upper": 5.0}
-BRIEF = Screening(members=5, generations=1, bands=(), refinements=0)
+BRIEF = Racing(members=5, trials=1, bands=(), polish=0)
 
 
 def cylinder(**dither: Any) -> tuple[ClosedLoop, ParameterSet]:
@@ -202,7 +202,7 @@ def test_a_start_that_never_settles_is_reported_and_searched_from() -> None:
     wild = given.with_values({"pid.Kp": 39.0, "plant.time_constant": 0.1})
     run = respond(loop, Step(1.0), wild)
     assert run["speed"][-50:].std() > 0.01
-    method = Screening(members=10, generations=3, refinements=40)
+    method = Racing(members=8, trials=40)
     best = tune(loop, Step(1.0), wild, minimise=SettlingTime(), method=method, progress=lines.append)
     assert lines[0] == "with the given gains the loop never settles at 0 to 1, 1 of 1 cases; searching on"
     assert best.certified.loc["SettlingTime"].max() < 0.5

@@ -39,11 +39,11 @@ from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
-FAST = Screening(members=10, generations=4, bands=(0.1,), refinements=50)
+FAST = Racing(members=8, trials=80)
 STEP, SETTLING = Step(1.0, horizon=1.0), SettlingTime()
 TUBE = ((0.0, -0.1, 1.1), (0.3, 0.8, 1.05), (0.8, 0.97, 1.03))
 FREE = {"pid.Kp": (0.02, 1.0), "pid.Ki": (0.1, 20.0)}
@@ -57,7 +57,7 @@ def speed_loop() -> tuple[ClosedLoop, ParameterSet]:
 @cache
 def tuned(*limits: Requirement, minimise: Requirement = SETTLING) -> TuningResult:
     loop, given = speed_loop()
-    return tune(loop, STEP, given, minimise=minimise, subject_to=limits, method=FAST, throw=False)
+    return tune(loop, STEP, given, minimise=minimise, subject_to=limits, method=FAST, plants={}, throw=False)
 
 
 def column(table: pd.DataFrame, case: str = "0 to 1") -> dict[str, float]:
@@ -122,18 +122,18 @@ def test_each_kind_is_an_objective(kind: type[Requirement]) -> None:
 def test_a_weighted_term_shifts_the_compromise() -> None:
     (loop, given), gains = speed_loop(), list[float]()
     for weight in (1e-3, 1.0):
-        found = tune(loop, STEP, given, minimise={ITAE(): 1.0, NoiseGain(): weight}, method=FAST)
+        found = tune(loop, STEP, given, minimise={ITAE(): 1.0, NoiseGain(): weight}, method=FAST, plants={})
         gains.append(column(found.certified)["NoiseGain"])
     assert gains[1] < gains[0]
 
 
-def test_a_linear_loop_is_screened_where_the_exact_problem_has_no_equation() -> None:
+def test_a_linear_loop_is_raced_where_the_exact_problem_has_no_equation() -> None:
     loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
     given = loop.parameters.with_bounds({"pid.Kp": (0.1, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
     limits: list[Requirement] = [PeakControl(4.0), ControlRate(30.0)]
     with pytest.raises(InputError, match=r"TwoPhase has no equation for IAE, ControlRate; use method=Racing\(\)"):
         tune(loop, Step(1.0), given, minimise=IAE(), subject_to=limits, method=TwoPhase())
-    found = tune(loop, Step(1.0), given, minimise=IAE(), subject_to=limits)
+    found = tune(loop, Step(1.0), given, minimise=IAE(), subject_to=limits, plants={})
     assert column(found.certified)["ControlRate"] <= 30.0
     assert "simulations" in found.stats
 
@@ -166,6 +166,7 @@ def test_margins_hold_on_every_scenarios_plant() -> None:
         subject_to=[PhaseMargin(50.0), MaxSensitivity(1.8), Overshoot(0.1)],
         scenarios=stronger,
         method=FAST,
+        plants={},
     )
     margins = [column(found.certified, case)["PhaseMargin"] for case in ("0 to 1", "0 to 1 [stronger]")]
     assert min(margins) >= 50.0
@@ -195,7 +196,7 @@ def test_limits_come_first_whatever_the_objective_is_measured_in() -> None:
     bounds = {"pid.Kp": (0.1 * unit, 5 * unit), "pid.Ki": (unit, 60 * unit)}
     given = loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
     limits: list[Requirement] = [Overshoot(0.02), SettlingTime(max=0.15)]
-    found = tune(loop, Step(1.0, horizon=0.5), given, minimise=PeakControl(), subject_to=limits, method=FAST)
+    found = tune(loop, Step(1.0, horizon=0.5), given, minimise=PeakControl(), subject_to=limits, method=FAST, plants={})
     certified = column(found.certified)
     assert certified["Overshoot"] <= 2.0
     assert certified["SettlingTime"] <= 0.15

@@ -15,12 +15,12 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.method import SearchResult, TuningTask
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
-from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
-SMALL = Screening(12, 8, (), 60)
+SMALL = Racing(8, 60)
 
 
 def slow_problem() -> tuple[ClosedLoop, Any]:
@@ -33,7 +33,7 @@ def slow_problem() -> tuple[ClosedLoop, Any]:
 
 def test_a_design_that_creeps_is_followed_by_a_search_over_four_horizons(monkeypatch: pytest.MonkeyPatch) -> None:
     (loop, given), heard, horizons = slow_problem(), list[str](), list[float]()
-    certify, find = Search.certify_roundings, Screening.find
+    certify, find = Search.certify_roundings, Racing.find
 
     def refuse_once(search: Search, found: SearchResult, margin: float) -> TuningResult:
         result = certify(search, found, margin)
@@ -43,12 +43,12 @@ def test_a_design_that_creeps_is_followed_by_a_search_over_four_horizons(monkeyp
         refused = replace(result.certificate, findings=(creep,))
         return replace(result, status=Status(Code.NOT_CERTIFIED, ("it creeps",)), certificate=refused)
 
-    def record_horizon(method: Screening, task: TuningTask, *rest: Any) -> SearchResult:
+    def record_horizon(method: Racing, task: TuningTask, *rest: Any) -> SearchResult:
         horizons.append(task.references[0].horizon)
         return find(method, task, *rest)
 
     monkeypatch.setattr(Search, "certify_roundings", refuse_once)
-    monkeypatch.setattr(Screening, "find", record_horizon)
+    monkeypatch.setattr(Racing, "find", record_horizon)
     asked: Any = {"minimise": SettlingTime(), "subject_to": [Overshoot(0.05)], "method": SMALL, "plants": {}}
     found = tune(loop, Step(1.0, horizon=1.5), given, progress=heard.append, **asked)
     assert any("searching over 4 horizons" in text for text in heard)

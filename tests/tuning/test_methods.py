@@ -26,7 +26,6 @@ STEP, LIMITS = Step(1.0, horizon=1.0), (Overshoot(0.05),)
 SMALL: dict[str, dict[str, object]] = {  # options with which each one takes a second
     "two_phase": {"starts": 1, "nodes": [20, 20]},
     "racing": {"members": 8, "trials": 40, "bands": [4.0], "polish": 2},
-    "screening": {"members": 8, "generations": 3, "bands": [0.1], "refinements": 20},
 }
 FILE = """
 [method]
@@ -108,6 +107,7 @@ def test_it_finds_a_certified_design_and_reports_progress(kind: str, tmp_path: P
         subject_to=LIMITS,
         method=read(kind, tmp_path, SMALL[kind]),
         progress=heard.append,
+        plants={},
     )
     assert found.status.converged
     assert found.certified.loc["Overshoot"].max() <= 5.0
@@ -130,7 +130,7 @@ def test_it_can_be_interrupted(kind: str, tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     method = read(kind, tmp_path, SMALL[kind])
-    found = tune(loop, STEP, given, minimise=SettlingTime(), method=method, progress=stop, throw=False)
+    found = tune(loop, STEP, given, minimise=SettlingTime(), method=method, progress=stop, throw=False, plants={})
     assert found.status.code is Code.INTERRUPTED
     assert found.parameters.value("pid.Kp") == given.value("pid.Kp")
 
@@ -150,4 +150,11 @@ def test_what_it_refuses_does_not_suit_it(kind: str) -> None:
             refused += 1
             assert not method.suits(task)
         assert choose_method(task).suits(task)
-    assert refused == {"two_phase": 3, "racing": 0, "screening": 0}[kind]
+    assert refused == {"two_phase": 3, "racing": 0}[kind]
+
+
+@pytest.mark.parametrize("gone", ["screening", "condensed"])
+def test_a_file_that_names_a_method_of_old_is_told_its_successor(gone: str, tmp_path: Path) -> None:
+    message = rf"tuning.toml: \[method\]: '{gone}' is gone; write kind = 'racing', whose options are members, trials"
+    with pytest.raises(InputError, match=message):
+        read(gone, tmp_path, {"generations": 3})

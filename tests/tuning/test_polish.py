@@ -122,7 +122,15 @@ def test_further_kinds_are_read_as_the_metrics_and_have_their_slopes(requirement
 
 def test_an_integral_is_minimised_within_limits() -> None:
     loop, given = friction_loop()
-    best = tune(loop, Step(0.1, horizon=0.4), given, minimise=ITAE(), subject_to=[ControlRate(4e4), TUBE], method=QUICK)
+    best = tune(
+        loop,
+        Step(0.1, horizon=0.4),
+        given,
+        minimise=ITAE(),
+        subject_to=[ControlRate(4e4), TUBE],
+        method=QUICK,
+        plants={},
+    )
     assert best.status.converged
     assert best.certified.loc["ControlRate"].max() <= 4e4
     assert best.certified.loc["StepEnvelope"].max() <= 1.0
@@ -139,7 +147,13 @@ def test_what_has_no_gradient_is_named() -> None:
 def test_what_has_no_gradient_is_searched_without(requirement: Requirement) -> None:
     loop, given = friction_loop(Dither(80.0))
     best = tune(
-        loop, Step(0.1, horizon=0.3), given, minimise=requirement, subject_to=[SteadyStateError(0.05)], method=QUICK
+        loop,
+        Step(0.1, horizon=0.3),
+        given,
+        minimise=requirement,
+        subject_to=[SteadyStateError(0.05)],
+        method=QUICK,
+        plants={},
     )
     assert best.status.converged
 
@@ -183,6 +197,7 @@ def test_a_tolerance_spreads_the_candidate(sample_time: float | None) -> None:
         subject_to=[PeakControl(11.0)],
         scenarios=tolerances(given, {"pid.Kp": 0.1}),
         method=QUICK,
+        plants={},
     )
     assert best.parameters.value("pid.Kp") == pytest.approx(10.0, rel=0.01)
     assert best.certified["0 to 1 [pid.Kp high]"]["PeakControl"] <= 11.0
@@ -201,6 +216,7 @@ def on_corners(limits: list[Requirement], method: Racing | None = None) -> Tunin
         subject_to=limits,
         scenarios=scenarios,
         method=method,
+        plants={},
     )
 
 
@@ -243,7 +259,7 @@ def test_ctrl_c_keeps_the_given_gains() -> None:
     def stop(_: str) -> None:
         raise KeyboardInterrupt
 
-    result = tune(loop, Step(0.1), given, minimise=SettlingTime(), method=QUICK, throw=False, progress=stop)
+    result = tune(loop, Step(0.1), given, minimise=SettlingTime(), method=QUICK, throw=False, progress=stop, plants={})
     assert result.status.code is Code.INTERRUPTED
     assert result.parameters.value("pid.Kp") == given.value("pid.Kp")
 

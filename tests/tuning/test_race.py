@@ -16,6 +16,7 @@ from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
     ITAE,
+    ROBUSTNESS_REQUIREMENTS,
     MaxSensitivity,
     Overshoot,
     PeakControl,
@@ -29,6 +30,7 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.race import Race, may_be_cut
 from pneuopt.tuning.readings import loop_pieces
+from pneuopt.tuning.responses import Responses
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 
@@ -123,6 +125,31 @@ def test_a_rival_saves_most_of_the_simulation(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(Simulator, "read", count)
     race.race(given, np.full(len(given), merits.min()), worst)
     assert lanes == [len(simulator.cases)]
+
+
+def test_margins_are_read_of_those_only_that_can_still_win(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit on a margin can only raise a merit; beside a bound the others get one too."""
+    limits = [*LIMITS, MaxSensitivity(1.3)]
+    simulator, spec = make_simulator("sampled", SettlingTime(0.1), limits), specify(SettlingTime(0.1), limits)
+    race, given, judged = Race(simulator, spec, 0.2), points(simulator), list[int]()
+    merits, worst = race.merits(given)
+    read = Responses.with_margins
+
+    def count(responses: Responses, rows: np.ndarray) -> dict[str, np.ndarray]:
+        judged.append(int(rows.sum()))
+        return read(responses, rows)
+
+    monkeypatch.setattr(Responses, "with_margins", count)
+    rivals = np.full(len(given), np.quantile(merits, 0.2))
+    bounded, raced = race.merits(given, rivals)[0], race.race(given, rivals, worst)[0]
+    won = merits <= rivals
+    for found in (bounded, raced):
+        assert found[won] == pytest.approx(merits[won], rel=1e-12)
+        assert (found[~won] > rivals[~won]).all()
+    plain = spec.without(ROBUSTNESS_REQUIREMENTS)
+    ahead = compute_merits(simulator.values(given, plain), plain, 0.2) <= rivals
+    assert judged == [ahead.sum()] * 2
+    assert won.sum() <= ahead.sum() < len(given)
 
 
 def test_a_response_cut_short_settles_when_the_whole_one_does() -> None:

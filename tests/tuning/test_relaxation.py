@@ -23,13 +23,13 @@ from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.method import Method
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
-FAST = Screening(members=20, generations=6, bands=(), refinements=80)
+FAST, PRECISE = Racing(members=8, trials=60), Racing(polish=0)
 PEAK, ERROR = 30.0, 0.02
 
 
@@ -38,10 +38,10 @@ def proportional(sample_time: float | None) -> TuningResult:
     """P control of y' = -y + u: the command begins with 2 Kp, the error ends at 1/(1 + Kp); 15 and 49 contradict."""
     loop = ClosedLoop(FirstOrder().system(), PID(sample_time, limits=False))
     given = loop.parameters.with_values({"plant.time_constant": 1.0}).with_bounds({"pid.Kp": (1.0, 200.0)})
-    method: Method = TwoPhase(nodes=(10, 12), starts=1) if sample_time is None else FAST
+    method: Method = TwoPhase(nodes=(10, 12), starts=1) if sample_time is None else PRECISE
     limits: list[Requirement] = [PeakControl(PEAK), SteadyStateError(ERROR)]
     step, free = Step(2.0), given.freed("pid.Kp")
-    return tune(loop, step, free, minimise=SettlingTime(0.1), subject_to=limits, method=method, throw=False)
+    return tune(loop, step, free, minimise=SettlingTime(0.1), subject_to=limits, method=method, throw=False, plants={})
 
 
 @pytest.mark.parametrize("sample_time", [None, 1e-3])
@@ -76,7 +76,7 @@ def slow() -> TuningResult:
     loop, given = oscillator()
     limits: list[Requirement] = [SettlingTime(max=0.35), Overshoot(0.02), PeakControl(1.2)]
     step = Step(1.0, horizon=1.0)
-    return tune(loop, step, given, minimise=SettlingTime(), subject_to=limits, method=FAST, throw=False)
+    return tune(loop, step, given, minimise=SettlingTime(), subject_to=limits, method=FAST, throw=False, plants={})
 
 
 def test_a_relaxed_limit_is_the_least_on_a_grid_and_its_design_keeps_the_others() -> None:
@@ -102,7 +102,7 @@ def test_a_relaxed_limit_is_the_least_on_a_grid_and_its_design_keeps_the_others(
 def test_a_single_limit_is_answered_with_what_can_be_had() -> None:
     loop, given = oscillator()
     step, limits = Step(1.0, horizon=1.0), [GainMargin(500.0)]
-    result = tune(loop, step, given, minimise=SettlingTime(), subject_to=limits, method=FAST, throw=False)
+    result = tune(loop, step, given, minimise=SettlingTime(), subject_to=limits, method=FAST, throw=False, plants={})
     table: Any = result.relaxations
     needed = table.loc["GainMargin", "needed"]
     assert list(result.relaxations.index) == ["GainMargin"]
@@ -124,6 +124,7 @@ def test_limits_that_only_the_margins_miss_are_kept() -> None:
         subject_to=limits,
         method=method,
         throw=False,
+        plants={},
     )
     assert best.status.converged, best.status
     assert best.parameters.value("pid.Kp") == pytest.approx(49.0, rel=1e-3)
@@ -134,7 +135,7 @@ def test_what_is_left_of_each_limit_is_in_the_result() -> None:
     loop, given = oscillator()
     limits: list[Requirement] = [Overshoot(0.05), PeakControl(3.0), GainMargin(3.0)]
     step = Step(1.0, horizon=1.0)
-    best = tune(loop, step, given, minimise=SettlingTime(), subject_to=limits, method=FAST)
+    best = tune(loop, step, given, minimise=SettlingTime(), subject_to=limits, method=FAST, plants={})
     found: Any = best.requirements  # its cells are numbers
     own = evaluate(loop, step, best.parameters)["0 to 1"]
     assert list(found.index) == ["SettlingTime", "Overshoot", "PeakControl", "GainMargin"]

@@ -29,8 +29,8 @@ from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning import certifier
 from pneuopt.tuning.method import SearchResult
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.result import TuningResult
-from pneuopt.tuning.screening import Screening
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
@@ -45,7 +45,7 @@ def search(
     given = loop.parameters.with_bounds({"pid.Kp": (0.0, 10.0), "pid.Ki": (0.0, 100.0)}).freed("pid.Kp", "pid.Ki")
     given = given.with_values({"pid.Kp": 0.5, "pid.Ki": 5.0})
     task = prepare_task(loop, Step(1.0, horizon=2.0), given, specify(minimise, limits), scenarios or {}, accept)
-    return prepare_search(task, Screening())
+    return prepare_search(task, Racing())
 
 
 class ForgedSimulator:
@@ -160,7 +160,7 @@ def test_a_design_that_hardly_moves_is_never_certified(kind: type[Requirement]) 
 
 def test_a_search_that_may_stand_still_is_repeated_among_designs_that_arrive() -> None:
     """The least peak of a command that brings a gain of 1 to within 2 % of the reference is 0.98 V."""
-    best = replace(search(PeakControl(), Overshoot(0.05)), method=Screening(16, 6, (), 60)).run()
+    best = replace(search(PeakControl(), Overshoot(0.05)), method=Racing(8, 60)).run()
     assert best.status.converged
     assert best.requirements.T["PeakControl"]["certified"] == pytest.approx(0.99, rel=0.02)
     assert best.certified.T["SettlingTime"].max() <= 1.9
@@ -174,7 +174,7 @@ def test_a_rest_off_the_reference_is_accepted_as_far_as_a_limit_on_it_says() -> 
 
     def rest(*limits: Requirement) -> TuningResult:
         task = prepare_task(loop, Step(1.0), given, specify(IAE(), limits))
-        return prepare_search(task, Screening()).certify_point(np.array([9.0]))  # rests 10 % off
+        return prepare_search(task, Racing()).certify_point(np.array([9.0]))  # rests 10 % off
 
     assert rest(SteadyStateError(0.11)).status.converged
     assert "misses the reference" in rest().status.sentences[0]

@@ -9,7 +9,7 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import IAE, ITAE, MaxSensitivity, Overshoot, Requirement, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import SecondOrder
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import tune
@@ -48,10 +48,10 @@ def test_slow_responses_need_no_more_samples() -> None:
 @pytest.mark.parametrize("minimise", [SettlingTime(), ITAE()])
 def test_a_fast_loop_in_a_long_horizon_is_claimed_as_it_is(minimise: Requirement) -> None:
     loop, simulator = problem()
-    small = Screening(12, 8, (), 60)
+    small = Racing(8, 60)
     limits = [Overshoot(0.05), MaxSensitivity(2.0)]
     given = simulator.space.parameters
-    found = tune(loop, STEP, given, minimise=minimise, subject_to=limits, method=small, throw=False)
+    found = tune(loop, STEP, given, minimise=minimise, subject_to=limits, method=small, throw=False, plants={})
     claimed, certified = found.requirements["claimed"], found.requirements["certified"]
     assert found.status.converged
     np.testing.assert_allclose(claimed, certified, rtol=5e-3, atol=1e-3)

@@ -16,7 +16,7 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.tuning.screening import Screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space, dither_resolution_rate, search_space
 from pneuopt.tuning.tune import tune
@@ -71,8 +71,8 @@ def test_frequency_is_tuned_with_the_rest() -> None:
     loop, p = axis(1e-3)
     bounds = {"pid.Kp": (100.0, 600.0), "dither.amplitude": (30.0, 60.0), "dither.frequency": (20.0, 200.0)}
     free = p.with_bounds(bounds).with_values({"dither.frequency": 25.0}).freed(*bounds)
-    method = Screening(members=12, generations=3, refinements=30)
-    best = tune(loop, STEP, free, minimise=SettlingTime(0.05), subject_to=[Ripple(0.03)], method=method)
+    method = Racing(members=8, trials=40)
+    best = tune(loop, STEP, free, minimise=SettlingTime(0.05), subject_to=[Ripple(0.03)], method=method, plants={})
     assert best.parameters.value("dither.frequency") > 40.0
     assert best.certified.loc["Ripple"].max() <= 0.03
 

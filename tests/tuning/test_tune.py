@@ -25,8 +25,7 @@ from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.tuning.responses import Responses
-from pneuopt.tuning.screening import MeritFunction, Screening, run_screening
+from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
@@ -66,7 +65,9 @@ def settled(parameters: ParameterSet, band: float, horizon: float = 1.0) -> floa
 def tuned() -> TuningResult:
     loop, parameters = benchmark()
     given = parameters.with_bounds({"dither.amplitude": (0.0, 0.1)}).freed("dither.amplitude")
-    return tune(loop, STEP, given, minimise=SettlingTime(0.001), subject_to=LIMITS, method=TwoPhase(starts=1))
+    return tune(
+        loop, STEP, given, minimise=SettlingTime(0.001), subject_to=LIMITS, method=TwoPhase(starts=1), plants={}
+    )
 
 
 def test_the_benchmark_reaches_its_optimum_as_printed() -> None:
@@ -119,6 +120,7 @@ def test_a_first_order_plant_has_a_known_answer() -> None:
         minimise={SettlingTime(0.05): 1.0},
         subject_to=[PeakControl(100.0)],
         method=TwoPhase(starts=2, digits=None),
+        plants={},
     )
     kp, share = best.parameters.value("pid.Kp"), 1 / 51
     assert kp == pytest.approx(50.0, rel=1e-3)
@@ -132,7 +134,8 @@ def test_weighted_terms_trade_off() -> None:
     method = TwoPhase((20, 25), starts=1)
     terms: list[dict[Requirement, float]] = [{SettlingTime(0.02): 1.0, MaxSensitivity(): w} for w in (1e-3, 1.0)]
     fast, calm = (
-        tune(loop, STEP, parameters, minimise=m, subject_to=limits, method=method).certified["0 to 1"] for m in terms
+        tune(loop, STEP, parameters, minimise=m, subject_to=limits, method=method, plants={}).certified["0 to 1"]
+        for m in terms
     )
     assert fast["SettlingTime"] < calm["SettlingTime"]
     assert fast["MaxSensitivity"] > calm["MaxSensitivity"]
@@ -155,7 +158,9 @@ def test_an_optimum_that_grazes_is_rejected(monkeypatch: pytest.MonkeyPatch) -> 
     """Without a margin and without digits to spare, two printed digits cannot keep a band of 0.1 %."""
     loop, parameters = benchmark()
     method = TwoPhase(starts=1, margin=0.0, digits=2)
-    result = tune(loop, STEP, parameters, minimise=SettlingTime(0.001), subject_to=LIMITS, method=method, throw=False)
+    result = tune(
+        loop, STEP, parameters, minimise=SettlingTime(0.001), subject_to=LIMITS, method=method, throw=False, plants={}
+    )
     assert result.status.code is Code.NOT_CERTIFIED
     assert [result.parameters.value(n) for n in GAINS] == [parameters.value(n) for n in GAINS]
     assert result.stats["rejected.pid.Kp"] != parameters.value("pid.Kp")
@@ -170,13 +175,13 @@ def friction_loop(sample_time: float | None = 1e-3) -> tuple[ClosedLoop, Paramet
     return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
 
 
-def test_a_drive_with_friction_is_tuned_by_screening() -> None:
+def test_a_drive_with_friction_is_tuned_by_simulation() -> None:
     loop, parameters = friction_loop()
     assert not is_linear(loop)
     references = [Step(0.1, horizon=0.5), Step(0.25, horizon=0.5)]
     limits: list[Requirement] = [Overshoot(0.05), MaxSensitivity(1.6)]
-    method = Screening(members=20, generations=4, refinements=60)
-    best = tune(loop, references, parameters, minimise=SettlingTime(), subject_to=limits, method=method)
+    method = Racing(members=8, trials=40)
+    best = tune(loop, references, parameters, minimise=SettlingTime(), subject_to=limits, method=method, plants={})
     before = evaluate(loop, references, parameters)
     assert list(best.certified) == ["0 to 0.1", "0 to 0.25"]
     assert bool((best.certified.loc["SettlingTime"] < 0.06).all())
@@ -258,6 +263,7 @@ def test_steady_state_error_can_be_a_limit() -> None:
         minimise=PeakControl(),
         subject_to=[SteadyStateError(0.1)],
         method=TwoPhase((20, 25), starts=1),
+        plants={},
     )
     assert best.parameters.value("pid.Kp") == pytest.approx(1 / 0.097 - 1, rel=1e-3)
 
@@ -267,38 +273,6 @@ def test_modes_too_fast_for_the_grid_are_refused() -> None:
     wide = parameters.with_bounds({"pid.Tf": (1e-5, 0.05)})
     with pytest.raises(InputError, match=r"raise the lower one of pid\.Tf"):
         tune(loop, STEP, wide, minimise=SettlingTime(), method=TwoPhase())
-
-
-def test_a_race_saves_sensitivities_and_changes_nothing() -> None:
-    """The points that cannot beat their rivals get a bound; the search finds what it found."""
-    loop, parameters = friction_loop()
-    space, references = search_space(loop, parameters), [Step(0.1, horizon=0.3)]
-    spec = specify(SettlingTime(), [Overshoot(0.05), MaxSensitivity(1.3)])
-    simulator, judged = Simulator(loop, references, space), list[int]()
-    robust = Responses.with_margins
-
-    def counting(responses: Responses, rows: np.ndarray) -> dict[str, np.ndarray]:
-        judged.append(int(rows.sum()))
-        return robust(responses, rows)
-
-    method = Screening(members=12, generations=3, refinements=0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Responses, "with_margins", counting)
-        found = run_screening(simulator, references, space, spec, method, space.start, lambda _: None)
-    assert found.is_complete
-    assert found.count == 12 * 4 * 4
-    assert sum(judged) < 0.7 * found.count
-
-    def plainly(
-        merit: MeritFunction, unit: np.ndarray, _: np.ndarray, first: np.ndarray | None
-    ) -> tuple[np.ndarray, ...]:
-        return race(merit, unit, np.full(len(unit), np.inf), first)
-
-    with pytest.MonkeyPatch.context() as patch:
-        race = MeritFunction.race
-        patch.setattr(MeritFunction, "race", plainly)
-        plain = run_screening(simulator, references, space, spec, method, space.start, lambda _: None)
-    assert np.array_equal(found.point, plain.point)
 
 
 def test_references_run_together_or_alone_alike() -> None:
@@ -373,9 +347,10 @@ def interrupted(after: int) -> TuningResult:
         parameters,
         minimise=SettlingTime(),
         subject_to=[Overshoot(0.05)],
-        method=Screening(members=20, generations=4, refinements=60),
+        method=Racing(members=8, trials=40),
         throw=False,
         progress=stop,
+        plants={},
     )
 
 
