@@ -64,9 +64,13 @@ class ReferenceGrid:
         return replace(self, reference=reference, t=self.t[: last + 1], u=self.u[: last + 1])
 
     def pad(self, n: int) -> tuple[Array, Array, Array]:
-        """Inputs, instants and steps, the last sample repeated up to n samples with steps of 0: there a run ends."""
-        k = np.minimum(np.arange(n), len(self.t) - 1)
-        return self.u[k], self.t[k], np.append(np.diff(self.t), 0.0)[k]
+        """Inputs, instants and steps, the last sample repeated up to n samples with steps of 0: there a run ends.
+
+        A held controller would act again at each of them: they lie between two of its samples.
+        """
+        k, added = np.minimum(np.arange(n), len(self.t) - 1), np.arange(n) >= len(self.t)
+        later = 0.0 if self.sample_time is None else 0.5 * self.spacing * added
+        return self.u[k], self.t[k] + later, np.append(np.diff(self.t), 0.0)[k]
 
     def at(self, t: Array) -> "ReferenceGrid":
         """The same inputs, held as before, at other instants between the first and the last."""

@@ -288,6 +288,22 @@ def test_references_run_together_or_alone_alike() -> None:
     assert many["SettlingTime"].shape == (9,)
 
 
+def test_a_shorter_reference_beside_a_longer_one_ends_where_it_ends_alone() -> None:
+    """A held controller acted again at each sample of the padding: its integral moved by a sixth."""
+    loop, parameters = friction_loop()
+    space, references = search_space(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, horizon=0.2)]
+    simulator, m = Simulator(loop, references, space), 4
+    points, row = space.from_unit(np.random.default_rng(3).random((m, 4))), np.arange(m)
+    p, starts = simulator.lanes(points, row, np.ones(m, dtype=np.intp))
+
+    def end(n: int) -> np.ndarray:
+        u, t, h = (np.array([column] * m) for column in simulator.grids[1].pad(n))
+        return simulator.rollout.run(starts, u, p, t, h, substeps=max(simulator.substeps)).x_end
+
+    alone = len(simulator.grids[1].t)
+    assert np.array_equal(end(alone + 100), end(alone))
+
+
 def test_the_search_reads_what_the_certificate_reads() -> None:
     loop, parameters = friction_loop()
     space, steps = search_space(loop, parameters), [Step(0.1, horizon=0.3), Step(-0.2, at=0.05, horizon=0.3)]
