@@ -1,15 +1,39 @@
-"""Rows of a study, one a seed, in processes: kept as they come, and resumed."""
+"""Rows of a study, one a seed, in processes: kept as they come, and resumed; the options of such a study."""
 
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from problems.shared.claims import arguments
+
 if TYPE_CHECKING:
     import pandas as pd
 
 Row = dict[str, Any]
+
+
+def row_arguments(description: str | None, count: int) -> ArgumentParser:
+    """A parser with the options of a script that makes a row a seed; a script adds its own."""
+    parser = arguments(description)
+    parser.add_argument(
+        "--count", type=int, default=count, metavar="N", help="problems; of each set, if there are some"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes")
+    parser.add_argument("--resume", action="store_true", help="go on with the rows that --out holds")
+    return parser
+
+
+def study_rows(make: Callable[[int], Row], seeds: Sequence[int], options: Namespace, name: str) -> "pd.DataFrame":
+    """The rows of `rows_by_seed`, kept in --out as NAME.csv, as the options of `row_arguments` say."""
+    kept = None if options.out is None else options.out / f"{name}.csv"
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        if not options.resume:
+            kept.unlink(missing_ok=True)
+    return rows_by_seed(make, seeds, options.jobs, kept)
 
 
 def rows_by_seed(make: Callable[[int], Row], seeds: Sequence[int], jobs: int, kept: Path | None) -> "pd.DataFrame":

@@ -32,17 +32,16 @@ from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from problems.shared import random_problems
 from problems.shared.arrays import Array
-from problems.shared.claims import Claim, arguments, finish, frame
+from problems.shared.claims import Claim, finish, frame
 from problems.shared.plain_loop import PlainResponse, plain_kind, simulate_plainly
 from problems.shared.random_problems import Plant, random_steps
-from problems.shared.rows import rows_by_seed
+from problems.shared.rows import row_arguments, study_rows
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
 COUNT, FIRST, WHOLE = 12, 0, 200
-FILE = "random_designs.csv"
 HORIZONS = 5
 BAND = 0.02
 SLACK = 2e-3  # of the step: what fixed steps, readings and the mean over a period differ by
@@ -241,17 +240,8 @@ def figure(rows: "pd.DataFrame") -> "Figure":
 
 
 if __name__ == "__main__":
-    parser = arguments(__doc__)
-    parser.add_argument("--count", type=int, default=COUNT, help="problems")
+    parser = row_arguments(__doc__, COUNT)
     parser.add_argument("--first", type=int, default=FIRST, metavar="SEED", help="seed of the first problem")
-    parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes")
-    parser.add_argument("--resume", action="store_true", help="go on with the rows that --out holds")
     options = parser.parse_args()
-    kept = None if options.out is None else options.out / FILE
-    if kept is not None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        if not options.resume:
-            kept.unlink(missing_ok=True)
-    seeds = list(range(options.first, options.first + options.count))
-    rows = rows_by_seed(design_row, seeds, options.jobs, kept)
+    rows = study_rows(design_row, range(options.first, options.first + options.count), options, "random_designs")
     sys.exit(finish(main(rows), options, lambda: {"random_designs": figure(rows)}))

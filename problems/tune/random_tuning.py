@@ -14,9 +14,6 @@ out. --out keeps a row a problem in random_tuning.csv as they come; --resume goe
 
 import sys
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +23,9 @@ import numpy as np
 
 import pneuopt as po
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
-from problems.shared.claims import Claim, arguments, finish, frame
+from problems.shared.claims import Claim, finish, frame
 from problems.shared.random_problems import problem
+from problems.shared.rows import row_arguments, study_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,7 +34,6 @@ if TYPE_CHECKING:
 COUNT, FIRST = 9, 0
 WHOLE = 100  # problems of the study
 OUTCOMES = {po.Code.CONVERGED: "solved", po.Code.NOT_CERTIFIED: "rejected", po.Code.INFEASIBLE: "relaxed"}
-FILE = "random_tuning.csv"
 
 
 def main(rows: "pd.DataFrame") -> "pd.DataFrame":
@@ -59,30 +56,6 @@ def main(rows: "pd.DataFrame") -> "pd.DataFrame":
     kinds = rows.groupby("kind")["outcome"]
     claims += [Claim(f"{kind}.solved", 100 * float((o == "solved").mean()), "%") for kind, o in kinds]
     return frame(claims)
-
-
-def run(seeds: list[int], jobs: int, kept: Path | None) -> "pd.DataFrame":
-    """A row a problem; those that `kept` already has are not tuned again."""
-    import pandas as pd
-
-    read = pd.read_csv(kept).to_dict("records") if kept is not None and kept.exists() else []
-    rows = [{str(k): v for k, v in row.items()} for row in read]
-    done = {int(r["seed"]) for r in rows}
-    for row in _outcomes([s for s in seeds if s not in done], jobs):
-        rows.append(row)
-        print(f"{row['seed']} {row['kind']}: {row['outcome']} {row['certified']:.4g} s, {row['status']}", flush=True)
-        if kept is not None:
-            pd.DataFrame(rows).to_csv(kept, index=False)
-    table = pd.DataFrame(rows)
-    return table[table["seed"].isin(seeds)].sort_values("seed")
-
-
-def _outcomes(seeds: list[int], jobs: int) -> Iterator[dict[str, Any]]:
-    if jobs == 1:
-        yield from map(tuned, seeds)
-        return
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        yield from (future.result() for future in as_completed([pool.submit(tuned, seed) for seed in seeds]))
 
 
 def tuned(seed: int) -> dict[str, Any]:
@@ -145,16 +118,8 @@ def figure(rows: "pd.DataFrame") -> "Figure":
 
 
 if __name__ == "__main__":
-    parser = arguments(__doc__)
-    parser.add_argument("--count", type=int, default=COUNT, help="problems")
+    parser = row_arguments(__doc__, COUNT)
     parser.add_argument("--first", type=int, default=FIRST, metavar="SEED", help="seed of the first problem")
-    parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes")
-    parser.add_argument("--resume", action="store_true", help="go on with the rows that --out holds")
     options = parser.parse_args()
-    kept = None if options.out is None else options.out / FILE
-    if kept is not None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        if not options.resume:
-            kept.unlink(missing_ok=True)
-    rows = run(list(range(options.first, options.first + options.count)), options.jobs, kept)
+    rows = study_rows(tuned, range(options.first, options.first + options.count), options, "random_tuning")
     sys.exit(finish(main(rows), options, lambda: {"random_tuning": figure(rows)}))

@@ -36,8 +36,8 @@ from pneuopt.evaluation.requirements import metric_name
 from pneuopt.evaluation.specification import Specification, specify
 from pneuopt.plotting import BLUE, GREY, ORANGE, RED, axes_grid, legend_above
 from pneuopt.tuning.tune import prepare_search, prepare_task
-from problems.shared.claims import Claim, arguments, finish, frame
-from problems.shared.rows import rows_by_seed
+from problems.shared.claims import Claim, finish, frame
+from problems.shared.rows import row_arguments, study_rows
 from problems.speed.t32 import best_of, scipy_search
 
 if TYPE_CHECKING:
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COUNT = 2
-FILE = "rule_comparison.csv"
 SENSITIVITY, OVERSHOOT = 1.8, 0.1  # what SIMC keeps: its Ms is 1.59 to 1.70, the derivative's filter adds to it
 FILTERS = (0.05, 1.0)  # of the dead time: the box of Tf; a shorter filter amplifies noise, and costs steps
 REACH = 5.0  # of the rules' largest gains: the box of Kp, Ki and Kd
@@ -249,15 +248,6 @@ def figure(rows: "pd.DataFrame") -> "Figure":
 
 
 if __name__ == "__main__":
-    parser = arguments(__doc__)
-    parser.add_argument("--count", type=int, default=COUNT, metavar="N", help="problems of each set")
-    parser.add_argument("--jobs", type=int, default=1, metavar="J", help="processes")
-    parser.add_argument("--resume", action="store_true", help="go on with the rows that --out holds")
-    options = parser.parse_args()
-    kept = None if options.out is None else options.out / FILE
-    if kept is not None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        if not options.resume:
-            kept.unlink(missing_ok=True)
-    rows = rows_by_seed(compared, range(len(SETS) * options.count), options.jobs, kept)
+    options = row_arguments(__doc__, COUNT).parse_args()
+    rows = study_rows(compared, range(len(SETS) * options.count), options, "rule_comparison")
     sys.exit(finish(main(rows), options, lambda: {"rule_comparison": figure(rows)}))

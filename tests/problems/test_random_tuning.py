@@ -8,6 +8,7 @@ import pytest
 
 import pneuopt as po
 from problems.shared import random_problems
+from problems.shared.rows import rows_by_seed
 from problems.tune import random_tuning
 
 ROW = {"kind": "s32", "redrawn": 0, "known": 0.2, "sample_time": 0.0, "claimed": 0.1, "certified": 0.1, "cpu": 1.0}
@@ -42,10 +43,10 @@ def test_a_problem_is_its_seeds_and_its_limits_leave_the_margin(seed: int) -> No
 
 @pytest.mark.slow
 def test_one_is_solved_and_drawn(tmp_path: Path) -> None:
-    found = random_tuning.run([2], 1, tmp_path / "rows.csv")
+    found = rows_by_seed(random_tuning.tuned, [2], 1, tmp_path / "rows.csv")
     assert found["outcome"].tolist() == ["solved"]
     assert found["certified"].item() <= 1.1 * found["known"].item()
     assert found["deviation"].item() <= 1e-3
-    kept = random_tuning.run([2], 1, tmp_path / "rows.csv")
+    kept = rows_by_seed(random_tuning.tuned, [2], 1, tmp_path / "rows.csv")
     assert np.allclose(kept["certified"], found["certified"])
     random_tuning.figure(found).savefig(tmp_path / "picture.png")
