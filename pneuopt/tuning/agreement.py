@@ -73,14 +73,14 @@ def compare_starts(objectives: Sequence[float], tolerance: float) -> Agreement:
 
 
 def describe_agreement(stats: Mapping[str, float]) -> tuple[str, str]:
-    """Words on the agreement of a result's starts, and a sentence where some do not agree; empty where unknown.
+    """Words on the agreement of a result's starts, and a sentence where some do not agree; empty where none has ended.
 
     Examples
     --------
     >>> print(*describe_agreement(compare_starts([0.94, 0.94, 0.94, 1.223], 1e-3).stats), sep="; ")
     3 of 4 starts agree; others end up to 30 % worse, one start more would find another optimum with a chance of 50 %
     """
-    if "starts" not in stats:
+    if not stats.get("starts"):
         return "", ""
     agreeing, starts = stats["starts_agreeing"], stats["starts"]
     words = f"{agreeing:.0f} of {starts:.0f} starts agree"

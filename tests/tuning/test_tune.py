@@ -374,7 +374,7 @@ def test_ctrl_c_keeps_the_given_gains_and_shows_the_best_so_far_certified() -> N
     _, given = friction_loop()
     result = interrupted(after=16)  # the first line says that the given gains never settle
     assert result.status.code is Code.INTERRUPTED
-    assert result.status.message.startswith("the best of 380 simulations so far holds: certified objective 0.0")
+    assert result.status.message.startswith("the best of 251 simulations so far holds: certified objective 0.0")
     assert {n: p.value for n, p in result.parameters.items()} == {n: p.value for n, p in given.items()}
     assert result.certified["0 to 0.1"]["SettlingTime"] < 0.1
     assert result.stats["rejected.pid.Kp"] != given.value("pid.Kp")
@@ -384,5 +384,6 @@ def test_ctrl_c_at_once_says_that_nothing_was_found() -> None:
     assert interrupted(after=1).status.message.startswith("the best of 1 simulations so far does not hold")
     result = interrupted(after=2)
     assert result.status.code is Code.INTERRUPTED
-    assert result.status.message.startswith("the best of 40 simulations so far ")
+    assert result.status.message.startswith("the best of 16 simulations so far ")
+    assert "starts agree" not in result.status.message
     assert result.status.message.endswith("run again for an answer")
