@@ -117,8 +117,11 @@ def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = la
     yield from [c for c in candidates[1:] if not settled or not c.trial_parameters]
 
 
-def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[float, Start]:
-    """The cost that a start reaches with its guesses held, and the start from there."""
+def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[tuple[float, float], Start]:
+    """What a start reaches with its guesses held, and the start from there.
+
+    A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones.
+    """
     transcription = problem.transcription(candidate)
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
     bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
@@ -127,7 +130,7 @@ def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[float, 
     if fit.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     start = problem.start_from(fit, f"{candidate.label}, settled")
-    return fit.stats["cost"], replace(start, parameters={**start.parameters, **guesses})
+    return (fit.stats["gap_deviation"], fit.stats["cost"]), replace(start, parameters={**start.parameters, **guesses})
 
 
 def fit_holding_unidentifiable(problem: EstimationProblem, start: Start) -> tuple[EstimationProblem, Fit]:

@@ -87,12 +87,14 @@ class ArrowEquations:
     node_gradient: Array
     gradient: Array
 
-    def eliminate(self, damping: float) -> ReducedEquations | None:
+    def eliminate(self, damping: float, node_damping: Array | float = 0.0) -> ReducedEquations | None:
         """Eliminate the nodes, with Marquardt's multiplicative damping of the diagonal.
 
         Parameters
         ----------
         damping : float
+        node_damping : float or ndarray, shape (m,)
+            Damping of each node, on top.
 
         Returns
         -------
@@ -103,7 +105,7 @@ class ArrowEquations:
         flat = self.border.reshape(m * n, k)
         right = np.concatenate([flat, self.node_gradient.reshape(m * n, 1)], axis=1)
         try:
-            solved = self._solve_nodes(right, damping) if m * n else right
+            solved = self._solve_nodes(right, damping + node_damping) if m * n else right
         except LinAlgError:
             return None
         corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-300)
@@ -119,11 +121,11 @@ class ArrowEquations:
         """Rate at which the cost falls along a step."""
         return -float(np.sum(self.node_gradient * step.nodes) + self.gradient @ step.parameters)
 
-    def _solve_nodes(self, right: Array, damping: float) -> Array:
+    def _solve_nodes(self, right: Array, damping: Array | float) -> Array:
         factor = cholesky_banded(self._band_storage(damping), overwrite_ab=True, check_finite=False)
         return np.asarray(cho_solve_banded((factor, False), right, check_finite=False))
 
-    def _band_storage(self, damping: float) -> Array:
+    def _band_storage(self, damping: Array | float) -> Array:
         """Upper banded storage of D for LAPACK's pbtrf."""
         m, n, _ = self.diagonal.shape
         upper = 2 * n - 1
@@ -133,7 +135,7 @@ class ArrowEquations:
                 banded[upper + a - b, b::n] = self.diagonal[:, a, b]
             for b in range(n):
                 banded[upper + a - n - b, n + b :: n] = self.coupling[:-1, a, b]
-        banded[upper] *= 1 + damping
+        banded[upper] *= 1 + np.repeat(np.broadcast_to(damping, m), n)
         banded[upper] += STATE_REGULARISATION
         return banded
 

@@ -19,6 +19,15 @@ from pneuopt.shooting.segments import IntegrationCorrection, Segments
 # width of a flat prior, in standard deviations by the data with all else known: lower lets the prior narrow intervals,
 # higher loses digits
 FLAT_PRIOR_WIDTH = 1e3
+# share [1] of a step's squares below which a segment's excess is no curvature: lower takes rounding for it, higher
+# leaves a node that overshoots
+CURVATURE_RESOLUTION = 1e-6
+# share of all nodes [1], and least number, that may overshoot: more slow a search down that is still far off, fewer
+# leave the step of all to be cut for the sake of some
+MAX_OVERSHOOTING_SHARE, MIN_OVERSHOOTING_NODES = 0.02, 3
+# share of the excess [1] that these nodes must make up: lower damps nodes where the parameters' step is too long
+MIN_LOCAL_EXCESS = 0.9
+MAX_NODE_DAMPING = 1e6  # times a node's diagonal [1]: higher overflows, lower lets a node move that must not
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,15 +236,45 @@ def second_order_correction(equations: NormalEquations, step: Array, moved: Arra
     ndarray, shape (m, n)
     """
     segments, slopes, n = equations.segments, equations.linearisation, nodes.shape[1]
-    change = np.zeros(slopes.end_sensitivities.shape[::2])
-    change[:, :n] = step
-    for rows, columns, unknowns in segments.blocks:
-        change[rows, n + columns] = (slopes.chain * moved)[unknowns]
-    promised = slopes.gaps + (slopes.end_sensitivities @ change[..., None])[..., 0]
-    promised[:-1] -= step[1:]
-    excess = np.where(segments.linked[:, None], gaps - promised, 0.0)
+    excess = gaps - _promised_gaps(equations, _unknown_changes(equations, step, moved))
     shift = _propagate_shifts(np.where(segments.linked[:, None, None], slopes.end_sensitivities[:, :, :n], 0.0), excess)
     return np.asarray(nodes + shift * segments.nominal)
+
+
+def missed_curvature(
+    equations: NormalEquations, step: Array, moved: Array, trial: NormalEquations, sigma: Array
+) -> Array:
+    """The curvature that Gauss-Newton's model has missed along a step, by node, where a few nodes missed nearly all.
+
+    A segment's residuals are nonlinear in its own node. What its cost exceeds the model's by is put down to a term
+    ``damping * diagonal`` of that node, which added to the model would have promised the cost that came.
+
+    Parameters
+    ----------
+    equations : NormalEquations
+        Where the step (nodes `step`, shape (m, n) in nominal sizes; parameters `moved`, shape (k,)) was computed.
+    step, moved : ndarray
+    trial : NormalEquations
+        After the step.
+    sigma : ndarray, shape (n,)
+        Standard deviation of a gap, in nominal sizes.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        The damping; 0 at all nodes where many have missed some, for then the step was too long as a whole.
+    """
+    change = _unknown_changes(equations, step, moved)
+    own = np.concatenate([change, np.ones((len(change), 1))], axis=1)
+    squares = np.einsum("mi,mi->m", own, (equations.linearisation.grams @ own[..., None])[..., 0])
+    promised = squares + np.sum((_promised_gaps(equations, change) / sigma) ** 2, axis=1)
+    found = trial.linearisation.squares.sum(axis=1) + np.sum((trial.gaps / sigma) ** 2, axis=1)
+    diagonal = np.einsum("mii,mi->m", equations.arrow.diagonal, step**2)
+    excess = np.where(found - promised > CURVATURE_RESOLUTION * np.sum(diagonal), found - promised, 0.0)
+    few = max(MIN_OVERSHOOTING_NODES, round(MAX_OVERSHOOTING_SHARE * len(excess)))
+    if not np.sort(excess)[-few:].sum() > MIN_LOCAL_EXCESS * excess.sum():
+        return np.zeros(len(excess))  # the parameters' step is too long, or all is well
+    return np.asarray(np.minimum(excess / np.maximum(diagonal, 1e-300), MAX_NODE_DAMPING))
 
 
 def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: bool) -> tuple[str, ...]:
@@ -257,6 +296,24 @@ def describe_misfit(equations: NormalEquations, level: float, *, noisy_gaps: boo
         return ()
     output = segments.system.outputs[worst].name
     return f"{lead}residuals are {misfit[worst]:.2g} times the noise of {output}", tail
+
+
+def _unknown_changes(equations: NormalEquations, step: Array, moved: Array) -> Array:
+    """The change of each segment's own unknowns by a step: its start state, then its sensitivity columns."""
+    slopes, n = equations.linearisation, step.shape[1]
+    change = np.zeros(slopes.end_sensitivities.shape[::2])
+    change[:, :n] = step
+    for rows, columns, unknowns in equations.segments.blocks:
+        change[rows, n + columns] = (slopes.chain * moved)[unknowns]
+    return change
+
+
+def _promised_gaps(equations: NormalEquations, change: Array) -> Array:
+    """The gaps that the linear model promises after a step; zero where nothing follows."""
+    segments, slopes, n = equations.segments, equations.linearisation, equations.gaps.shape[1]
+    promised = slopes.gaps + (slopes.end_sensitivities @ change[..., None])[..., 0]
+    promised[:-1] -= change[1:, :n]
+    return np.where(segments.linked[:, None], promised, 0.0)
 
 
 def _propagate_shifts(own: Array, excess: Array) -> Array:

@@ -18,22 +18,19 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, ProgressCallback, Status
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, ConvergenceTest, assess_convergence
-from pneuopt.shooting.equations import NormalEquations, normal_equations, second_order_correction, weigh_gaps
+from pneuopt.shooting.equations import (
+    weigh_gaps,
+)
+from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, segment, stable_substeps, start_nodes
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
-# Marquardt's damping over the diagonal [1] with loose gaps: lower takes wild first steps, higher small ones
-INITIAL_DAMPING = 1e-3
-# actual over promised decrease [1] below which a step is corrected: higher costs evaluations, lower crawls in valleys
-MIN_GAIN_RATIO = 0.5
 # promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
 STAGE_COST_TOLERANCE = 1e-3
 # promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
 FINAL_COST_TOLERANCE = 5e-7
-# least damping over the diagonal [1], in which the gaps weigh up to 1e14: higher slows parameters, lower is rounding
-MIN_DAMPING = 1e-15
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
@@ -113,20 +110,7 @@ def solve_least_squares(transcription: Transcription, method: LeastSquares | Non
     Fit
         Whatever its status; an interruption (Ctrl-C) returns the best iterate so far, marked.
     """
-    return _LevenbergMarquardt(segment(transcription), method or LeastSquares()).solve()
-
-
-@dataclass(frozen=True, eq=False)
-class _Iterate:
-    """The unknowns (nodes in SI, z as searched), and the equations linearised there."""
-
-    nodes: Array
-    z: Array
-    equations: NormalEquations
-
-    @property
-    def cost(self) -> float:
-        return self.equations.cost
+    return _Search(segment(transcription), method or LeastSquares()).solve()
 
 
 class _StageEnd(NamedTuple):
@@ -137,8 +121,8 @@ class _StageEnd(NamedTuple):
     cost: float
 
 
-class _LevenbergMarquardt:
-    """Levenberg-Marquardt on the nodes and the free parameters of one transcription."""
+class _Search:
+    """The stages of a search for the nodes and the free parameters of one transcription."""
 
     def __init__(self, segments: Segments, method: LeastSquares) -> None:
         self.segments, self.method = segments, method
@@ -217,7 +201,7 @@ class _LevenbergMarquardt:
         self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
         if is_known:
             slopes = self.current.equations.linearisation
-            self.current = _Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
+            self.current = Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
         else:
             self.current = self._evaluate(nodes, z)
         if stage.refine > 1:
@@ -267,8 +251,9 @@ class _LevenbergMarquardt:
     def _run_stage(self) -> bool:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
+        descent = Descent(self._objective(), damping, self._is_negligible_step)
         for _ in range(self.stage.iterations):
-            trial, damping = self._step(self.current, damping)
+            trial = descent.step(self.current)
             if trial is None:
                 return True
             self.iterations += 1
@@ -276,24 +261,7 @@ class _LevenbergMarquardt:
             self._report()
         return before - self.current.cost < STALL_COST_DECREASE * before
 
-    def _step(self, current: _Iterate, damping: float) -> tuple[_Iterate | None, float]:
-        """Raise the damping until a step lowers the cost; None if ten tries do not, or it would hardly fall."""
-        raise_by = 10.0
-        for k in range(10):
-            reduced = current.equations.arrow.eliminate(damping)
-            step = (
-                None if reduced is None else reduced.step(self.scaling.movable(current.z, current.equations, reduced))
-            )
-            if reduced and step and np.max(np.abs(step.parameters[self.scaling.log]), initial=0.0) <= 2:
-                if k == 0 and damping <= INITIAL_DAMPING and self._is_negligible_step(current, step):
-                    break
-                trial = self._trial(current, reduced, step)
-                if trial.cost < current.cost:
-                    return trial, damping * 0.1 if damping > MIN_DAMPING else 0.0
-            damping, raise_by = max(damping, MIN_DAMPING) * raise_by, 3 * raise_by
-        return None, damping
-
-    def _is_negligible_step(self, current: _Iterate, step: GaussNewtonStep) -> bool:
+    def _is_negligible_step(self, current: Iterate, _reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
         """Whether a step promises a negligible decrease: in the last stage, 0.1 % of a deviation in any direction."""
         if self.noisy_gaps or self.stage is self.method.stages[-1]:
             enough = FINAL_COST_TOLERANCE * max(1.0, 2 * current.cost / max(1, current.equations.count))
@@ -301,31 +269,17 @@ class _LevenbergMarquardt:
             enough = STAGE_COST_TOLERANCE * current.cost
         return 0.5 * current.equations.arrow.descent_rate(step) < enough
 
-    def _trial(self, current: _Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> _Iterate:
-        """The iterate after a step; where the cost falls too little, with its gaps corrected to second order."""
-        z = self.scaling.project_to_bounds(current.z + step.parameters)
-        moved = z - current.z
-        shift = reduced.back_substitute(moved)  # a bound may have cut the parameters' step short
-        trial = self._evaluate(current.nodes + shift * self.segments.nominal, z)
-        promised = 0.5 * current.equations.arrow.descent_rate(GaussNewtonStep(shift, moved))
-        if current.cost - trial.cost >= MIN_GAIN_RATIO * promised or not np.isfinite(trial.equations.gaps).all():
-            return trial
-        with np.errstate(all="ignore"):
-            nodes = second_order_correction(current.equations, shift, moved, trial.nodes, trial.equations.gaps)
-        corrected = self._evaluate(nodes, z) if np.isfinite(nodes).all() else trial
-        return corrected if corrected.cost < trial.cost else trial
-
-    def _evaluate(self, nodes: Array, z: Array) -> _Iterate:
+    def _objective(self) -> Objective:
         sigma = self.stage.gap * self.gap_scales
-        with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
-            given = (nodes, self.scaling.values(z), self.scaling.chain(z), sigma, self.substeps, self.correction)
-            equations = normal_equations(self.segments, *given)
-        return _Iterate(nodes, z, equations)
+        return Objective(self.segments, self.scaling, sigma, self.substeps, self.correction)
 
-    def _convergence_status(self, current: _Iterate) -> Status:
+    def _evaluate(self, nodes: Array, z: Array) -> Iterate:
+        return self._objective().evaluate(nodes, z)
+
+    def _convergence_status(self, current: Iterate) -> Status:
         return self._assess(current).status
 
-    def _assess(self, current: _Iterate) -> ConvergenceTest:
+    def _assess(self, current: Iterate) -> ConvergenceTest:
         message, tolerance = f"{self.iterations} iterations", self.method.tolerance
         return assess_convergence(
             current.equations, self.scaling, current.z, tolerance, message, noisy_gaps=self.noisy_gaps

@@ -1,0 +1,134 @@
+"""`Descent`: Levenberg-Marquardt steps on the nodes and the free parameters, at one weight of the gaps."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pneuopt.quantities.arrays import Array
+from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
+from pneuopt.shooting.equations import NormalEquations, missed_curvature, normal_equations, second_order_correction
+from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.segments import IntegrationCorrection, Segments
+
+# Marquardt's damping over the diagonal [1] with loose gaps: lower takes wild first steps, higher small ones
+INITIAL_DAMPING = 1e-3
+# least damping over the diagonal [1], in which the gaps weigh up to 1e14: higher slows parameters, lower is rounding
+MIN_DAMPING = 1e-15
+# actual over promised decrease [1] below which a step is corrected: higher costs evaluations, lower crawls in valleys
+MIN_GAIN_RATIO = 0.5
+MAX_TRIES = 10  # dampings tried for a step: fewer give up where a step exists, more try what no longer moves anything
+MAX_LOG_CHANGE = (
+    2.0  # e-folds of a log parameter in a step: longer ones leave the model's range, shorter ones take more
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """The unknowns (nodes in SI, z as searched), and the equations linearised there."""
+
+    nodes: Array
+    z: Array
+    equations: NormalEquations
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of all squares; infinite where the model is not finite."""
+        return self.equations.cost
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """The lifted least squares with given gaps' weights and integration steps.
+
+    Attributes
+    ----------
+    segments : Segments
+    scaling : ParameterScaling
+    sigma : ndarray, shape (n_states,)
+        Standard deviation of a gap, in nominal sizes.
+    substeps : int
+        Integration steps a sample.
+    correction : IntegrationCorrection or None
+        The change of outputs and ends by finer steps.
+    """
+
+    segments: Segments
+    scaling: ParameterScaling
+    sigma: Array
+    substeps: int
+    correction: IntegrationCorrection | None = None
+
+    def evaluate(self, nodes: Array, z: Array) -> Iterate:
+        """The iterate at these nodes, shape (m, n_states), and searched parameters."""
+        with np.errstate(all="ignore"):  # a step too far may overflow; its cost is infinite then
+            given = (nodes, self.scaling.values(z), self.scaling.chain(z), self.sigma, self.substeps, self.correction)
+            equations = normal_equations(self.segments, *given)
+        return Iterate(nodes, z, equations)
+
+
+IsNegligible = Callable[[Iterate, ReducedEquations, GaussNewtonStep], bool]
+
+
+class Descent:
+    """Levenberg-Marquardt steps on one objective; a node that overshoots is damped alone.
+
+    Parameters
+    ----------
+    objective : Objective
+    damping : float
+        Of the first step.
+    is_negligible : callable
+        Whether a step that is hardly damped is not worth a try.
+    """
+
+    def __init__(self, objective: Objective, damping: float, is_negligible: IsNegligible) -> None:
+        self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
+        self.node_damping = np.zeros(objective.segments.count)
+
+    def step(self, current: Iterate) -> Iterate | None:
+        """The next iterate; None if no damping lowers the cost, or the step would be negligible.
+
+        After the first try the damping rises only at the nodes that have overshot, if there are any.
+        """
+        raise_by, scaling = 10.0, self.objective.scaling
+        for k in range(MAX_TRIES):
+            reduced = current.equations.arrow.eliminate(self.damping, self.node_damping)
+            step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
+            if reduced and step and np.max(np.abs(step.parameters[scaling.log]), initial=0.0) <= MAX_LOG_CHANGE:
+                is_hardly_damped = self.damping <= INITIAL_DAMPING and (k == 0 or (k == 1 and self.node_damping.any()))
+                if is_hardly_damped and self._is_negligible(current, reduced, step):
+                    break
+                trial = self._trial(current, reduced, step)
+                is_lower = trial.cost < current.cost
+                if not is_lower or self.node_damping.any():
+                    self.node_damping = self._missed_curvature(current, trial)
+                if is_lower:
+                    self.damping = self.damping * 0.1 if self.damping > MIN_DAMPING else 0.0
+                    return trial
+                if k == 0 and self.node_damping.any():
+                    continue
+            self.damping, raise_by = max(self.damping, MIN_DAMPING) * raise_by, 3 * raise_by
+        return None
+
+    def _trial(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> Iterate:
+        """The iterate after a step; where the cost falls too little, with its gaps corrected to second order."""
+        z = self.objective.scaling.project_to_bounds(current.z + step.parameters)
+        moved = z - current.z
+        shift = reduced.back_substitute(moved)  # a bound may have cut the parameters' step short
+        trial = self.objective.evaluate(current.nodes + shift * self.objective.segments.nominal, z)
+        promised = 0.5 * current.equations.arrow.descent_rate(GaussNewtonStep(shift, moved))
+        if current.cost - trial.cost >= MIN_GAIN_RATIO * promised or not np.isfinite(trial.equations.gaps).all():
+            return trial
+        with np.errstate(all="ignore"):
+            nodes = second_order_correction(current.equations, shift, moved, trial.nodes, trial.equations.gaps)
+        corrected = self.objective.evaluate(nodes, z) if np.isfinite(nodes).all() else trial
+        return corrected if corrected.cost < trial.cost else trial
+
+    def _missed_curvature(self, current: Iterate, trial: Iterate) -> Array:
+        """The curvature that a trial shows and the model has missed, by node; none of a trial that is not finite."""
+        if not math.isfinite(trial.cost):
+            return np.zeros(len(current.nodes))
+        step, moved = (trial.nodes - current.nodes) / self.objective.segments.nominal, trial.z - current.z
+        return missed_curvature(current.equations, step, moved, trial.equations, self.objective.sigma)

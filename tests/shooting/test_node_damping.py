@@ -1,0 +1,83 @@
+"""Nodes at which Gauss-Newton's model overshoots are damped alone, so that the rest of a log converges as fast."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import OptimizeResult, least_squares
+
+from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.shooting import levenberg_marquardt as search
+from pneuopt.shooting.equations import missed_curvature, normal_equations
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
+
+N, H, NOISE, GAP = 60, 0.1, 0.1, 0.5
+WRONG = {20: -0.15, 40: -0.3}  # squares that the model cannot have
+
+
+def drift() -> DiscreteSystem:
+    """A state that drifts at a constant rate, and its square."""
+
+    def rhs(t: object, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
+        return {"x": p["rate"] + u["push"]}, {"x": x["x"], "square": x["x"] ** 2}
+
+    outputs = [Quantity("x", "m"), Quantity("square", "m^2")]
+    free = ParameterSet({"rate": Parameter(0.5, "m/s", -5.0, 5.0, free=True)})
+    return discretise(define([Quantity("x", "m")], [Quantity("push", "m/s")], outputs, free, rhs), 1)
+
+
+def wrong_squares() -> Transcription:
+    """A log near zero whose squares are negative at two nodes: there the residual's curvature exceeds its slope."""
+    system, rng = drift(), np.random.default_rng(0)
+    t: Array = H * np.arange(N, dtype=float)
+    measured = np.column_stack([0.01 * t + NOISE * rng.standard_normal(N), np.full(N, np.nan)])
+    for at, value in WRONG.items():
+        measured[at, 1] = value
+    nodes = regular_nodes(N, 2)
+    phase = Phase("log", t, np.full(N, H), np.zeros((N, 1)), nodes, guess=np.full((N, 1), 0.3))
+    residuals = Residuals(0, ("x", "square"), measured, np.array([NOISE, 0.03]))
+    return Transcription(system, system.parameters, (phase,), (residuals,))
+
+
+def dense(problem: Transcription) -> OptimizeResult:
+    """The same residuals by SciPy: the rate, then the nodes."""
+    y = problem.residuals[0].measured
+
+    def misfit(z: Array) -> Array:
+        x = np.stack([z[1:], z[1:] + H * z[0]], axis=1)
+        gaps = (x[:-1, 1] + H * z[0] - x[1:, 0]) / GAP
+        squares = [(x.ravel()[at] ** 2 - y[at, 1]) / 0.03 for at in WRONG]
+        return np.concatenate([(x.ravel() - y[:, 0]) / NOISE, squares, gaps])
+
+    return least_squares(misfit, np.zeros(N // 2 + 1), xtol=1e-14, ftol=1e-14, gtol=1e-12)
+
+
+METHOD = LeastSquares(stages=(Stage(GAP, 60),), kinematic=1.0, substeps=1)
+
+
+def test_two_nodes_that_overshoot_do_not_slow_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = wrong_squares()
+    fit, best = solve_least_squares(problem, METHOD), dense(problem)
+    assert fit.stats["cost"] == pytest.approx(best.cost, rel=1e-6)
+    assert_allclose(fit.parameters.value("rate"), best.x[0], atol=1e-5)
+    monkeypatch.setattr(search, "missed_curvature", lambda equations, *_: np.zeros(len(equations.gaps)))
+    slow = solve_least_squares(problem, METHOD)
+    assert fit.stats["iterations"] <= 0.5 * slow.stats["iterations"]
+
+
+def test_the_missed_curvature_is_that_of_the_nodes_that_overshoot() -> None:
+    """Of x^2 - m the half square has the curvature 4 x^2 + 2 (x^2 - m): the second part is missed."""
+    segments = segment(wrong_squares())
+    scaling, sigma = ParameterScaling(segments.transcription), np.array([GAP])
+    q, chain = scaling.values(scaling.start), scaling.chain(scaling.start)
+    nodes, step = start_nodes(segments), np.full((N // 2, 1), 1e-3)
+    before, after = (normal_equations(segments, x, q, chain, sigma, 1) for x in (nodes, nodes + step))
+    found = missed_curvature(before, step, np.zeros(1), after, sigma)
+    assert np.flatnonzero(found).tolist() == [at // 2 for at in WRONG]
+    for at, value in WRONG.items():
+        missed = 2 * (0.3**2 - value) / 0.03**2
+        assert found[at // 2] * before.arrow.diagonal[at // 2, 0, 0] == pytest.approx(missed, rel=0.02)
