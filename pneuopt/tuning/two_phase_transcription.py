@@ -72,8 +72,9 @@ def transcribe_two_phase(
     system = _extend_system(free_loop, extra, space, references, nodes)
     parameters = (averaged | extra).select(system.parameters)
     phases = [p for i, r in enumerate(references) for p in _reference_phases(loop, space, i, r, nodes)]
-    parameters = parameters | _durations(references)
+    parameters = parameters | _durations(references, spec, extra[SETTLING_PARAMETER])
     limits = [
+        *_horizon_limits(references, parameters),
         *(q for i, r in enumerate(references) for q in _path_limits(loop, space, spec, system, i, r)),
         *_sensitivity_limit(free_loop, averaged, space, spec, parameters),
     ]
@@ -107,10 +108,44 @@ def _extra_unknowns(references: Sequence[Step], spec: Specification) -> Paramete
     return ParameterSet(given)
 
 
-def _durations(references: Sequence[Step]) -> ParameterSet:
-    """The fixed durations [s]: of each reference before its step, and after it."""
-    rest = {f"rest.{i}": Parameter(r.horizon - r.at, "s") for i, r in enumerate(references)}
-    return ParameterSet(rest | {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0})
+def _durations(references: Sequence[Step], spec: Specification, settling: Parameter) -> ParameterSet:
+    """The durations [s] of each reference, before its step and of its settled phase.
+
+    Where the error at the end counts the settled phase ends with the horizon; otherwise it is as long as the record
+    after the step, which shows more of the band.
+    """
+    found = {f"before.{i}": Parameter(r.at, "s") for i, r in enumerate(references) if r.at > 0}
+    for i, r in enumerate(references):
+        record = r.horizon - r.at
+        if not spec.concerns(SteadyStateError):
+            found[_settled_duration(i)] = Parameter(record, "s")
+        elif settling.free:
+            rest = (record - v for v in (settling.value, settling.upper, settling.lower))
+            found[_settled_duration(i)] = Parameter(next(rest), "s", *rest, free=True)
+        else:
+            found[_settled_duration(i)] = Parameter(record - settling.value, "s")
+    return ParameterSet(found)
+
+
+def _settled_duration(i: int) -> str:
+    """The name of the duration of reference i's settled phase."""
+    return f"rest.{i}"
+
+
+def _horizon_limits(references: Sequence[Step], parameters: ParameterSet) -> list[Limit]:
+    """The settled phase ends with the horizon, where its duration is unknown because the settling time is."""
+    q, names_ = ca.SX.sym("q", len(parameters)), list(parameters)
+    return [
+        Limit(
+            f"horizon {i}",
+            ca.Function("limit", [q], [q[names_.index(SETTLING_PARAMETER)] + q[names_.index(_settled_duration(i))]]),
+            r.horizon - r.at,
+            r.horizon - r.at,
+            Where.PARAMETERS,
+        )
+        for i, r in enumerate(references)
+        if parameters[_settled_duration(i)].free
+    ]
 
 
 def _extend_system(
@@ -146,7 +181,7 @@ def _reference_phases(loop: ClosedLoop, space: Space, i: int, reference: Step, n
     moved = reference.at > 0
     before = [make_phase("before", nodes[0], reference.initial, f"before.{i}", start)] if moved else []
     transient = make_phase("transient", nodes[0], reference.final, SETTLING_PARAMETER, None if moved else start)
-    return [*before, transient, make_phase("settled", nodes[1], reference.final, f"rest.{i}", None)]
+    return [*before, transient, make_phase("settled", nodes[1], reference.final, _settled_duration(i), None)]
 
 
 def _state_before_step(loop: ClosedLoop, space: Space, reference: Step) -> Array:
