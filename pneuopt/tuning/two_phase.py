@@ -41,9 +41,10 @@ PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "
 # Relative difference of two objectives below which starts agree. A smaller one counts the solver's tolerance as another
 # optimum; a larger one hides local optima.
 OPTIMA_TOLERANCE = 1e-3
-# Starts, at most, as a multiple of those asked for, where the best optimum has been found once only. Fewer hand out a
-# local optimum that nothing confirms; more delay answers of problems with many optima.
-MAX_START_FACTOR = 3
+# Starts after which the search ends if most of them have failed. One that fails takes longer than one that succeeds, and
+# where most fail the exact problem is hard (of an oscillator with dead time 9 of 10 starts): a lower number gives up
+# after a bad draw, a higher one delays the search by simulation that `tune` then makes.
+MIN_STARTS = 3
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,7 @@ class TwoPhase:
         How much tighter the problem's limits are than those asked for, a fraction; without it an optimum's response
         touches the band.
     starts : int
-        Number of starts: the given gains, then random ones within the bounds; more where only one of them ends in the
-        best optimum.
+        Number of starts: the given gains, then random ones within the bounds; fewer where most of at least three fail.
     seed : int
         Of the random numbers.
     digits : int, optional
@@ -207,8 +207,7 @@ def solve_two_phase(
 ) -> Optima:
     """Solve the two-phase problem from every start; `report_progress` receives a line of text a start.
 
-    Solutions that are not allowed do not count as converged. Of several starts two have to end in the best optimum:
-    until then, up to a limit, there are more of them.
+    Solutions that are not allowed do not count as converged. The search ends early where most starts fail.
 
     Raises
     ------
@@ -218,18 +217,18 @@ def solve_two_phase(
     problem = prepare_full_space(transcribe_two_phase(loop, references, space, spec, method.nodes), method.solver)
     parameters = problem.graph.transcription.parameters
     rng = np.random.default_rng(method.seed)
-    found, agreement = list[Solution](), compare_starts([], OPTIMA_TOLERANCE)
-    for k in range(method.starts * MAX_START_FACTOR if method.starts > 1 else 1):
-        if k >= method.starts and agreement.agreeing != 1:
+    found, good = list[Solution](), list[Solution]()
+    for k in range(method.starts):
+        if k >= MIN_STARTS and 2 * len(good) < k:
             break
         point = space.from_unit(rng.random(len(space.names))) if k else space.start
         gains = dict(zip(space.names, point.tolist(), strict=True))
         found.append(solve_from(problem, parameters.with_values(gains)))
         value, ended = _objective_value(found[-1]), found[-1].status.code.value
-        report_progress(f"start {k + 1} of {max(k + 1, method.starts)}: objective {value:.4g}, {ended}")
-        good = [s for s in found if s.status.converged and is_allowed(s)]
-        failed = [math.inf] * (len(found) - len(good))
-        agreement = compare_starts([*map(_objective_value, good), *failed], OPTIMA_TOLERANCE)
+        report_progress(f"start {k + 1} of {method.starts}: objective {value:.4g}, {ended}")
+        good += [s for s in found[-1:] if s.status.converged and is_allowed(s)]
+    failed = [math.inf] * (len(found) - len(good))
+    agreement = compare_starts([*map(_objective_value, good), *failed], OPTIMA_TOLERANCE)
     if not good:
         closest = min(found, key=lambda s: s.stats.get("largest_violation", math.inf))
         unstable = Status(Code.INFEASIBLE, ("every optimum found is an unstable loop, or nearly so", WIDEN_BOUNDS))
