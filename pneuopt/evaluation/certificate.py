@@ -31,7 +31,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Step, as_steps
+from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.continuation import continue_response
 from pneuopt.evaluation.counts import describe_counts
 from pneuopt.evaluation.defects import Defect as Defect  # noqa: PLC0414 - who reads a certificate finds it here
@@ -39,6 +40,7 @@ from pneuopt.evaluation.defects import Ending, Finding, correct_metrics, describ
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
 from pneuopt.evaluation.metrics import Envelope
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
@@ -92,6 +94,9 @@ def certificate(
     <Defect.UNSTABLE: 'unstable'>
     """
     check_closed_loop(loop)
+    full = loop.complete(parameters)
+    for case in cases(as_steps(references), scenarios, full):
+        check_travel(loop, case, full)
     found = evaluate_cases(loop, references, parameters, scenarios=scenarios, band=band, envelope=envelope)
     return judge_evaluations(tuple(found), band)
 

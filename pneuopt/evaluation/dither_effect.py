@@ -1,6 +1,6 @@
 """`dither_effect`: what a dither moves, by harmonic balance of the nonlinear plant, and why it acts as it does."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isnan, nan, pi
 
@@ -79,6 +79,36 @@ def dither_effect(
     if axis.final_element is None:
         return found
     return _add_effect_at_rest(found, loop, axis, axis.final_element, held, full)
+
+
+def describe_swing(loop: ClosedLoop, references: Sequence[Step], parameters: ParameterSet, band: float) -> str | None:
+    """Sentence for a dither that moves the measured signal out of the settling band; None for others.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    references : sequence of Step
+    parameters : ParameterSet
+        Values with the dither's amplitude and frequency.
+    band : float
+        Half width of the settling band, a fraction of the step.
+    """
+    full, step = loop.complete(parameters), min(references, key=lambda r: abs(r.nominal_size))
+    if loop.dither_period(full) is None:
+        return None
+    moves, _ = _operating_points(loop, loop.plant.axis or Axis(), step, None)
+    moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
+    swing, half = abs(moving.get(loop.feedback.name, 0.0)), band * abs(step.nominal_size)
+    if swing <= half:
+        return None
+    signal, command = loop.feedback, loop.command
+    amplitude, frequency = full.value(DITHER_AMPLITUDE), full.value(DITHER_FREQUENCY)
+    swings, allowed = (format_with_prefix(v, signal.unit) for v in (swing, half))
+    return (
+        f"the given dither of {amplitude:.3g} {command.unit} at {frequency:.4g} Hz swings the {signal.name} by "
+        f"+-{swings}, beyond the settling band of +-{allowed} (+-{100 * band:.3g} % of step {step.label}): only the "
+        f"mean over its period can settle; lower {DITHER_AMPLITUDE}, raise {DITHER_FREQUENCY}, or widen the band"
+    )
 
 
 def _operating_points(

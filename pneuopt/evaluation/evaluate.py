@@ -22,6 +22,7 @@ from pneuopt.evaluation.resolution import MAX_REFINEMENTS, refine_instants
 from pneuopt.evaluation.response import loop_inputs, measure, readings_a_sample, sample_spacing
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
+from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ModelError
 from pneuopt.quantities.parameters import ParameterSet
@@ -80,15 +81,15 @@ def evaluate(
     Raises
     ------
     InputError
-        If two references have one label, a scenario names an unknown parameter, or the responses take more
-        steps than `max_steps`.
+        If two references have one label, a scenario names an unknown parameter, the responses take more steps than
+        `max_steps`, or the stroke is too short for a reference.
     ConvergenceError
         If the simulation stops.
 
     Warns
     -----
     PhysicsWarning
-        If the piston reaches an end stop, or a chamber is emptied.
+        If the piston overshoots into an end stop, or a chamber is emptied.
 
     Examples
     --------
@@ -108,7 +109,10 @@ def evaluate(
     steps = as_steps(references)
     check_parameters(parameters)
     inner, _ = _loop_and_rig(loop, steps)
-    check_steps(inner, steps, inner.complete(parameters), plants=1 + len(scenarios), max_steps=max_steps)
+    full = inner.complete(parameters)
+    check_steps(inner, steps, full, plants=1 + len(scenarios), max_steps=max_steps)
+    for case in cases(steps, scenarios, full):
+        check_travel(inner, case, full)
     return tabulate_metrics(
         evaluate_cases(loop, references, parameters, scenarios=scenarios, band=band, envelope=envelope)
     )
@@ -180,7 +184,9 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
         States and outputs of a loop, simulated tightly on a grid finer than a search's; for a rig, its truth.
     """
     inner, rig = _loop_and_rig(loop, [reference])
-    return _respond(inner, rig, reference, inner.complete(parameters))
+    full = inner.complete(parameters)
+    check_travel(inner, TuningCase(reference), full)
+    return _respond(inner, rig, reference, full)
 
 
 def _respond(loop: ClosedLoop, rig: Rig | None, reference: Step, parameters: ParameterSet) -> Trajectory:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf
 
 import numpy as np
 
@@ -19,10 +18,10 @@ from pneuopt.evaluation.margins import frequency_response
 from pneuopt.evaluation.requirements import NoiseGain, PeakControl, RiseTime, SettlingTime, metric_name, upper_limit
 from pneuopt.evaluation.response import highest_dither_frequency
 from pneuopt.evaluation.specification import Specification
+from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import write_value
 from pneuopt.tuning.space import Space
 
 # Frequency at which the sign of the plant's static gain is read [rad per horizon]. A higher one may meet phase lag that
@@ -57,7 +56,7 @@ def check_feasibility(loop: ClosedLoop, cases: Sequence[TuningCase], space: Spac
     _check_noise(loop, space, spec)
     for case in cases:
         _check_counts(loop, case, space, spec)
-        _check_travel(loop, case, space)
+        check_travel(loop, case, space.parameters)
         _check_hold(loop, case, space, spec)
     _check_sign(loop, cases[0], space)
 
@@ -101,36 +100,6 @@ def _check_counts(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specif
         return
     told = describe_counts(loop, case.case_parameters(space.parameters), case.reference, spec.band)
     require(told is None, f"{_case_prefix(case)}{told}")
-
-
-def _check_travel(loop: ClosedLoop, case: TuningCase, space: Space) -> None:
-    """Check that a piston that follows the reference stays clear of the end stops."""
-    stops = [g for g in loop.plant.validity_limits if g.state == "position"]
-    states = [q.name for q in loop.plant.states]
-    if not stops or "position" not in states:
-        return
-    reference, own = case.reference, case.case_parameters(space.parameters)
-    begin = float(case.initial(loop, space.parameters)[states.index("position")])
-    for stop in stops:
-        limit = stop.limit(own)
-        room = stop.side * (limit - begin)
-        if loop.feedback.name == "position":
-            far, remedy = stop.side * (reference.final - begin), "take a smaller step"
-        elif loop.feedback.name == "speed":
-            lead, rest = stop.side * reference.initial * reference.at, reference.horizon - reference.at
-            far = max(lead, lead + stop.side * reference.final * rest)
-            fits = (room - lead) / (stop.side * reference.final) if reference.final else inf
-            early = f"end it by horizon = {reference.at + fits:.3g} s"
-            remedy = f"{early}, or start elsewhere, start={{'position': ...}}" if fits > 0 else "start elsewhere"
-        else:
-            return
-        where = "front" if stop.side > 0 else "rear"
-        require(
-            far <= room,
-            f"{_case_prefix(case)}it leads the piston over {write_value(far, 'm', 4)}, but from position "
-            f"{write_value(begin, 'm', 4)} to the {where} end stop there are {write_value(max(room, 0.0), 'm', 4)}; "
-            f"{remedy}",
-        )
 
 
 def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:

@@ -5,6 +5,7 @@ A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or s
 """
 
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
@@ -17,13 +18,14 @@ from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.budget import check_steps
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
+from pneuopt.evaluation.dither_effect import describe_swing
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
-from pneuopt.evaluation.requirements import PeakControl, Requirement, requirement_values
+from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime, requirement_values
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.quantities.arguments import as_tuple, check_parameters
-from pneuopt.quantities.errors import ConvergenceError, require
+from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.tuning.feasibility import check_feasibility
@@ -110,6 +112,11 @@ def tune(
         short; the error's `solution` is the result, with the given gains unchanged: `claimed` and `certified` are
         those of the best point found, which is in its `stats`.
 
+    Warns
+    -----
+    PhysicsWarning
+        Before the search, if the given dither moves the measured signal out of the settling band.
+
     Examples
     --------
     >>> from pneuopt.control.pid import PID
@@ -126,6 +133,7 @@ def tune(
     task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios, accept, max_steps)
     if rig is not None:
         check_rig(rig, task)
+    _warn_of_swing(task)
     search, result = _search(task, method, progress)
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     tuned = search.space.names
@@ -146,6 +154,15 @@ def tune(
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
     return result
+
+
+def _warn_of_swing(task: TuningTask) -> None:
+    """Warn, in the name of the caller's caller, of a dither that moves the signal out of its settling band."""
+    if not task.spec.concerns(SettlingTime):
+        return
+    told = describe_swing(task.loop, task.references, task.space.parameters, task.spec.band)
+    if told is not None:
+        warnings.warn(told, PhysicsWarning, stacklevel=3)
 
 
 def _search(task: TuningTask, method: Method | None, progress: ProgressCallback | None) -> tuple[Search, TuningResult]:

@@ -30,9 +30,9 @@ from pneuopt.tuning.space import Space, clip_level, fastest_eigenvalue
 from pneuopt.tuning.two_phase_transcription import BAND_PARAMETER, transcribe_two_phase, without_clip
 
 # RK4 steps between two nodes up to which the method is chosen. A lower number leaves loops to the race that are solved
-# exactly (the published one takes 3 steps). With a higher one a response leaves its band unseen between two nodes, and a
-# start takes minutes: of six lags of second order with 4 to 16 steps none was certified in 6 to 20 s, all by the race
-# in 1.5 s; of an oscillator with dead time and 10 steps 36 s gave 0.67 s to settle, 2 s of the race 0.30 s.
+# exactly (the published one takes 3 steps). With a higher one a response leaves its band between two nodes, unseen, and
+# a start takes long: of six lags of second order with 4 to 16 steps none was certified in 6 to 20 s, all by the race in
+# 1.5 s; of an oscillator with dead time and 10 steps 36 s gave 0.67 s to settle, 2 s of the race 0.30 s.
 MAX_STEPS_A_SEGMENT = 3.5
 # Share of the margin that limits on peaks of command and sensitivity are tightened by. With less, rounding the gains
 # breaks them; more gives performance away, for the exact problem misses no peak.
@@ -42,9 +42,9 @@ PARAMETERS_WITHOUT_EFFECT = ("dither.amplitude", "dither.frequency", "pid.Tt", "
 # Relative difference of two objectives below which starts agree. A smaller one counts the solver's tolerance as another
 # optimum; a larger one hides local optima.
 OPTIMA_TOLERANCE = 1e-3
-# Starts after which the search ends if most of them have failed. One that fails takes longer than one that succeeds, and
-# where most fail the exact problem is hard (of an oscillator with dead time 9 of 10 starts): a lower number gives up
-# after a bad draw, a higher one delays the search by simulation that `tune` then makes.
+# Starts after which the search ends if most of them have failed. One that fails takes longer than one that succeeds,
+# and where most fail the exact problem is hard (of an oscillator with dead time 9 of 10 starts): a lower number gives
+# up after a bad draw, a higher one delays the search by simulation that `tune` then makes.
 MIN_STARTS = 3
 
 

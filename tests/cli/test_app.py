@@ -289,14 +289,24 @@ horizon = "0.4 s"
 
 
 def test_an_end_stop_is_reported_in_one_line(folder: Path) -> None:
-    """From 160 of 200 mm at 0.2 m/s, for longer than 0.2 s; the command goes on."""
+    """From 160 of 200 mm at 0.2 m/s for 0.19 s, with an overshoot; the command goes on."""
     (folder / "cylinder.toml").write_text(CYLINDER, encoding="utf-8")
-    (folder / "speed.toml").write_text(SPEED_LOOP, encoding="utf-8")
+    fast = SPEED_LOOP.replace("[pid]", "[pid]\nb = 4.0").replace("0.4 s", "0.19 s")
+    (folder / "speed.toml").write_text(fast, encoding="utf-8")
     result = run("simulate cylinder.toml speed.toml -o steps.csv")
     assert result.exit_code == 0
     (line,) = result.stderr.splitlines()
-    assert line.startswith("warning: the piston reached the front end stop (position 199.9 mm) at t = 0.2")
+    assert line.startswith("warning: the piston reached the front end stop (position 199.9 mm) at t = 0.1")
     assert line.endswith("from there the response is the stop's")
+
+
+def test_a_horizon_longer_than_the_stroke_allows_is_refused(folder: Path) -> None:
+    (folder / "cylinder.toml").write_text(CYLINDER, encoding="utf-8")
+    (folder / "speed.toml").write_text(SPEED_LOOP, encoding="utf-8")
+    result = run("simulate cylinder.toml speed.toml -o steps.csv")
+    assert (result.exit_code, list(folder.glob("steps*"))) == (2, [])
+    assert "it leads the piston over 80 mm" in result.stderr
+    assert "there are 39.9 mm; end it by horizon = 0.199 s" in result.stderr
 
 
 def test_impossible_hardware_is_refused_with_its_line(folder: Path) -> None:

@@ -1,5 +1,6 @@
 """Certificates: either direction, from rest and from motion, on the smooth loop and on a rig."""
 
+from collections.abc import Callable
 from math import exp
 
 import numpy as np
@@ -10,6 +11,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
+from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.requirements import IAE
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
@@ -115,10 +117,10 @@ def test_a_rig_is_certified_by_the_truth_and_starts_in_motion() -> None:
 
 def test_an_end_stop_is_no_certificate() -> None:
     loop, p = cylinder(Stribeck())
-    step = Step(0.3, horizon=0.6)
-    with pytest.warns(PhysicsWarning, match=r"front end stop .* at t = 0\.[34]"):
-        evaluate(loop, step, p)
-    free = p.with_values({"pid.Kp": 2.0, "pid.b": 3.0}).with_bounds({"pid.Kp": (2.0, 3.0)}).freed("pid.Kp")
+    fast = p.with_values({"pid.Kp": 2.0, "pid.b": 3.0})
+    with pytest.warns(PhysicsWarning, match=r"front end stop .* at t = 0\.[23]"):
+        evaluate(loop, Step(0.3, horizon=0.33), fast)
+    free = fast.with_bounds({"pid.Kp": (2.0, 3.0)}).freed("pid.Kp")
     method = Racing(members=5, trials=1, polish=0)
     result = tune(loop, Step(0.3, horizon=0.33), free, minimise=IAE(), method=method, throw=False, plants={})
     assert result.status.code is Code.NOT_CERTIFIED
@@ -126,6 +128,20 @@ def test_an_end_stop_is_no_certificate() -> None:
     assert "shorten the horizon" in result.status.message
     assert result.parameters.value("pid.Kp") == 2.0
     assert result.stats["contacts"] >= 1
+
+
+def test_a_horizon_longer_than_the_stroke_allows_is_refused() -> None:
+    """0.3 m/s from the middle of 200 mm: evaluated, certified and simulated alike, of a rig and on a scenario, too."""
+    loop, p = cylinder(Stribeck())
+    words = r"reference 0 to 0.3: it leads the piston over 180 mm.*99.9 mm; end it by horizon = 0.333 s"
+    calls: list[Callable[..., object]] = [evaluate, certificate, respond]
+    for call in calls:
+        with pytest.raises(InputError, match=words):
+            call(loop, Step(0.3, horizon=0.6), p)
+    with pytest.raises(InputError, match=words):
+        evaluate(Rig(loop, {"position": Sensor(resolution=1e-5)}), Step(0.3, horizon=0.6), p)
+    with pytest.raises(InputError, match=r"reference 0 to 0.3 \[short\]: .* there are 74.9 mm"):
+        evaluate(loop, Step(0.3, horizon=0.3), p, scenarios={"short": {"cylinder.stroke": 0.15}})
 
 
 def test_bad_input_is_named() -> None:

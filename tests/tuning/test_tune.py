@@ -11,6 +11,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import (
+    IAE,
     MaxSensitivity,
     Overshoot,
     PeakControl,
@@ -22,7 +23,7 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder
-from pneuopt.quantities.errors import ConvergenceError, InputError
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.racing import Racing
@@ -190,6 +191,31 @@ def friction_loop(sample_time: float | None = 1e-3) -> tuple[ClosedLoop, Paramet
     bounds = {"pid.Kp": (10.0, 1000.0), "pid.Ki": (1.0, 10000.0), "dither.amplitude": (0.0, 50.0)}
     bounds |= {"dither.offset": (-100.0, 100.0)}
     return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
+
+
+def test_a_ripple_beyond_the_band_is_said_before_the_search() -> None:
+    """The first word, with band and ripple; of a calm dither, none at all, or no settling time, nothing is said."""
+
+    class BegunError(Exception):
+        """The search has begun."""
+
+    def begin(_: str) -> None:
+        raise BegunError
+
+    def start(amplitude: float, size: float, minimise: Requirement) -> None:
+        loop, parameters = friction_loop()
+        given = parameters.with_values({"dither.amplitude": amplitude})
+        with pytest.raises(BegunError):
+            tune(loop, Step(size, horizon=0.4), given, minimise=minimise, progress=begin)
+
+    words = (
+        r"dither of 40 N at 80 Hz swings the speed by \+-1\d mm/s, beyond the settling band of \+-1 mm/s \(\+-2 % of"
+    )
+    with pytest.warns(PhysicsWarning, match=words):
+        start(40.0, 0.05, SettlingTime())
+    start(0.0, 0.05, SettlingTime())
+    start(1.0, 0.1, SettlingTime())
+    start(40.0, 0.05, IAE())
 
 
 def test_a_drive_with_friction_is_tuned_by_simulation() -> None:
