@@ -113,7 +113,7 @@ from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
-from .studies.neighbours import search_again
+from .studies.neighbours import search_again, sweep_from_neighbours
 from .studies.sweep import grid, sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
@@ -288,6 +288,7 @@ __all__ = [
     "split",
     "step_metrics",
     "sweep",
+    "sweep_from_neighbours",
     "to_parallel",
     "to_series",
     "to_standard",

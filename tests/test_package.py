@@ -170,6 +170,7 @@ PUBLIC_NAMES = [
     "StickSlipResult",
     "Stribeck",
     "sweep",
+    "sweep_from_neighbours",
     "System",
     "Thermal",
     "to_parallel",

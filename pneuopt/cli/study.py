@@ -31,20 +31,27 @@ from pneuopt.evaluation.requirements import (
     user_limit,
     with_user_limit,
 )
+from pneuopt.files.drive import read_drive
 from pneuopt.files.loop import construct_at
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.study import Pareto, Study, SweptAxis, read_axes, read_pareto, read_study
-from pneuopt.files.tuning import Tuning
+from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.plotting import plot_front, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
+from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.sweep import grid, sweep
 from pneuopt.tuning.pareto import pareto_front
+from pneuopt.tuning.tune import certified_objective, tune
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# Columns of a study that tunes: its objective, and the word before the name of a gain that was found.
+OBJECTIVE, FOUND = "objective", "found"
 
 
 def run_study(file: Path, outputs: Outputs, quiet: bool) -> int:
@@ -69,15 +76,19 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
         cases = grid(parameters, {axis.name: axis.points for axis in axes})
     except InputError as error:
         raise InputError(f"{file}: [axes] {error}") from None
-    band = study.band or task.specification.band
-    certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
-    with progress("certifying", quiet=quiet) as report_progress:
-        table = sweep(certify, parameters, cases, progress=report_progress)
+    table = _tune_cells(study, task, parameters, axes, quiet) if study.tune else None
+    if table is None:
+        band = study.band or task.specification.band
+        certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
+        with progress("certifying", quiet=quiet) as report_progress:
+            table = sweep(certify, parameters, cases, progress=report_progress)
     verdict, status = _grid_verdict(table, len(task.references))
     make_console().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
     seen = _worst_of_references(table, axes, study.show)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     show_cases(make_console(), seen, written, metrics)
+    for case in table["case"][table["breaks"]] if study.tune else ():
+        make_console().print(f"{case}: breaks with its neighbours, also searched from their gains", soft_wrap=True)
     writers: Writers = {}
     if outputs.output is not None:
         text = _grid_csv(table, {n: parameters[n].unit for n in written}, task.loop)
@@ -87,6 +98,53 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
     tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
     finish(outputs, writers, tables, None)
     return status
+
+
+def _tune_cells(
+    study: Study, task: Tuning, parameters: ParameterSet, axes: Sequence[SweptAxis], quiet: bool
+) -> "pd.DataFrame":
+    """Tune every cell of the grid, each from the gains of its neighbours: a row a cell, with metrics and gains."""
+    require(bool(task.specification.weights), f"{study.tuning}: has nothing to minimise; add [minimise]")
+    free = task.parameters.free_names
+    require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
+    points = {axis.name: axis.points for axis in axes}
+    with progress("tuning", quiet=quiet) as report_progress:
+        table = sweep_from_neighbours(
+            partial(tune_cell, study.drive, study.tuning),
+            parameters,
+            points,
+            value=OBJECTIVE,
+            starts={f"{FOUND} {n}": n for n in free},
+            progress=report_progress,
+        )
+    return table.rename(columns={f"{FOUND} {n}": n for n in free})
+
+
+def tune_cell(drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
+    """One cell of a study: the certified metrics of the gains tuned for it, the objective and the gains.
+
+    Raises
+    ------
+    ConvergenceError
+        If no design is certified.
+    """
+    task = read_tuning(tuning, read_drive(drive)[0].system())
+    result = tune(
+        task.loop,
+        task.references,
+        parameters,
+        minimise=task.specification,
+        scenarios=task.scenarios(parameters),
+        accept=task.accept,
+        plants={},
+        max_steps=task.max_steps,
+        method=task.method,
+    )
+    metrics = {
+        f"{row}[{case}]": float(value) for case, column in result.certified.items() for row, value in column.items()
+    }
+    found = {f"{FOUND} {n}": result.parameters.value(n) for n in result.parameters.free_names}
+    return metrics | {OBJECTIVE: certified_objective(task.specification, result)} | found
 
 
 def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
@@ -179,13 +237,14 @@ def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requi
 
 
 def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
-    """How many cases are certified, fail or never settle, and the exit status."""
+    """How many cases are certified, fail, never settle or break with their neighbours, and the exit status."""
     settling = table[[c for c in table if _metric_name(c) == "SettlingTime"]]
     good = table["error"] == ""
     counts = {
         "interrupted": int((table["error"] == INTERRUPTED_CASE).sum()),
         "failed": int((~good & (table["error"] != INTERRUPTED_CASE)).sum()),
         "never settle": int((good & settling.isna().any(axis=1)).sum()),
+        "break with their neighbours": int((good & table["breaks"]).sum()) if "breaks" in table else 0,
     }
     parts = [f"{count} {what}" for what, count in counts.items() if count]
     status = EXIT_INTERRUPTED if counts["interrupted"] else EXIT_FAILURE if parts else EXIT_SUCCESS

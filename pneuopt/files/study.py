@@ -15,7 +15,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import read_unit, read_value, si_conversion
 
 _SECTION_KEYS = {
-    "study": ("drive", "tuning"),
+    "study": ("drive", "tuning", "tune"),
     "metrics": ("band", "show"),
     "pareto": ("between", "points", "lower", "upper"),
 }
@@ -43,6 +43,8 @@ class Study:
         The metrics on screen and in the figure.
     pareto : mapping of str to object, optional
         A front is asked for in place of a grid: as written; `read_pareto` reads it.
+    tune : bool
+        Whether each cell of the grid is tuned, from the gains of its neighbours, and not only certified.
     """
 
     path: Path
@@ -52,6 +54,7 @@ class Study:
     band: float | None
     show: tuple[str, ...]
     pareto: Mapping[str, Any] | None = None
+    tune: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,8 +131,13 @@ def read_study(path: str | Path) -> Study:
     require(bool(axes) or "pareto" in table, f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
     band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
     require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
-    drive, tuning = (_file_path(table.get("study", {}), key, path) for key in _SECTION_KEYS["study"])
-    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), table.get("pareto"))
+    given = table.get("study", {})
+    drive, tuning = (_file_path(given, key, path) for key in ("drive", "tuning"))
+    tune = given.get("tune", False)
+    require(isinstance(tune, bool), f"{path}: [study] tune must be true or false, got {tune!r}")
+    require(not (tune and "pareto" in table), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
+    require(not (tune and band), f"{path}: [metrics] band would not be the one tuned for; state it in {tuning.name}")
+    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), table.get("pareto"), tune)
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:

@@ -1,26 +1,99 @@
-"""Cells of a study that break with their neighbours: found, computed again from a neighbour's result, and flagged.
+"""A search in each cell of a grid: from a neighbour's result, again where a cell breaks with its neighbours, flagged.
 
-A tuning in each cell of a grid ends in a local optimum here and there, three times as bad as beside it. All cells are
-computed first, then the flagged ones again: what comes out does not depend on the order in which processes finish.
+A tuning in each cell of a grid ends in a local optimum here and there, three times as bad as beside it. Cells are
+computed in waves, by their distance from the one nearest to the given parameters, then the flagged ones again: what
+comes out does not depend on the order in which processes finish.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import TYPE_CHECKING
 
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.studies.outcome import CaseFunction
-from pneuopt.studies.sweep import sweep
+from pneuopt.studies.sweep import grid, sweep
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Places = Mapping[str, Mapping[float, int]]
 # Ratio to the best neighbour from which a cell breaks with it. A smaller one computes cells again on a steep slope; a
 # larger one leaves local optima in the table.
 BREAK_RATIO = 3.0
+
+
+def sweep_from_neighbours(
+    fn: CaseFunction,
+    parameters: ParameterSet,
+    axes: Mapping[str, Sequence[float]],
+    *,
+    value: str,
+    starts: Mapping[str, str],
+    executor: Executor | None = None,
+    progress: ProgressCallback | None = None,
+) -> "pd.DataFrame":
+    """Compute a search in every cell of a grid, each from the result of the best neighbour that is known already.
+
+    The cell nearest to the given parameters starts from theirs; then those beside it, and so on. Cells that break with
+    their neighbours at the end are computed once more, and flagged if they still do: see `search_again`.
+
+    Parameters
+    ----------
+    fn, parameters, executor, progress
+        As for `sweep`.
+    axes : mapping of str to sequence of float
+        As for `grid`.
+    value, starts
+        As for `search_again`.
+
+    Returns
+    -------
+    DataFrame
+        As from `search_again`, a row a cell in the order of `grid`.
+
+    Raises
+    ------
+    InputError
+        As from `grid` and `sweep`, or if an axis is a parameter that the search finds.
+
+    Examples
+    --------
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> from pneuopt.quantities.parameters import Parameter
+    >>> given = ParameterSet({"mass": Parameter(1.0, "kg"), "Kp": Parameter(1.0, "1")})
+    >>> def tune(p):  # a local search that gets no further than to twice its start
+    ...     gain = min(p.value("mass"), 2 * p.value("Kp"))
+    ...     return {"gain": gain, "excess": p.value("mass") - gain}
+    >>> table = sweep_from_neighbours(tune, given, {"mass": [1.0, 2.0, 4.0]}, value="excess", starts={"gain": "Kp"},
+    ...                               executor=ThreadPoolExecutor())
+    >>> table["gain"].tolist()
+    [1.0, 2.0, 4.0]
+    """
+    import pandas as pd
+
+    taken = sorted(set(axes) & set(starts.values()))
+    require(
+        not taken, f"{', '.join(taken)}: an axis of the study and found by its search; fix it or leave the axis out"
+    )
+    cases, table = grid(parameters, axes), pd.DataFrame()
+    places = {n: _places(axes[n]) for n in axes}
+    for wave in _waves(parameters, cases, axes):
+        chosen = {name: cases[name] | _start_beside(table, cases[name], places, value, starts) for name in wave}
+        found = sweep(fn, parameters, chosen, executor=executor, progress=progress)
+        found = found.drop(columns=[n for n in starts.values() if n in found])
+        found = found.assign(**{n: [cases[name][n] for name in wave] for n in axes})
+        table = pd.concat([table, found], ignore_index=True)
+    columns = ["case", *axes, *(n for n in table if n not in ("case", *axes, "seconds", "error")), "seconds", "error"]
+    table = table.set_index("case").loc[list(cases)].reset_index()[columns]
+    missing = {value, *starts} - set(table)
+    if missing:  # every cell failed: no result to start from
+        return table.assign(**dict.fromkeys(sorted(missing), nan), again=False, breaks=True)
+    return search_again(
+        fn, parameters, table, axes=list(axes), value=value, starts=starts, executor=executor, progress=progress
+    )
 
 
 def search_again(
@@ -104,12 +177,45 @@ def search_again(
     return found
 
 
+def _waves(
+    parameters: ParameterSet, cases: Mapping[str, Mapping[str, float]], axes: Mapping[str, Sequence[float]]
+) -> list[list[str]]:
+    """The names of the cells by their distance, in steps of the grid, from the one nearest to the parameters."""
+    distances = dict.fromkeys(cases, 0)
+    for n, values in axes.items():
+        places, own = _places(values), parameters.value(n)
+        middle = places[min(places, key=lambda v, own=own: abs(v - own))]
+        distances = {name: d + abs(places[cases[name][n]] - middle) for name, d in distances.items()}
+    waves = [[n for n, d in distances.items() if d == wave] for wave in range(max(distances.values()) + 1)]
+    return [wave for wave in waves if wave]
+
+
+def _start_beside(
+    table: "pd.DataFrame", case: Mapping[str, float], places: Places, value: str, starts: Mapping[str, str]
+) -> dict[str, float]:
+    """What the best neighbour of a cell found, by parameter; nothing where none has found anything yet."""
+    best = _best_beside(table, case, places, value) if value in table else -1
+    return {n: float(table[column].iloc[best]) for column, n in starts.items()} if best >= 0 else {}
+
+
+def _places(values: Iterable[float]) -> dict[float, int]:
+    """The rank of each value of an axis."""
+    return {v: k for k, v in enumerate(sorted(set(map(float, values))))}
+
+
 def _best_neighbour(table: "pd.DataFrame", axes: Sequence[str], value: str, row: int) -> int:
-    """The row with the least value among those one step away along one axis; -1 where none has a value."""
-    places = {n: {v: k for k, v in enumerate(sorted(set(table[n])))} for n in axes}
-    at = [[places[n][table[n].iloc[k]] for n in axes] for k in range(len(table))]
-    beside = [k for k in range(len(table)) if sum(abs(a - b) for a, b in zip(at[k], at[row], strict=True)) == 1]
-    able = [k for k in beside if isfinite(_number(table, value, k))]
+    """The row with the least value among the neighbours of a row; -1 where none has a value."""
+    case = {n: float(table[n].iloc[row]) for n in axes}
+    return _best_beside(table, case, {n: _places(table[n]) for n in axes}, value)
+
+
+def _best_beside(table: "pd.DataFrame", case: Mapping[str, float], places: Places, value: str) -> int:
+    """The row with the least value among those one step away from a cell along one axis; -1 where none has a value."""
+
+    def distance(row: int) -> int:
+        return sum(abs(places[n][float(table[n].iloc[row])] - places[n][case[n]]) for n in places)
+
+    able = [k for k in range(len(table)) if distance(k) == 1 and isfinite(_number(table, value, k))]
     return min(able, key=lambda k: _number(table, value, k), default=-1)
 
 

@@ -176,15 +176,14 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback 
         return search, result
     other = prepare_search(task, successor, progress)
     found = other.run()
-    worse = not found.status.converged or _certified_objective(task, found) >= _certified_objective(task, result)
+    before, after = (certified_objective(task.spec, r) for r in (result, found))
+    worse = not found.status.converged or after >= before
     return (search, result) if result.status.converged and worse else (other, found)
 
 
-def _certified_objective(task: TuningTask, result: TuningResult) -> float:
+def certified_objective(spec: Specification, result: TuningResult) -> float:
     """The objective by a result's certificate, the worst over the cases."""
-    return task.spec.objective(
-        worst_values([requirement_values(dict(column)) for _, column in result.certified.items()])
-    )
+    return spec.objective(worst_values([requirement_values(dict(column)) for _, column in result.certified.items()]))
 
 
 def _try_on_plants(

@@ -14,6 +14,9 @@ from typer.testing import CliRunner, Result
 
 from pneuopt.cli import study as study_module
 from pneuopt.cli.app import app
+from pneuopt.cli.study import tune_cell
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.racing import Racing
@@ -98,6 +101,60 @@ def edit(name: str, old: str, new: str) -> None:
     text = Path(name).read_text(encoding="utf-8")
     assert old in text
     Path(name).write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+@pytest.fixture
+def tuned(front: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The files of a study that tunes each cell over three masses, in threads."""
+    edit("study.toml", "[axes]", "tune = true\n[axes]")
+    edit("study.toml", "load.force", "# load.force")
+    edit("study.toml", '"2 kg", "4000 g"', '"4 kg", "5 kg", "6 kg"')
+    edit("tuning.toml", "[limits]", '[minimise]\nsettling_time = { band = "5 %", weight = 1.0 }\n[limits]')
+    edit("tuning.toml", 'settling_time = { max = "250 ms", band = "5 %" }', "")
+    edit("tuning.toml", "[limits]", '[method]\nkind = "racing"\ntrials = 40\npolish = 0\n[limits]')
+    inside = partial(sweep_from_neighbours, executor=ThreadPoolExecutor(1))
+    monkeypatch.setattr(study_module, "sweep_from_neighbours", inside)
+    return front
+
+
+def test_a_study_tunes_each_cell_from_the_gains_of_its_neighbours(tuned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = dict[float, float]()
+
+    def cell(drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
+        begun[parameters.value("load.mass")] = parameters.value("pid.Kp")
+        return tune_cell(drive, tuning, parameters)
+
+    monkeypatch.setattr(study_module, "tune_cell", cell)
+    result = run("study study.toml -o cases.csv --json cases.json --plot map.png")
+    assert result.exit_code == 0, result.stdout
+    assert result.stdout.splitlines()[0] == "3 cases, each the worst of 2 references: all settle"
+    cases = pd.read_csv("cases.csv").set_index("load.mass [kg]")
+    assert begun[5.0] == 300.0
+    assert begun[4.0] == begun[6.0] == cases["pid.Kp"][5.0] != 300.0
+    worst = cases[["SettlingTime[0 to 0.2] [s]", "SettlingTime[0 to -0.1] [s]"]].max(axis=1)
+    np.testing.assert_allclose(cases["objective"], worst)
+    assert (cases[["PeakControl[0 to 0.2] [N]", "PeakControl[0 to -0.1] [N]"]] <= 120.0).all().all()
+    assert not cases[["again", "breaks"]].any().any()
+
+
+def test_a_cell_that_breaks_with_its_neighbours_is_searched_again_and_named(
+    tuned: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched = list[float]()
+
+    def cell(_: Path, __: Path, parameters: ParameterSet) -> dict[str, float]:
+        mass = parameters.value("load.mass")
+        searched.append(mass)
+        long = 0.4 if mass == 6.0 else 0.1
+        return {"SettlingTime": long, "Overshoot": 0.0, "objective": long, "found pid.Kp": 200.0, "found pid.Ki": 2e3}
+
+    monkeypatch.setattr(study_module, "tune_cell", cell)
+    result = run("study study.toml -o cases.csv")
+    assert result.exit_code == 1
+    assert result.stdout.splitlines()[0].endswith("1 break with their neighbours")
+    assert "load.mass = 6 kg: breaks with its neighbours, also searched from their gains" in result.stdout
+    assert searched == [5.0, 4.0, 6.0, 6.0]
+    assert pd.read_csv("cases.csv")["breaks"].tolist() == [False, False, True]
 
 
 def test_a_study_is_shown_written_and_drawn(folder: Path) -> None:

@@ -143,3 +143,24 @@ def test_a_bad_front_gets_one_message(file: Path, case: str) -> None:
     with pytest.raises(InputError, match=said) as error:
         front(file, FRONT.replace(old, new, 1))
     assert str(error.value).startswith(str(file))
+
+
+def test_a_study_may_tune_each_cell_of_a_grid(file: Path) -> None:
+    file.write_text(STUDY, encoding="utf-8")
+    assert not read_study(file).tune
+    file.write_text(STUDY.replace("[axes]", "tune = true\n[axes]"), encoding="utf-8")
+    assert read_study(file).tune
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (STUDY.replace("[axes]", 'tune = "yes"\n[axes]'), "tune must be true or false, got 'yes'"),
+        (FRONT.replace("[pareto]", "tune = true\n[pareto]"), "tune belongs to a grid; a front is tuned anyway"),
+        (STUDY.replace("[axes]", "tune = true\n[axes]") + '[metrics]\nband = "5 %"\n', "state it in tuned.toml"),
+    ],
+)
+def test_what_a_study_cannot_tune_is_refused(file: Path, text: str, told: str) -> None:
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        read_study(file)

@@ -7,7 +7,7 @@ import pytest
 
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.studies.neighbours import search_again
+from pneuopt.studies.neighbours import search_again, sweep_from_neighbours
 from pneuopt.studies.sweep import grid, sweep
 
 GIVEN = ParameterSet({"a": Parameter(0.0, "1"), "b": Parameter(0.0, "1"), "gain": Parameter(0.0, "1", 0.0, 9.0)})
@@ -60,3 +60,43 @@ def test_smooth_studies_are_left_alone_and_missing_columns_are_named() -> None:
     assert not table[["again", "breaks"]].to_numpy().any()
     with pytest.raises(InputError, match="no column Ts"):
         search_again(calm, GIVEN, first, axes=["a", "b"], value="Ts", starts=STARTS)
+
+
+def nearsighted(p: ParameterSet) -> dict[str, float]:
+    """A search that gets from its start no further than 1, towards 3 + a + b."""
+    start, best = p.value("gain"), 3.0 + p.value("a") + p.value("b")
+    found = min(best, start + 1.0)
+    return {"found": found, "settling": 1.0 + best - found}
+
+
+def test_each_cell_starts_from_its_best_neighbour_nearest_to_the_given_parameters_first() -> None:
+    given = GIVEN.with_values({"a": 1.0, "b": 2.0, "gain": 5.5})
+    axes = {"b": [0.0, 1.0, 2.0], "a": [2.0, 1.0, 0.0]}
+    with ThreadPoolExecutor(3) as pool:
+        table = sweep_from_neighbours(nearsighted, given, axes, value="settling", starts=STARTS, executor=pool)
+        alone = sweep(nearsighted, given, grid(given, axes), executor=pool)
+    np.testing.assert_allclose(table["settling"], 1.0)
+    assert alone["settling"].max() == 1.5  # from the given start the farthest cell is out of reach
+    assert list(table) == ["case", "b", "a", "found", "settling", "seconds", "error", "again", "breaks"]
+    assert table["case"].tolist() == list(grid(given, axes))
+    assert not table["breaks"].any()
+
+
+def test_cells_that_fail_are_searched_again_from_a_neighbour_and_flagged_if_they_fail_again() -> None:
+    with ThreadPoolExecutor(3) as pool:
+        kinds = {"axes": {"a": [0.0, 1.0, 2.0], "b": [0.0, 1.0, 2.0]}, "value": "settling", "starts": STARTS}
+        table = sweep_from_neighbours(search, GIVEN, executor=pool, **kinds)  # type: ignore[arg-type]
+        dead = sweep_from_neighbours(fails, GIVEN, executor=pool, **kinds)  # type: ignore[arg-type]
+    assert not table["breaks"].any()  # the corner and the middle start from a neighbour's 5, not from 0
+    np.testing.assert_allclose(table["settling"], 1.0 + 0.1 * table["b"])
+    assert dead["breaks"].all()
+    assert dead[["found", "settling"]].isna().all().all()
+
+
+def test_an_axis_that_the_search_finds_is_refused() -> None:
+    with pytest.raises(InputError, match="gain: an axis of the study and found by its search"):
+        sweep_from_neighbours(search, GIVEN, {"gain": [1.0, 2.0]}, value="settling", starts=STARTS)
+
+
+def fails(p: ParameterSet) -> dict[str, float]:
+    raise ConvergenceError(f"nothing settles at {p.value('a'):g}")
