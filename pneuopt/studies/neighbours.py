@@ -184,7 +184,7 @@ def _waves(
     distances = dict.fromkeys(cases, 0)
     for n, values in axes.items():
         places, own = _places(values), parameters.value(n)
-        middle = places[min(places, key=lambda v, own=own: abs(v - own))]
+        middle = places[min((abs(v - own), v) for v in places)[1]]
         distances = {name: d + abs(places[cases[name][n]] - middle) for name, d in distances.items()}
     waves = [[n for n, d in distances.items() if d == wave] for wave in range(max(distances.values()) + 1)]
     return [wave for wave in waves if wave]

@@ -120,8 +120,8 @@ def _durations(references: Sequence[Step], spec: Specification, settling: Parame
         if not spec.concerns(SteadyStateError):
             found[_settled_duration(i)] = Parameter(record, "s")
         elif settling.free:
-            rest = (record - v for v in (settling.value, settling.upper, settling.lower))
-            found[_settled_duration(i)] = Parameter(next(rest), "s", *rest, free=True)
+            rest, least, most = (record - v for v in (settling.value, settling.upper, settling.lower))
+            found[_settled_duration(i)] = Parameter(rest, "s", least, most, free=True)
         else:
             found[_settled_duration(i)] = Parameter(record - settling.value, "s")
     return ParameterSet(found)
