@@ -25,6 +25,7 @@ PUBLIC_NAMES = [
     "catalog",
     "Certificate",
     "certificate",
+    "ChosenWidth",
     "ClosedLoop",
     "coarse_delay",
     "Code",

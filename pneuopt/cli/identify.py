@@ -1,7 +1,7 @@
 """`pneuopt identify` and `pneuopt simulate --log`: from logs to parameters, and back to logs."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,13 +58,14 @@ def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: fl
         result = identify(system, experiments, parameters, method=LeastSquares(progress=report_progress), throw=False)
     console = make_console()
     show_status(console, result.status)
-    show_estimates(console, result.estimates)
+    show_estimates(console, result.estimates, result.widths)
     show_verdict(console, result.verdict)
     show_fit(console, result.fit)
     tables = {
         "estimates": records(result.estimates),
         "fit": records(result.fit),
         "verdict": _verdict_record(result.verdict),
+        "widths": [asdict(width) for width in result.widths],
     }
     writers: Writers = {}
     if outputs.output is not None:

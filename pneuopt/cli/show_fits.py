@@ -1,13 +1,14 @@
 """What an identification shows: estimates, what is unidentifiable, the models compared, the agreement with logs."""
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.text import Text
 
 from pneuopt.cli.terminal import format_number, new_table
-from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, Verdict
+from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, ChosenWidth, Verdict
 from pneuopt.identification.select_model import ModelSelection
 
 if TYPE_CHECKING:
@@ -17,21 +18,26 @@ MAX_FIT_ROWS = 12
 """Rows of a table of logs: of more, the median and the worst are easier to read."""
 
 
-def show_estimates(console: Console, estimates: "pd.DataFrame") -> None:
-    """Value and 95 % confidence interval of each free parameter.
+def show_estimates(console: Console, estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> None:
+    """Value and 95 % confidence interval of each free parameter, then the widths that the logs have chosen.
 
     Parameters
     ----------
     console : Console
     estimates : DataFrame
         Of an `IdentificationResult`.
+    widths : sequence of ChosenWidth
     """
     table = new_table("parameter", "value", "95 % confidence interval", "unit", "")
     for parameter, row in estimates.iterrows():
         value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
         value = "-" if row["note"] == UNIDENTIFIABLE_NOTE else value
         table.add_row(str(parameter), value, interval, str(row["unit"]), str(row["note"]))
+    for width in widths:
+        table.add_row(width.name, format_number(width.value, 3), "-", width.unit, "chosen")
     console.print(table)
+    for width in widths:
+        console.print(str(width), soft_wrap=True)
 
 
 def show_verdict(console: Console, verdict: Verdict | None) -> None:

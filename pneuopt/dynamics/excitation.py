@@ -11,6 +11,9 @@ from typing import NamedTuple
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 
+DEFAULT_WIDTH = "default; identify chooses it by the logs"
+"""Source of a width that nobody has stated; one that a user states has another source, whatever its value."""
+
 
 @dataclass(frozen=True, eq=False)
 class LoggedMotion:
@@ -81,6 +84,30 @@ class SeparatingRun:
 
 
 @dataclass(frozen=True)
+class Width:
+    """A width over which a model rounds a kink so that it can be integrated: a means, and no property of the plant.
+
+    An identification chooses it by the logs, unless the user states it (`IdentificationResult.widths`).
+
+    Parameters
+    ----------
+    name : str
+        The parameter; it is on a logarithmic scale.
+    factor : float
+        By which a search narrows or widens it.
+    follows : tuple of str
+        Parameters that are narrowed or widened with it.
+    hides : str
+        The parameter that a width of its size hides, as a rounded edge does a dead zone; empty if there is none.
+    """
+
+    name: str
+    factor: float
+    follows: tuple[str, ...] = ()
+    hides: str = ""
+
+
+@dataclass(frozen=True)
 class Excitation:
     """Which motion a model's parameters need in a log, and the runs that separate its parameters.
 
@@ -90,27 +117,28 @@ class Excitation:
         By parameter.
     runs : tuple of SeparatingRun
         The first that suits a group counts.
-    smoothing : str
-        The parameter over which dry friction changes its sign: a model creeps at speeds of that order where the drive
-        stands still. Empty without one.
+    widths : tuple of Width
     """
 
     needs: Mapping[str, Need] = field(default_factory=dict)
     runs: tuple[SeparatingRun, ...] = ()
-    smoothing: str = ""
+    widths: tuple[Width, ...] = ()
 
     def __or__(self, other: "Excitation") -> "Excitation":
-        return Excitation(
-            {**self.needs, **other.needs}, self.runs + other.runs, smoothing=self.smoothing or other.smoothing
-        )
+        known = {w.name for w in self.widths}
+        widths = self.widths + tuple(w for w in other.widths if w.name not in known)
+        return Excitation({**self.needs, **other.needs}, self.runs + other.runs, widths)
 
     def with_prefix(self, prefix: str) -> "Excitation":
         """Put `prefix.` before the names of a part's own parameters: "viscous" becomes "friction.viscous"."""
 
-        def whole(names: frozenset[str]) -> frozenset[str]:
-            return frozenset(n if "." in n else f"{prefix}.{n}" for n in names)
+        def own(name: str) -> str:
+            return name if "." in name or not name else f"{prefix}.{name}"
 
-        smoothing = f"{prefix}.{self.smoothing}" if self.smoothing else ""
+        def whole(names: frozenset[str]) -> frozenset[str]:
+            return frozenset(map(own, names))
+
         needs = {f"{prefix}.{n}": replace(e, confused_with=whole(e.confused_with)) for n, e in self.needs.items()}
         runs = tuple(replace(r, some=whole(r.some), others=whole(r.others)) for r in self.runs)
-        return Excitation(needs, runs, smoothing)
+        widths = tuple(Width(own(w.name), w.factor, tuple(map(own, w.follows)), own(w.hides)) for w in self.widths)
+        return Excitation(needs, runs, widths)

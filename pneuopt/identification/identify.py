@@ -42,6 +42,7 @@ from pneuopt.identification.statistics import (
     cross_correlation,
     ljung_box,
 )
+from pneuopt.identification.widths import choose_widths
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
@@ -112,8 +113,9 @@ def identify(
     check_content(model, experiments)
     log_warnings = emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
     problem = EstimationProblem(model, tuple(experiments), model.parameters | parameters, method)
+    problem, widths = choose_widths(problem)
     held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
-    result = review_fit(held, *_result(held, fit, label, loss))
+    result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths)
     if log_warnings:
         result = replace(result, status=result.status.with_remedies(*log_warnings))
     if throw and not result.status.converged:

@@ -9,6 +9,7 @@ from pneuopt.identification.excitation import remedy
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,6 +83,35 @@ class Verdict:
         return "\n".join(self.sentences) or "the logs identify every free parameter"
 
 
+@dataclass(frozen=True)
+class ChosenWidth:
+    """A width that an identification has used, and whether the logs would have narrower ones.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        [unit]
+    unit : str
+    given : float
+        Before the choice [unit].
+    too_stiff : bool
+        Whether a narrower one was left out, for it takes too many integration steps.
+    """
+
+    name: str
+    value: float
+    unit: str
+    given: float
+    too_stiff: bool = False
+
+    def __str__(self) -> str:
+        kept = self.value == self.given
+        how = "stays at" if kept else "narrowed to" if self.value < self.given else "widened to"
+        reason = "; narrower ones take too many integration steps" if self.too_stiff else ""
+        return f"{self.name} {how} {write_value(self.value, self.unit, 3)}, as the logs ask{reason}"
+
+
 @dataclass(frozen=True, eq=False)
 class IdentificationResult:
     """The result of `identify`: estimates, intervals, fitted trajectories and status.
@@ -109,6 +139,8 @@ class IdentificationResult:
     provenance : mapping of str to str
     verdict : Verdict
         What the logs do not identify, why, and which run would: ``print(result.verdict)``.
+    widths : tuple of ChosenWidth
+        The widths over which the model rounds its kinks, as chosen by the logs; `parameters` holds them, too.
     """
 
     parameters: ParameterSet
@@ -120,6 +152,7 @@ class IdentificationResult:
     stats: Mapping[str, float]
     provenance: Mapping[str, str]
     verdict: Verdict | None = None
+    widths: tuple[ChosenWidth, ...] = ()
 
 
 def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.dynamics.system import System
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.identifiability import (
     MAX_LINEAR_DEVIATION,
@@ -26,7 +25,7 @@ from pneuopt.identification.result import (
     Verdict,
     join_names,
 )
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.identification.widths import advise_widths
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.equations import segment_gaps
@@ -43,8 +42,6 @@ GAP_SUBSTEPS = (
     20  # integration steps a sample for the gaps that are shown: fewer add integration errors, more cost time
 )
 MIN_REPORTED_GAP = 1e-4  # of a state's nominal size: smaller gaps are integration errors, larger ones point to a fault
-SMOOTHING_REDUCTION = 0.1  # of the width [1] in one advice; smaller takes finer steps, larger leaves the model creeping
-MIN_SMOOTHING_SHARE = 0.1  # of the model's default width [1]; a narrower width takes ever finer integration steps
 
 
 def review_fit(
@@ -196,27 +193,13 @@ def _locate_failure(problem: EstimationProblem, start: Start, status: Status, ve
         status = status.with_remedies(
             _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
         )
-    return status.with_remedies(smoothing_advice(problem.system.plant, problem.parameters))
+    return status.with_remedies(*advise_widths(problem))
 
 
 def _name_unidentifiable(verdict: Verdict) -> str:
     """A sentence on what the logs do not identify; empty if they identify all."""
     names = verdict.unidentifiable
     return f"the logs do not identify {join_names(names)}" if names else ""
-
-
-def smoothing_advice(plant: System, parameters: ParameterSet) -> str:
-    """A remedy for logs that stick, where a smoothed friction creeps; empty if the plant's smoothing is narrow."""
-    name = plant.excitation.smoothing
-    if name not in parameters:
-        return ""
-    width, unit = parameters[name].value, parameters[name].unit
-    narrowest = MIN_SMOOTHING_SHARE * plant.parameters[name].value
-    if width <= narrowest:
-        return ""
-    narrower = max(narrowest, SMOOTHING_REDUCTION * width)
-    message = f"if the logs stick, try {name} = {narrower:g} {unit} in place of {width:g} {unit}"
-    return f"{message}: above it the model creeps where the drive stands still"
 
 
 def _worst_residual(problem: EstimationProblem, start: Start) -> str:

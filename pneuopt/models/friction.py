@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import casadi as ca
 import numpy as np
 
-from pneuopt.dynamics.excitation import Excitation
+from pneuopt.dynamics.excitation import DEFAULT_WIDTH, Excitation
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.friction_start import Bristles, FrictionSamples, FrictionStart
 from pneuopt.models.needs import (
@@ -365,7 +365,7 @@ _FLOORS = {"coulomb": MIN_COULOMB_SHARE, "viscous": 0.0}
 _STRIBECK_SCAN = {"stribeck_velocity": STRIBECK_VELOCITIES}
 _VISCOUS_PARAMETER = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5)
 _COULOMB_PARAMETER = Parameter(30.0, "N", lower=0.0, upper=1e5)
-_SMOOTHING_PARAMETER = Parameter(1e-3, "m/s", lower=1e-6, upper=1.0, log=True)
+_SMOOTHING_PARAMETER = Parameter(1e-3, "m/s", lower=1e-6, upper=1.0, log=True, source=DEFAULT_WIDTH)
 _STRIBECK_PARAMETERS = {
     "coulomb": _COULOMB_PARAMETER,
     "static": Parameter(45.0, "N", lower=0.0, upper=1e5),

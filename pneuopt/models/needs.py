@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from pneuopt.dynamics.excitation import Excitation, Lack, LoggedMotion, Need, SeparatingRun
+from pneuopt.dynamics.excitation import Excitation, Lack, LoggedMotion, Need, SeparatingRun, Width
 from pneuopt.quantities.parameters import ParameterSet
 
 MIN_SPEED_RATIO = 3.0  # fast over slow speed [1]: less shows one point of the curve, a larger bound refuses good logs
@@ -17,6 +17,9 @@ MIN_INERTIA_SHARE = 0.02  # inertia force over the friction level [1]: less is l
 DEFAULT_STRIBECK_VELOCITY = 0.02  # for laws without a Stribeck velocity [m/s]
 FRICTION_LEVELS = frozenset({"coulomb", "static"})
 STRIBECK_CURVE = FRICTION_LEVELS | {"stribeck_velocity"}
+# factor of a search over the width of dry friction's sign [1]: a smaller one takes more trials, a larger one leaves out
+# widths at which a log that slides is followed best
+SMOOTHING_FACTOR = 10.0
 BRISTLES = frozenset({"bristle_stiffness", "bristle_damping", "damping_velocity"})
 CONSTANT_FORCES = frozenset({"load.force", "rig.force_offset"})
 """Parameters of drives for a force that is constant, whatever the speed."""
@@ -89,7 +92,11 @@ VISCOUS_EXCITATION = Excitation(
     ),
 )
 COULOMB_EXCITATION = (
-    Excitation({}, (SeparatingRun(CONSTANT_FORCES, FRICTION_LEVELS, "log both directions"),), smoothing="smoothing")
+    Excitation(
+        {},
+        (SeparatingRun(CONSTANT_FORCES, FRICTION_LEVELS, "log both directions"),),
+        (Width("smoothing", SMOOTHING_FACTOR),),
+    )
     | VISCOUS_EXCITATION
 )
 STRIBECK_EXCITATION = COULOMB_EXCITATION | Excitation(
@@ -125,6 +132,7 @@ ASYMMETRY_EXCITATION = Excitation(
             ALIKE_AT_EVERY_SPEED,
         ),
     ),
+    (Width("smoothing", SMOOTHING_FACTOR, follows=("asymmetry_width",)),),
 )
 _LEVELS = frozenset(f"friction.{n}" for n in FRICTION_LEVELS)
 

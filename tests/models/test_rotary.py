@@ -6,13 +6,12 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.excitation import LoggedMotion
+from pneuopt.dynamics.excitation import DEFAULT_WIDTH, LoggedMotion
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime
 from pneuopt.files.drive import read_drive
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.identification.review import smoothing_advice
 from pneuopt.logs.experiments import Experiment, read_log
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent
 from pneuopt.models.load_dependent import LoadDependent
@@ -136,12 +135,12 @@ def test_the_log_of_a_shaft_is_checked_in_its_own_channels(servo: tuple[RotaryDr
         identify(drive.system(), [against], fit.parameters)
 
 
-def test_advice_on_smoothing_is_in_the_axis_units() -> None:
+def test_the_width_of_its_friction_is_chosen_in_the_axis_units() -> None:
     system = RotaryDrive().system()
-    assert system.excitation.smoothing == "friction.smoothing"
-    advice = smoothing_advice(system, system.parameters)
-    assert advice.startswith("if the logs stick, try friction.smoothing = 0.01 rad/s in place of 0.1 rad/s")
-    assert smoothing_advice(system, system.parameters.with_values({"friction.smoothing": 0.01})) == ""
+    assert [(w.name, system.parameters[w.name].unit) for w in system.excitation.widths] == [
+        ("friction.smoothing", "rad/s")
+    ]
+    assert system.parameters["friction.smoothing"].source == DEFAULT_WIDTH
 
 
 def test_friction_laws_are_those_of_sliding_in_units_of_turning() -> None:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from pneuopt.dynamics.excitation import Excitation, SeparatingRun
+from pneuopt.dynamics.excitation import Excitation, SeparatingRun, Width
 from pneuopt.dynamics.hooks import Axis, FinalElement, Log, LogWarningHook, Rest
 from pneuopt.dynamics.system import Symbols, System, define, names, parameter_vector, stack, symbols
 from pneuopt.models.drive import AMBIENT_PARAMETERS, POSITION, SPEED, rename_quantity
@@ -289,6 +289,9 @@ class PneumaticDrive:
         return self.rest(parameters, **outputs)
 
 
+# factor of a search over the rounding of the valve's edges [1]: a smaller one takes more trials, a larger one leaves
+# out the rounding of a worn valve
+_ROUNDING_FACTOR = 4.0
 _FLOW_PARAMETERS = frozenset({"valve.conductance", "valve.critical_ratio", "supply.pressure", "valve.leak"})
 _FLOW_EXCITATION = Excitation(
     runs=(
@@ -297,7 +300,8 @@ _FLOW_EXCITATION = Excitation(
             _FLOW_PARAMETERS,
             "log chambers filling up to the supply's pressure and emptying to the ambient's",
         ),
-    )
+    ),
+    widths=(Width("valve.rounding", _ROUNDING_FACTOR, hides="valve.dead_zone"),),
 )
 _AIR_PARAMETERS = ParameterSet(
     {

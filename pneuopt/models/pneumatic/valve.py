@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
+from pneuopt.dynamics.excitation import DEFAULT_WIDTH
 from pneuopt.dynamics.system import Symbols
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY, REFERENCE_TEMPERATURE, FlowLaw, Iso6358, Smoothing
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -73,7 +74,7 @@ class ProportionalValve:
         }
         geometry = {
             "dead_zone": Parameter(0.0, "1", -0.5, 0.5),
-            "rounding": Parameter(0.04, "1", 1e-6, 0.5, log=True),
+            "rounding": Parameter(0.04, "1", 1e-6, 0.5, log=True, source=DEFAULT_WIDTH),
             "leak": Parameter(0.0, "1", 0.0, 0.2),
             "span": Parameter(5.0, "V", 0.1, 100.0),
         }

@@ -1,0 +1,242 @@
+"""`choose_widths`: the widths over which a model rounds its kinks, chosen by the logs before the search.
+
+Friction's sign and a valve's edges are sharp; a model rounds them, for its integration. Which width serves depends on
+the log: a wide one creeps where the drive sticks and hides a dead zone, a narrow one takes many integration steps. So
+each width that nobody has stated is narrowed, or else widened, as long as that lowers the cost of a short search with
+loose gaps (problems/identify/foreign_rig.py); a search at a wide width, followed by narrower ones, would stay in the
+optimum of the wide one. A width is stated where its parameter differs from the model's own, in its value or its source.
+"""
+
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
+from math import inf, sqrt
+
+import numpy as np
+
+from pneuopt.dynamics.excitation import Width
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.result import ChosenWidth
+from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code
+from pneuopt.shooting.least_squares import MAX_SEARCH_SUBSTEPS, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
+from pneuopt.shooting.transcription import Transcription
+
+CHOSEN_WIDTH = "chosen by identify from the logs"
+"""Source of a width that `choose_widths` has set."""
+
+# gaps and iterations of a trial: with tighter gaps, or more iterations, it takes as long as a search; with looser gaps,
+# or fewer, a wrong width looks as good as a right one
+TRIAL_STAGE = Stage(3e-3, 6)
+# stages of the method that confirm another width: with fewer a search that has not settled counts as a wrong width,
+# with more it takes as long as a search
+CONFIRMING_STAGES = 4
+MAX_TRIAL_SAMPLES = 8000  # of all logs: more take time and tell no more, fewer may leave out where a log sticks
+EXCERPTS = 4  # stretches in which a longer log is tried: fewer may miss where it sticks, more are short
+# fall of the squared residuals that counts, in variances (chi-square with one degree of freedom exceeds it once in a
+# thousand); lower follows chance, higher keeps wrong widths
+SIGNIFICANT_FALL = 10.8
+# fall of the cost that counts [1]; lower takes integration errors for a better width, higher keeps wrong widths
+MIN_RELATIVE_FALL = 2e-3
+# width over what it hides [1], above which it is narrowed even where the cost does not fall: above .25 a rounded edge
+# shifts the dead zone that it is fitted with
+MAX_HIDING_SHARE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A short search with some widths: its cost, and what it found."""
+
+    widths: dict[str, float]
+    cost: float
+    count: int
+    parameters: ParameterSet
+    too_stiff: bool
+
+    def is_better_than(self, other: "_Trial") -> bool:
+        """Whether the cost is lower beyond chance."""
+        if not self.cost < inf:
+            return False
+        return other.cost - self.cost > self.significant_fall
+
+    @property
+    def significant_fall(self) -> float:
+        noise = max(1.0, 2 * self.cost / max(1, self.count))
+        return max(0.5 * SIGNIFICANT_FALL * noise, MIN_RELATIVE_FALL * self.cost)
+
+
+def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[ChosenWidth, ...]]:
+    """Choose the widths that nobody has stated.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With these widths.
+    chosen : tuple of ChosenWidth
+        Empty where all are stated, or the model has none.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If a trial is interrupted.
+    """
+    open_names = {n for w in _present(problem) if _is_open(problem, w.name) for n in _names(w) if _is_open(problem, n)}
+    if not open_names:
+        return problem, ()
+    given = problem.parameters
+    best, too_stiff = _race_widths(problem, open_names)
+    edits = {n: replace(given[n], value=v, source=CHOSEN_WIDTH) for n, v in best.widths.items() if v != given.value(n)}
+    chosen = (ChosenWidth(n, v, given[n].unit, given.value(n), n in too_stiff) for n, v in best.widths.items())
+    return replace(problem, parameters=given | ParameterSet(edits)), tuple(chosen)
+
+
+def advise_widths(problem: EstimationProblem) -> tuple[str, ...]:
+    """Other values for the widths that the user has stated, each tried in a short search; empty if none is better."""
+    given = problem.parameters
+    stated = {w.name for w in _present(problem) if not given[w.name].free and not _is_open(problem, w.name)}
+    if not stated:
+        return ()
+    found = _race_widths(problem, stated)[0].widths
+    reason = "a short search then follows the logs better; left out, it is chosen by the logs"
+    return tuple(
+        f"try {n} = {v:.3g} {given[n].unit} in place of {given.value(n):g} {given[n].unit}: {reason}"
+        for n, v in found.items()
+        if v != given.value(n)
+    )
+
+
+def _race_widths(problem: EstimationProblem, names: Set[str]) -> tuple[_Trial, set[str]]:
+    """The best trial over the named widths, and the widths of which a narrower one would be too stiff."""
+    race, too_stiff = _Race(problem), set[str]()
+    best = race.run({n: problem.parameters.value(n) for n in sorted(names)})
+    for width in _present(problem):
+        if width.name in names:
+            best, is_stiff = _search_width(race, width, best)
+            too_stiff |= {width.name} if is_stiff else set()
+    return best, too_stiff
+
+
+def _names(width: Width) -> tuple[str, ...]:
+    """The parameters that a search over a width moves."""
+    return (width.name, *width.follows)
+
+
+def _present(problem: EstimationProblem) -> list[Width]:
+    """The widths of the model, of which each is a parameter."""
+    return [w for w in problem.system.plant.excitation.widths if w.name in problem.parameters]
+
+
+def _is_open(problem: EstimationProblem, name: str) -> bool:
+    """Whether nobody has stated a width: it stands where the model, or an earlier choice, has put it."""
+    if name not in problem.parameters or any(name in e.conditions for e in problem.experiments):
+        return False
+    said = problem.parameters[name]
+    return not said.free and (said == problem.system.parameters[name] or said.source == CHOSEN_WIDTH)
+
+
+def _search_width(race: "_Race", width: Width, best: _Trial) -> tuple[_Trial, bool]:
+    """Narrow a width as long as that lowers the cost, or shows what it hides; else widen it as long.
+
+    Returns
+    -------
+    best : Trial
+    too_stiff : bool
+        Whether a narrower one takes too many integration steps.
+    """
+    given, too_stiff = best, False
+    for factor in (1 / width.factor, 1 / sqrt(width.factor)):
+        best, too_stiff = _follow(race, width, best, factor)
+        if not too_stiff:
+            break
+    if best is given:
+        best = _follow(race, width, best, width.factor)[0]
+    return (best if _is_confirmed(race, width, given, best) else given), too_stiff
+
+
+def _follow(race: "_Race", width: Width, best: _Trial, factor: float) -> tuple[_Trial, bool]:
+    """Multiply a width by a factor until that helps no more."""
+    while True:
+        trial = race.run_scaled(best, width, factor)
+        if trial is None:
+            return best, False
+        if not _is_better(width, trial, best):
+            return best, trial.too_stiff
+        best = trial
+
+
+def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> bool:
+    """Whether tighter gaps, too, prefer a width to the given one."""
+    if best is given:
+        return True
+    return _is_better(width, *(race.run(t.widths, race.confirming_stages) for t in (best, given)))
+
+
+def _is_better(width: Width, trial: _Trial, other: _Trial) -> bool:
+    """Whether a trial follows the logs better than another, or as well while it shows what the other hides."""
+    return trial.is_better_than(other) or _shows_more(width, trial, other)
+
+
+def _shows_more(width: Width, trial: _Trial, best: _Trial) -> bool:
+    """Whether a width is too wide for what it hides, and a narrower one follows the logs as well."""
+    is_narrower = trial.widths[width.name] < best.widths[width.name]
+    if width.hides not in best.parameters or not (is_narrower and trial.cost <= best.cost + best.significant_fall):
+        return False
+    return best.widths[width.name] > MAX_HIDING_SHARE * abs(trial.parameters.value(width.hides)) > 0
+
+
+class _Race:
+    """Trials of one problem, in stretches of its logs where these are long."""
+
+    def __init__(self, problem: EstimationProblem) -> None:
+        method = replace(problem.method, progress=None)
+        self.confirming_stages = method.stages[:CONFIRMING_STAGES]
+        self._problem = replace(problem, experiments=excerpts(problem.experiments), weights={}, method=method)
+
+    def run_scaled(self, trial: _Trial, width: Width, factor: float) -> _Trial | None:
+        """A trial with a width and its followers multiplied by a factor; None beyond the bounds."""
+        p = self._problem.parameters
+        scaled = {n: trial.widths[n] * factor for n in _names(width) if n in trial.widths}
+        if any(not p[n].lower <= v <= p[n].upper for n, v in scaled.items()):
+            return None
+        return self.run({**trial.widths, **scaled})
+
+    def run(self, widths: dict[str, float], stages: tuple[Stage, ...] = (TRIAL_STAGE,)) -> _Trial:
+        """A short search from the model's first start, which depends on the widths, too."""
+        problem = replace(self._problem, parameters=self._problem.parameters.with_values(widths))
+        # an empty last stage: the last one of a method would iterate to its end
+        method = replace(problem.method, stages=(*stages, replace(stages[-1], iterations=0)))
+        transcription = problem.transcription(problem.candidates()[0])
+        fit = solve_least_squares(transcription, method)
+        if fit.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        too_stiff = fit.stats["iterations"] == 0 and _is_too_stiff(transcription, method)
+        cost = inf if too_stiff or not fit.stats["cost"] < inf else fit.stats["cost"]
+        return _Trial(widths, cost, fit.count, fit.parameters, too_stiff)
+
+
+def _is_too_stiff(transcription: Transcription, method: LeastSquares) -> bool:
+    """Whether a search refuses its start for the integration steps that it takes."""
+    segments = segment(transcription)
+    q = np.array([p.value for p in segments.transcription.parameters.values()])
+    needed = method.substeps or stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA)
+    return needed > MAX_SEARCH_SUBSTEPS
+
+
+def excerpts(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+    """The logs, or evenly spread stretches of them where they are long."""
+    total = sum(len(e.trajectory) for e in experiments)
+    if total <= MAX_TRIAL_SAMPLES:
+        return tuple(experiments)
+    share, out = MAX_TRIAL_SAMPLES / total, list[Experiment]()
+    for e in experiments:
+        n = len(e.trajectory)
+        size, each = n // EXCERPTS, round(share * n / EXCERPTS)
+        parts = [e.trajectory.rows(k * size, k * size + max(10, each)) for k in range(EXCERPTS)]
+        out += [replace(e, trajectory=part, name=f"{e.name}@{k}") for k, part in enumerate(parts)]
+    return tuple(out)

@@ -1,0 +1,114 @@
+"""The widths over which a model rounds its kinks are chosen by the logs, unless the user states them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pneuopt as po
+from pneuopt.identification.checks import check_logs
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.widths import CHOSEN_WIDTH, MAX_TRIAL_SAMPLES, advise_widths, choose_widths, excerpts
+from pneuopt.shooting.least_squares import LeastSquares, Stage
+
+FREE = ("friction.coulomb", "friction.static", "friction.viscous", "friction.stribeck_velocity")
+WIDTH = "friction.smoothing"
+
+
+def problem(system: po.System, log: po.Experiment, parameters: po.ParameterSet) -> EstimationProblem:
+    logs = tuple(check_logs(system, [log], parameters))
+    return EstimationProblem(system, logs, system.parameters | parameters, LeastSquares())
+
+
+def sticking() -> po.Experiment:
+    """A pulled mass that sticks between its slips, its events located."""
+    t = np.arange(1200) * 1e-3
+    rig = po.ForceDrive(po.Karnopp(po.Stribeck()))
+    truth = rig.parameters.with_values({"friction.coulomb": 30.0, "friction.static": 45.0, "load.mass": 5.0})
+    pull = np.where(t % 1.0 < 0.5, 1, -1) * (20 + 60 * (t % 0.5))
+    sensors = {"position": po.Sensor(noise=1e-5)}
+    return po.record(po.Rig(rig.system(), sensors), po.Trajectory(t, {"force": pull}), truth).experiment
+
+
+def sliding(width: float, step: float = 1e-3) -> po.Experiment:
+    """A mass that slides to and fro, of which the friction turns round over a width."""
+    system = po.ForceDrive(po.Stribeck()).system()
+    t = np.arange(round(1.2 / step)) * step
+    push = 60 * np.sin(2 * np.pi * 2 * t) + 30 * np.sin(2 * np.pi * 3.3 * t)
+    run = po.simulate(system, po.Trajectory(t, {"force": push}), system.parameters.with_values({WIDTH: width}))
+    noisy = run["position"] + 1e-5 * np.random.default_rng(1).standard_normal(len(t))
+    return po.Experiment(po.Trajectory(t, {"force": push, "position": noisy}), {"position": 1e-5}, name="run")
+
+
+def test_a_log_that_sticks_is_explained_by_defaults_and_the_width_is_reported() -> None:
+    system, log = po.ForceDrive(po.Stribeck()).system(), sticking()
+    fit = po.identify(system, [log], system.parameters.with_values({"load.mass": 5.0}).freed(*FREE))
+    for name, true in (("friction.coulomb", 30.0), ("friction.static", 45.0)):
+        assert abs(fit.parameters.value(name) / true - 1) < 0.05
+    assert fit.parameters.value(WIDTH) < 2e-4  # m/s
+    assert fit.parameters[WIDTH].source == CHOSEN_WIDTH
+    assert [(w.name, w.value, w.given) for w in fit.widths] == [(WIDTH, fit.parameters.value(WIDTH), 1e-3)]
+    assert str(fit.widths[0]).startswith(f"{WIDTH} narrowed to {1e3 * fit.parameters.value(WIDTH):.3g} mm/s")
+
+
+def test_a_stated_width_stays_and_a_failure_names_a_better_one() -> None:
+    system, log = po.ForceDrive(po.Stribeck()).system(), sticking()
+    given = system.parameters.with_values({"load.mass": 5.0, WIDTH: 2e-3}).freed(*FREE[:3])
+    hasty = po.LeastSquares(stages=(Stage(1e-3, 2),))
+    failed = po.identify(system, [log], given, method=hasty, throw=False)
+    assert not failed.status.converged
+    assert (failed.parameters.value(WIDTH), failed.widths) == (2e-3, ())
+    advice = next(s for s in failed.status.sentences if s.startswith(f"try {WIDTH} = "))
+    assert "in place of 0.002 m/s" in advice
+    assert float(advice.split()[3]) < 5e-4
+    better = given.with_values({WIDTH: float(advice.split()[3])})
+    assert advise_widths(problem(system, log, better)) == ()
+
+
+def test_a_width_is_stated_by_its_source_even_at_the_usual_value() -> None:
+    system, log = po.ForceDrive(po.Stribeck()).system(), sticking()
+    usual = system.parameters.with_values({"load.mass": 5.0}).freed(*FREE)
+    stated = usual | po.ParameterSet({WIDTH: replace(usual[WIDTH], source="")})
+    assert choose_widths(problem(system, log, stated))[1] == ()
+    chosen, widths = choose_widths(problem(system, log, usual))
+    assert len(widths) == 1
+    again = choose_widths(problem(system, log, chosen.parameters))[1]
+    assert (again[0].value, again[0].given) == (widths[0].value, widths[0].value)
+
+
+@pytest.mark.parametrize(("width", "chosen"), [(1e-3, 1e-3), (1e-2, 1e-2)])
+def test_a_log_that_slides_keeps_or_gets_the_width_of_its_friction(width: float, chosen: float) -> None:
+    system = po.ForceDrive(po.Stribeck()).system()
+    found = choose_widths(problem(system, sliding(width), system.parameters.freed(*FREE)))[1]
+    assert found[0].value == pytest.approx(chosen)
+
+
+def test_a_width_too_narrow_for_the_log_rate_is_widened_in_place_of_a_refusal() -> None:
+    """30 N over 1 mm/s on 20 g take 1500 steps a sample of 2 ms, more than a search allows."""
+    system, log = po.ForceDrive(po.Coulomb()).system(), sliding(1e-2, step=2e-3)
+    light = system.parameters.with_values({"load.mass": 0.02}).freed("friction.coulomb")
+    found = choose_widths(problem(system, log, light))[1]
+    assert found[0].value > 1e-3
+
+
+def test_an_edge_that_hides_the_dead_zone_is_narrowed() -> None:
+    drive = po.PneumaticDrive(po.ProportionalValve(spool=po.Spool.RIGID), po.Viscous())
+    t = np.arange(400) * 2e-3
+    truth = drive.parameters.with_values({"valve.dead_zone": 0.03, "valve.rounding": 0.002})
+    voltage = 0.6 * np.sin(2 * np.pi * 1.5 * t)
+    run = po.simulate(drive.system(), po.Trajectory(t, {"valve_voltage": voltage}), truth, initial={"position": 0.1})
+    log = po.Experiment(run.select(["position", "pressure_a", "pressure_b"]).with_columns({"valve_voltage": voltage}))
+    log = log.with_noise({"position": 1e-5, "pressure_a": 500.0, "pressure_b": 500.0})
+    given = drive.parameters.freed("valve.dead_zone", "valve.conductance")
+    fit = po.identify(drive.system(), [log], given, throw=False)
+    assert fit.parameters.value("valve.dead_zone") == pytest.approx(0.03, rel=0.1)
+    assert fit.parameters.value("valve.rounding") <= 0.25 * 0.03 * 1.4
+
+
+def test_long_logs_are_tried_in_stretches() -> None:
+    t = np.arange(100_000) * 1e-3
+    log = po.Experiment(po.Trajectory(t, {"force": t, "position": t}), name="long")
+    parts = excerpts([log])
+    assert sum(len(e.trajectory) for e in parts) <= MAX_TRIAL_SAMPLES
+    assert [round(e.trajectory.t[0]) for e in parts] == [0, 25, 50, 75]
+    assert excerpts(parts) == parts
