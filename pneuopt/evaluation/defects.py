@@ -12,6 +12,7 @@ from pneuopt.evaluation.continuation import Course
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.dither_ripple import describe_ripple
 from pneuopt.evaluation.limit_cycle import LimitCycle, find_limit_cycle
+from pneuopt.quantities.arrays import Mask
 
 # Share of the step below which a response has not moved: below it, a stuck drive whose friction gives way a little
 # counts as a motion; above it, a response counts as none that creeps towards the reference.
@@ -28,6 +29,10 @@ GROWTH_SHARE, EDGE_SHARE = 0.5, 0.9
 # Share of the range over half the record that a drift in one direction must cover to be creep: with less, slow hunting
 # is creep too; with all of it, the least ringing on the drift hides it.
 MIN_DRIFT_SHARE = 0.9
+# Ratio of the time in the band at the record's end to any stay in it before, from which a response that came in late
+# counts as settled. With a lower one slow hunting settles whenever it is inside; with a higher one a stroke that ends
+# early makes creep of every response that once touched the band's edge.
+MIN_STAY_RATIO = 2.0
 # Horizons within which a response must be in its band for good. With fewer, a design is refused whose user only
 # underrated its settling; with more, one counts as settled that for its user's purposes never does.
 LATEST_SETTLING = 4.0
@@ -84,18 +89,31 @@ class Ending:
     @property
     def settling_time(self) -> float:
         """Instant after the step from which the mean stays in the band, to the grid [s]."""
-        outside = np.flatnonzero(np.abs(self.course.error) > self.band * (1 + BAND_TOLERANCE))
+        outside = np.flatnonzero(~self._inside)
         return float(self.course.at[outside[-1]]) if len(outside) else 0.0
 
     @property
     def is_settled(self) -> bool:
         """Whether the mean enters the band for good: not at the very end, and not again and again."""
         last, end = self.settling_time, float(self.course.at[-1])
-        return last <= (1 - TAIL_SHARE) * end and (last <= end / 2 or self.returns(0.0) == 0)
+        return last <= (1 - TAIL_SHARE) * end and (last <= end / 2 or end - last >= MIN_STAY_RATIO * self.longest_stay)
+
+    @property
+    def longest_stay(self) -> float:
+        """The longest time in the band before the mean leaves it for the last time [s]; 0 where it never does."""
+        at = self.course.at
+        inside = np.concatenate([[False], self._inside, [False]])
+        enters, leaves = np.flatnonzero(~inside[:-1] & inside[1:]), np.flatnonzero(inside[:-1] & ~inside[1:])
+        ended = leaves < len(at)
+        return float(np.max(at[leaves[ended]] - at[enters[ended]], initial=0.0))
+
+    @cached_property
+    def _inside(self) -> Mask:
+        return np.abs(self.course.error) <= self.band * (1 + BAND_TOLERANCE)
 
     def returns(self, share: float) -> int:
         """How often the mean leaves the band from this share of the record on, having been inside."""
-        inside = np.abs(self.course.error[self.course.since(share)]) <= self.band * (1 + BAND_TOLERANCE)
+        inside = self._inside[self.course.since(share)]
         return int(np.sum(inside[:-1] & ~inside[1:]))
 
     @property
