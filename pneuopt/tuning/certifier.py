@@ -17,6 +17,7 @@ from pneuopt.evaluation.requirements import (
     metric_name,
     requirement_values,
 )
+from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
@@ -65,16 +66,17 @@ class Certifier:
         claimed = pd.DataFrame({case.label: metrics for case, metrics in rows}).loc[shown]
         try:
             evaluations, contacts = self._evaluate(parameters)
-            first = self._compare(found, claimed, tabulate_metrics(evaluations).loc[shown])
-            proof = self._judge(evaluations, continues=first.converged and not contacts)
+            within = self._compare(found, claimed, tabulate_metrics(evaluations).loc[shown]).converged
+            proof = self._judge(evaluations, continues=within and not contacts)
             slopes, certified = _friction_slopes(proof.metrics), proof.metrics.loc[shown]
             status = _contact_status(contacts) if contacts else self._certificate_status(found, claimed, proof)
         except ConvergenceError as error:
-            proof, certified, contacts, slopes = None, claimed * np.nan, [], {}
+            proof, certified, contacts, slopes, within = None, claimed * np.nan, [], {}, False
             status = Status(Code.NOT_CERTIFIED, (str(error),))
         deviation = {f"deviation.{n}": float(v) for n, v in (claimed - certified).abs().max(axis=1).items()}
         values = dict(zip(self.task.space.names, point.tolist(), strict=True))
-        contact_count = {"contacts": float(len(contacts))} if contacts else {}
+        marks = {"contacts": float(len(contacts))} if contacts else {}
+        marks |= {"fails_late": 1.0} if within and not contacts and not status.converged else {}
         rejected = {} if status.converged else {f"rejected.{n}": v for n, v in values.items()}
         return TuningResult(
             self.task.space.parameters.with_values(values) if status.converged else self.task.space.parameters,
@@ -84,7 +86,7 @@ class Certifier:
             pd.DataFrame(columns=[*RELAXATION_COLUMNS, *self.task.space.names], dtype=float),
             found.active,
             status,
-            {**found.stats, **deviation, **contact_count, **rejected, **slopes},
+            {**found.stats, **deviation, **marks, **rejected, **slopes},
             provenance(
                 self.method,
                 *self.task.spec.weights,
@@ -158,6 +160,12 @@ class Certifier:
         values = requirement_values({metric: certified.loc[metric].to_numpy(dtype=float)})[metric]
         k = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
         return f" at {certified.columns[k]}" if len(values) > 1 else ""
+
+
+def certified_objective(spec: Specification, result: TuningResult) -> float:
+    """The objective by a result's certificate, the worst over the cases."""
+    values = [requirement_values(dict(column)) for _, column in result.certified.items()]
+    return spec.objective(worst_values(values))
 
 
 def objectives_agree(certified: float, claimed: float, optimum: float, resolution: float) -> bool:

@@ -4,6 +4,7 @@ A search adds up the excesses over its limits. Where that sum has a local minimu
 away keeps every limit. The second search is SciPy's differential evolution on the largest excess.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +16,15 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.tuning.relaxation import limit_excess
 from pneuopt.tuning.simulator import Simulator
+from pneuopt.tuning.space import Space
 
 # Members of the population and trials in all, for each free gain. Fewer miss designs that keep the limits; more delay
 # the answer where there is none.
 MEMBERS_A_GAIN, TRIALS_A_GAIN = 15, 900
 SEED = 0  # of the random numbers, so that an answer repeats
+# Designs that are certified one after the other, at most, and how far apart they lie, a share of a gain's range. Fewer
+# or closer ones fail alike; each more costs an independent simulation of every case.
+MAX_CANDIDATES, CANDIDATE_DISTANCE = 8, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +65,68 @@ def confirm_infeasible(
     -------
     Confirmation
     """
-    space, quick, stable = simulator.space, simulator.coarse(spec), spec.with_stability()
+    quick, stable = simulator.coarse(spec), spec.with_stability()
+    found, count = _minimise_excess(
+        lambda points: limit_excess(quick.values(points, stable), stable),
+        simulator.space,
+        lambda excess: excess <= -room,
+        progress,
+    )
+    share = float(limit_excess(simulator.values(found[None], stable), stable)[0])
+    return Confirmation(found, share, count)
+
+
+def find_candidates(
+    excess: Callable[[Array], Array], space: Space, progress: ProgressCallback
+) -> tuple[list[Array], int]:
+    """Designs that keep all limits, to be certified one after the other, by the same search.
+
+    Parameters
+    ----------
+    excess : callable
+        The largest relative excess over a limit of points, shape (m, n): shape (m,), at most 0 where all are kept.
+    space : Space
+    progress : callable
+        Receives a line of text a generation.
+
+    Returns
+    -------
+    points : list of ndarray, shape (n,)
+        The one with the most room first, then others that lie apart from those before; empty where there is none.
+    simulations : int
+        Candidates simulated.
+    """
+    kept, rooms = list[Array](), list[float]()
+
+    def record(points: Array) -> Array:
+        values = excess(points)
+        kept.extend(points[values <= 0])
+        rooms.extend(values[values <= 0].tolist())
+        return values
+
+    _, count = _minimise_excess(record, space, lambda _: False, progress)
+    chosen = list[Array]()
+    for k in np.argsort(rooms, kind="stable").tolist():
+        unit = space.to_unit(kept[k])
+        if all(np.max(np.abs(unit - space.to_unit(other))) > CANDIDATE_DISTANCE for other in chosen):
+            chosen.append(kept[k])
+    return chosen[:MAX_CANDIDATES], count
+
+
+def _minimise_excess(
+    excess: Callable[[Array], Array], space: Space, is_enough: Callable[[float], bool], progress: ProgressCallback
+) -> tuple[Array, int]:
+    """The point with the least excess that SciPy's differential evolution finds, shape (n,), and how many it tried."""
     count = 0
 
-    def find_excess(unit: Array) -> Any:
+    def cost(unit: Array) -> Any:
         nonlocal count
         count += unit.shape[1]
-        return limit_excess(quick.values(space.from_unit(np.clip(unit.T, 0.0, 1.0)), stable), stable)
+        return excess(space.from_unit(np.clip(unit.T, 0.0, 1.0)))
 
     def is_found(intermediate_result: OptimizeResult) -> bool:
         progress(f"confirming that no design keeps all limits: closest {100 * intermediate_result.fun:.3g} % beyond")
-        return bool(intermediate_result.fun <= -room)
+        return is_enough(float(intermediate_result.fun))
 
     settings: Any = {
         "bounds": [(0.0, 1.0)] * len(space.names),
@@ -84,10 +140,8 @@ def confirm_infeasible(
         "seed": SEED,
         "callback": is_found,
     }
-    found: Any = differential_evolution(find_excess, **settings)
-    point = space.from_unit(np.clip(found.x, 0.0, 1.0))
-    share = float(limit_excess(simulator.values(point[None], stable), stable)[0])
-    return Confirmation(point, share, count)
+    found: Any = differential_evolution(cost, **settings)
+    return space.from_unit(np.clip(found.x, 0.0, 1.0)), count
 
 
 def describe_confirmation(found: Confirmation) -> str:

@@ -64,7 +64,8 @@ class TuningResult:
         "starts_spread", the relative excess of the worst of them, and "starts_unseen", the chance that one start more
         finds another optimum (Boender and Rinnooy Kan);
         "friction_slope[0 to 0.2]" and so on, the slope of friction with which that case's margins are read [N s/m];
-        where the given gains stand "rejected.pid.Kp" and so on, and "contacts" where a response ran into an end stop.
+        where the given gains stand "rejected.pid.Kp" and so on, "contacts" where a response ran into an end stop, and
+        "fails_late" where only what comes after a horizon refuses the design.
     provenance : mapping of str to str
     certificate : Certificate, optional
         All that the independent evaluation found; None where its simulation stopped.

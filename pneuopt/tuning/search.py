@@ -8,7 +8,7 @@ import numpy as np
 
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
-from pneuopt.evaluation.requirements import metric_name
+from pneuopt.evaluation.requirements import metric_name, upper_limit
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
@@ -41,14 +41,17 @@ MAX_CERTIFIED_POINTS = 5
 # Rounds in which the neighbours of the best rounded design are simulated. Fewer miss a rounding that loses next to
 # nothing; more move the design away from the one that was found.
 ROUNDING_ROUNDS = 3
-# Horizons over which a design is sought whose rival hunted or crept after one: fewer do not show it; more cost time in
-# proportion. And the defects of responses that a longer horizon, over which they have to settle, shows to a search.
-HORIZON_FACTOR = 4.0
+# Horizons over which a design is sought whose rival hunted or crept after one, the first that the stroke allows: fewer
+# do not show it; more cost time in proportion. And the defects of responses that a longer horizon, over which they have
+# to settle, shows to a search.
+HORIZON_FACTORS = (4.0, 2.8, 2.0, 1.4)
 LATE_DEFECTS = (Defect.GROWS, Defect.HUNTS, Defect.CREEPS, Defect.NEVER_SETTLES, Defect.UNDECIDED)
-# Searches on closer samples, at most: fewer claim figures of responses that are not resolved; more cost a search each.
+# Searches on closer samples or with shorter steps, at most: fewer claim figures of responses that are not resolved;
+# more cost a search each.
 MAX_REFINED_SEARCHES = 3
-# Relative change of a requirement on closer samples above which a search is repeated on them. A smaller one repeats
-# searches for digits that no ranking needs; a larger one claims figures that the certificate refuses.
+# Change of a requirement on closer samples, relative to its value and its limit, above which a search is repeated on
+# them. A smaller one repeats searches for digits that no ranking needs; a larger one claims figures that the
+# certificate refuses.
 SAMPLING_TOLERANCE = 5e-3
 # Margin of the search for the least relaxation of a limit, a fraction. A larger one reports more than is needed; at
 # zero the design found does not survive its certificate.
@@ -101,26 +104,38 @@ class Search:
         finder = self
         for attempt in range(MARGINS_TO_TRY):
             margin = min(self.method.margin * 2**attempt, 0.5)
-            try:
-                found = finder.find(margin, start, attempt)
-                found = found if finder is self else self._restate(found)
-            except KeyboardInterrupt:  # in a method that holds no best point yet
-                found = _interruption_result(start)
+            found = self._find_with(finder, margin, start, attempt)
             simulator = self.simulator
             counts = {k: v for k, v in found.stats.items() if k.startswith("starts")} | counts
             found = replace(found, stats={**found.stats, **counts, "margin": margin})
             if not found.is_complete:
                 return self._result_so_far(simulator, found)
-            if not found.status.converged:
+            if found.status.converged:
+                result, start = self.certify_roundings(found, margin), found.point
+                if result.status.converged or (self.rests and "contacts" in result.stats):
+                    return result
+                if not self.rests and _ends_elsewhere(result):
+                    return self._run_with_rest(result)
+            elif finder is self:
                 return result or self.certifier.certify(simulator, found, found.point)
-            result = self.certify_roundings(found, margin)
-            if result.status.converged or "contacts" in result.stats:
-                return result
-            if not self.rests and _ends_elsewhere(result):
-                return self._run_with_rest(result)
-            start, finder = found.point, finder.lengthen() if _fails_late(result) else finder
+            finder = self._next_finder(finder, found, result, attempt)
         assert result is not None
         return result
+
+    def _find_with(self, finder: "Search", margin: float, start: Array, attempt: int) -> SearchResult:
+        """What a search for this one's task finds, over a longer horizon perhaps; its objective is this one's."""
+        try:
+            found = finder.find(margin, start, attempt)
+        except KeyboardInterrupt:  # in a method that holds no best point yet
+            return _interruption_result(start)
+        return found if finder is self or not found.is_complete else self.restate(found)
+
+    def _next_finder(
+        self, finder: "Search", found: SearchResult, refused: TuningResult | None, attempt: int
+    ) -> "Search":
+        """The search for the next attempt: over a longer horizon once a design was refused for what came after it."""
+        late = finder is not self or (refused is not None and _fails_late(refused))
+        return self.lengthen(rests=found.status.converged) if late and attempt + 1 < MARGINS_TO_TRY else finder
 
     def _run_with_rest(self, refused: TuningResult) -> TuningResult:
         """Search again for designs that end in the band; the refused one's result where there is none."""
@@ -130,22 +145,31 @@ class Search:
         result = other.run(self.space.start)
         return result if result.status.converged or result.status.code is Code.INTERRUPTED else refused
 
-    def lengthen(self) -> "Search":
+    def lengthen(self, *, rests: bool) -> "Search":
         """A search over a longer horizon, in which a response that hunts or creeps later never settles.
 
-        Where the piston's travel or the plant allows no longer one it is this search.
+        With `rests` it has to settle within the horizon asked for, otherwise within the longer one. It is the longest
+        of `HORIZON_FACTORS` for which the piston has room; where there is none it is this search.
         """
-        steps = tuple(replace(r, horizon=r.at + HORIZON_FACTOR * (r.horizon - r.at)) for r in self.task.references)
-        spec, task = replace(self.spec, limits=limits_with_settling(self.spec, steps, always=True)), self.task
-        every = cases(steps, task.scenarios, self.space.parameters, self.space.names)
-        try:
-            check_feasibility(task.loop, every, self.space, spec)
-        except InputError:
-            return self
-        self.progress(f"what it does after its horizon forbids the design; searching over {HORIZON_FACTOR:g} horizons")
-        return replace(self, task=replace(task, references=steps, spec=spec))
+        for factor in HORIZON_FACTORS:
+            task = self._stretch_task(factor, rests)
+            every = cases(task.references, task.scenarios, self.space.parameters, self.space.names)
+            try:
+                check_feasibility(task.loop, every, self.space, task.spec)
+            except InputError:
+                continue
+            self.progress(f"what it does after its horizon forbids the design; searching over {factor:g} horizons")
+            return replace(self, task=task)
+        return self
 
-    def _restate(self, found: SearchResult) -> SearchResult:
+    def _stretch_task(self, factor: float, rests: bool) -> TuningTask:
+        """The task over so many horizons, with a limit that every response settles."""
+        steps = tuple(replace(r, horizon=r.at + factor * (r.horizon - r.at)) for r in self.task.references)
+        spec = self.spec.with_rest(self.task.horizon) if rests else self.spec
+        spec = replace(spec, limits=limits_with_settling(spec, steps, always=True))
+        return replace(self.task, references=steps, spec=spec)
+
+    def restate(self, found: SearchResult) -> SearchResult:
         """A result of a search over a longer horizon, with the objective over the horizon asked for."""
         values = to_records(self.simulator.values(found.point[None], self.spec))[0]
         return replace(found, stats={**found.stats, "optimum": self.spec.objective(values)})
@@ -161,8 +185,8 @@ class Search:
         spec = self.tighten(margin)
         found = self.method.find(self.task, self.simulator, spec, start, attempt, self.progress)
         for _ in range(MAX_REFINED_SEARCHES):
-            finer = self.simulator.refine(found.point)
-            if not found.is_complete or finer is self.simulator or self._agree(finer, found.point):
+            finer = self._resolve(found.point) if found.is_complete else self.simulator
+            if finer is self.simulator:
                 break
             vars(self)["simulator"] = finer
             if "simulations" in found.stats:  # otherwise the method has samples of its own
@@ -170,14 +194,22 @@ class Search:
                 found = self.method.find(self.task, finer, spec, found.point, attempt, self.progress)
         return found
 
+    def _resolve(self, point: Array) -> Simulator:
+        """The simulator, or one with closer samples or shorter steps where a point's requirements need them."""
+        for finer in (self.simulator.refine(point), self.simulator.shorten_steps()):
+            if finer is not self.simulator and not self._agree(finer, point):
+                return finer
+        return self.simulator
+
     def _agree(self, finer: Simulator, point: Array) -> bool:
-        """Whether the requirements have the same values on closer samples."""
+        """Whether the requirements have the same values on closer samples, or with shorter steps."""
         coarse, fine = (to_records(s.respond(point[None], self.spec.band).values)[0] for s in (self.simulator, finer))
-        return all(
-            bool(np.isclose(coarse[n], fine[n], rtol=SAMPLING_TOLERANCE, equal_nan=True))
-            for n in self.spec.kinds
-            if n in fine
-        )
+        for q in (*self.spec.weights, *self.spec.limits):
+            n, least, most = metric_name(q), q.metric.resolution, upper_limit(q)
+            least += SAMPLING_TOLERANCE * most if most < np.inf else 0.0
+            if n in fine and not np.isclose(coarse[n], fine[n], rtol=SAMPLING_TOLERANCE, atol=least, equal_nan=True):
+                return False
+        return True
 
     def _report_start(self, simulator: Simulator) -> None:
         """Report cases in which the loop never settles with the given gains: one of them may be mistyped."""
@@ -193,7 +225,7 @@ class Search:
         result = None
         for point in self._round_gains(self.simulator, found, margin):
             result = self.certifier.certify(self.simulator, found, point)
-            if result.status.converged or "contacts" in result.stats:
+            if result.status.converged or "contacts" in result.stats or _fails_late(result):
                 break
         assert result is not None
         return result
@@ -262,15 +294,16 @@ class Search:
 
 
 def _ends_elsewhere(result: TuningResult) -> bool:
-    """Whether a design was refused because its response does not end at the reference."""
+    """Whether a design was refused because its response does not end at the reference, or runs into an end stop."""
     findings = result.certificate.findings if result.certificate is not None else ()
-    return any(f.defect in ENDS_ELSEWHERE and f.sentence in result.status.sentences for f in findings)
+    elsewhere = any(f.defect in ENDS_ELSEWHERE and f.sentence in result.status.sentences for f in findings)
+    return elsewhere or "contacts" in result.stats
 
 
 def _fails_late(result: TuningResult) -> bool:
-    """Whether the certificate failed by what the response does after its horizon."""
+    """Whether it was refused for what it does after its horizon, which no rounding mends and a longer one shows."""
     findings = result.certificate.findings if result.certificate is not None else ()
-    return any(finding.defect in LATE_DEFECTS for finding in findings)
+    return "fails_late" in result.stats or any(f.defect in LATE_DEFECTS for f in findings)
 
 
 def _interruption_result(point: Array) -> SearchResult:

@@ -9,6 +9,7 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.margins import lowest_noise_frequency
@@ -146,6 +147,18 @@ class Simulator:
         part._is_refined = part.grids is not self.grids
         return part if part._is_refined else self
 
+    def shorten_steps(self) -> "Simulator":
+        """A copy whose RK4 steps are half as long; itself where that takes too many."""
+        if 2 * max(self.substeps) > MAX_LOOP_SUBSTEPS:
+            return self
+        part = copy.copy(self)
+        part._rate = max(
+            (2 * k - 0.5) * RK4_MAX_H_LAMBDA / g.spacing for k, g in zip(self.substeps, self.grids, strict=True)
+        )
+        part.substeps = [rk4_substeps(part._rate, grid.spacing) for grid in part.grids]
+        part._find_points = PointFinder(self.loop, self.rollout, part._rate)
+        return part
+
     def _signal(self, point: Array, case: int, grid: ReferenceGrid) -> Array | None:
         """The measured signal of a case at the samples of a grid; None where it runs away."""
         p, start = self.lanes(point[None], np.zeros(1, dtype=np.intp), np.full(1, case))
@@ -153,14 +166,6 @@ class Simulator:
         with np.errstate(all="ignore"):
             found = self.rollout.run(start, u, p, t, h, substeps=rk4_substeps(self._rate, grid.spacing))
         return found.y[0, :, SIGNAL_OUTPUT] if is_sound(found.y, found.x_end)[0] else None
-
-    def select_cases(self, chosen: Sequence[int]) -> "Simulator":
-        """A copy with some of the cases."""
-        part = copy.copy(self)
-        part.cases, part._rest = tuple(self.cases[k] for k in chosen), [self._rest[k] for k in chosen]
-        used, part._grid_of = np.unique(self._grid_of[list(chosen)], return_inverse=True)
-        part.grids, part.substeps = [self.grids[g] for g in used], [self.substeps[g] for g in used]
-        return part
 
     def cases_by_grid(self) -> list[Mask]:
         """Which cases run on each grid, that is on each reference: a mask of shape (n_cases,) a grid."""

@@ -20,7 +20,7 @@ from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.dither_effect import describe_swing
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
-from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime, requirement_values
+from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import Objective, Specification, specify
@@ -28,11 +28,12 @@ from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
+from pneuopt.tuning.certifier import certified_objective
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.method import Method, TuningTask
 from pneuopt.tuning.methods import choose_method
 from pneuopt.tuning.on_rig import certify_on_rig, check_rig
-from pneuopt.tuning.responses import worst_values
+from pneuopt.tuning.refusal import confirm_refusal
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, relax
 from pneuopt.tuning.space import Space, clip_level, search_space
@@ -136,6 +137,7 @@ def tune(
     _warn_of_swing(task)
     search, result = _search(task, method, progress)
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
+    result = confirm_refusal(search, result) if result.status.code is Code.NOT_CERTIFIED else result
     tuned = search.space.names
     untuned = [n for n in task.space.names if n not in tuned]
     note = f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""
@@ -179,11 +181,6 @@ def _search(task: TuningTask, method: Method | None, progress: ProgressCallback 
     before, after = (certified_objective(task.spec, r) for r in (result, found))
     worse = not found.status.converged or after >= before
     return (search, result) if result.status.converged and worse else (other, found)
-
-
-def certified_objective(spec: Specification, result: TuningResult) -> float:
-    """The objective by a result's certificate, the worst over the cases."""
-    return spec.objective(worst_values([requirement_values(dict(column)) for _, column in result.certified.items()]))
 
 
 def _try_on_plants(

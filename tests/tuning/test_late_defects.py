@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pneuopt import catalog
@@ -10,7 +11,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.defects import Defect, Finding
-from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.evaluation.requirements import ITAE, Overshoot, RiseTime, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.status import Code, Status
@@ -62,22 +63,58 @@ def search_for(loop: ClosedLoop, step: Step, given: Any) -> Search:
     return prepare_search(prepare_task(loop, step, given, specify(SettlingTime(), [Overshoot(0.05)])), SMALL)
 
 
-def test_it_has_to_settle_over_the_longer_horizon() -> None:
+def test_it_has_to_settle_within_the_horizon_or_the_longer_one() -> None:
     loop, given = slow_problem()
     search = search_for(loop, Step(1.0, horizon=1.5), given)
-    longer = search.lengthen()
-    assert [r.horizon for r in longer.task.references] == [6.0]
-    assert longer.spec.limit(SettlingTime) == pytest.approx(0.95 * 6.0)
-    assert [r.horizon for r in longer.lengthen().task.references] == [24.0]
+    for rests, latest in ((True, 1.5), (False, 6.0)):
+        longer = search.lengthen(rests=rests)
+        assert [r.horizon for r in longer.task.references] == [6.0]
+        assert longer.spec.limit(SettlingTime) == pytest.approx(0.95 * latest)
+    assert [r.horizon for r in longer.lengthen(rests=False).task.references] == [24.0]
     assert search.task.references[0].horizon == 1.5
 
 
-def test_the_stroke_forbids_a_longer_horizon() -> None:
+@pytest.mark.parametrize(("start", "factor"), [(0.1, 1.4), (0.45, 1.0)])
+def test_the_stroke_allows_less_than_four_horizons(start: float, factor: float) -> None:
+    """A step of half a stroke a second: from 10 % on it has room for 1.8 s, from 45 % on for 1.1 s."""
     drive, rig = catalog.s32()
     loop = ClosedLoop(drive.system(), PID(), measured="speed")
     given = loop.parameters | rig.fixed("*")
     bounds = {"pid.Kp": (0.2, 60.0), "pid.Ki": (0.5, 400.0)}
     given = given.with_values({"pid.Kp": 5.0, "pid.Ki": 30.0}).with_bounds(bounds).freed(*bounds)
     stroke = rig.value("cylinder.stroke")
-    search = search_for(loop, Step(0.5 * stroke, horizon=1.0, start={"position": 0.2 * stroke}), given)
-    assert search.lengthen() is search
+    search = search_for(loop, Step(0.5 * stroke, horizon=1.0, start={"position": start * stroke}), given)
+    longer = search.lengthen(rests=True)
+    assert [r.horizon for r in longer.task.references] == [pytest.approx(factor)]
+    assert (longer is search) == (factor == 1.0)
+
+
+def test_a_limit_that_breaks_after_the_horizon_is_no_matter_of_rounding() -> None:
+    """The largest overshoot comes at .3 s, the horizon ends at .15 s: the next search has to see it."""
+    loop, given = slow_problem()
+    found = {}
+    for horizon in (0.15, 2.0):
+        task = prepare_task(loop, Step(1.0, horizon=horizon), given, specify(ITAE(), [Overshoot(0.05)]))
+        found[horizon] = prepare_search(task, SMALL).certify_point(np.array([1.0, 18.0]))
+        assert found[horizon].status.code is Code.NOT_CERTIFIED
+        assert "Overshoot is" in found[horizon].status.message
+    assert found[0.15].stats["fails_late"] == 1.0
+    assert "fails_late" not in found[2.0].stats
+
+
+def test_a_design_that_meets_an_end_stop_is_followed_by_a_search_for_one_that_rests(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (loop, given), heard, certify = slow_problem(), list[str](), Search.certify_roundings
+
+    def meet_the_stop(search: Search, found: SearchResult, margin: float) -> TuningResult:
+        result = certify(search, found, margin)
+        refused = replace(result, status=Status(Code.NOT_CERTIFIED, ("the stop",)), stats={"contacts": 1.0})
+        return result if search.rests else refused
+
+    monkeypatch.setattr(Search, "certify_roundings", meet_the_stop)
+    asked: Any = {"minimise": RiseTime(), "subject_to": [Overshoot(0.05)], "method": SMALL, "plants": {}}
+    found = tune(loop, Step(1.0, horizon=1.5), given, progress=heard.append, **asked)
+    assert any("searching for one that does" in text for text in heard)
+    assert found.status.converged
+    assert found.certified.loc["SettlingTime"].max() <= 1.5

@@ -152,15 +152,3 @@ def test_a_search_sees_what_happens_between_two_samples() -> None:
         assert proof["Overshoot"] > 1.5 * 100 * (at_samples.max() / 0.2 - 1)
         assert found.table("Overshoot")[k, 0] == pytest.approx(proof["Overshoot"], abs=0.1)
         assert found.table("SettlingTime")[k, 0] == pytest.approx(proof["SettlingTime"], abs=1e-4)
-
-
-def test_some_of_the_cases_read_as_they_do_among_all() -> None:
-    """Of one reference only, too: the other's grid is not run."""
-    loop, given = friction_loop()
-    space, steps = search_space(loop, given), [Step(0.1, horizon=0.3), Step(-0.2, horizon=0.2)]
-    whole = Simulator(loop, steps, space, corners(given, {"load.mass": 0.3}))
-    part = whole.select_cases([1, 5])
-    points = space.from_unit(np.full((2, 3), 0.4))
-    every, some = (simulator.respond(points, 0.02).table("Overshoot") for simulator in (whole, part))
-    assert [len(g.t) for g in part.grids] == [len(whole.grids[1].t)]
-    assert some == pytest.approx(every[:, [1, 5]], rel=1e-6)

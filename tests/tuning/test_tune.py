@@ -29,7 +29,7 @@ from pneuopt.quantities.status import Code
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
-from pneuopt.tuning.tune import TuningResult, tune
+from pneuopt.tuning.tune import TuningResult, prepare_search, prepare_task, tune
 from pneuopt.tuning.two_phase import TwoPhase, is_linear
 from problems.shared.paper2015 import paper_plant
 
@@ -172,16 +172,20 @@ def test_the_exact_problem_reads_the_steady_state_error_at_the_horizon(
     assert best.stats["margin"] == method.margin
 
 
-def test_an_optimum_that_grazes_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a margin and without digits to spare, two printed digits cannot keep a band of 0.1 %."""
+def test_an_optimum_that_grazes_is_rejected() -> None:
+    """Without a margin and without digits to spare, two printed digits cannot keep a band of 0.1 %.
+
+    What a second search finds then is slower, and is said to be its.
+    """
     loop, parameters = benchmark()
-    method = TwoPhase(starts=1, margin=0.0, digits=2)
-    result = tune(
-        loop, STEP, parameters, minimise=SettlingTime(0.001), subject_to=LIMITS, method=method, throw=False, plants={}
-    )
-    assert result.status.code is Code.NOT_CERTIFIED
-    assert [result.parameters.value(n) for n in GAINS] == [parameters.value(n) for n in GAINS]
-    assert result.stats["rejected.pid.Kp"] != parameters.value("pid.Kp")
+    method, spec = TwoPhase(starts=1, margin=0.0, digits=2), specify(SettlingTime(0.001), LIMITS)
+    refused = prepare_search(prepare_task(loop, STEP, parameters, spec), method).run()
+    assert refused.status.code is Code.NOT_CERTIFIED
+    assert [refused.parameters.value(n) for n in GAINS] == [parameters.value(n) for n in GAINS]
+    assert refused.stats["rejected.pid.Kp"] != parameters.value("pid.Kp")
+    second = tune(loop, STEP, parameters, minimise=spec, method=method, plants={})
+    assert "the first search's design was refused" in second.status.message
+    assert second.certified.loc["SettlingTime"].max() > refused.stats["optimum"]
 
 
 def friction_loop(sample_time: float | None = 1e-3) -> tuple[ClosedLoop, ParameterSet]:

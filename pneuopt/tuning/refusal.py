@@ -1,0 +1,76 @@
+"""`confirm_refusal`: before a certificate's refusal stands, a second search under the same certificate.
+
+A search hands over one design, its best. Where that hunts, creeps, or breaks a limit after its horizon, others that
+are worse by the objective may hold. The second search looks for designs with room to every limit, over the horizon and
+over a longer one, and certifies several that lie apart.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.certifier import certified_objective
+from pneuopt.tuning.confirmation import Confirmation, describe_confirmation, find_candidates
+from pneuopt.tuning.relaxation import limit_excess
+from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.search import Search, end_point
+
+
+def confirm_refusal(search: Search, refused: TuningResult) -> TuningResult:
+    """A design that the certificate lets through, or the refused one's result, which says that none was found.
+
+    Parameters
+    ----------
+    search : Search
+        Whose design was refused.
+    refused : TuningResult
+    """
+    resting = replace(search, rests=True)
+    vars(resting)["simulator"] = search.simulator
+    longer = resting.lengthen(rests=True)
+    try:
+        points, count = find_candidates(lambda at: _excess(resting, longer, at), search.space, search.progress)
+        for k, point in enumerate(points):
+            search.progress(f"certifying candidate {k + 1} of {len(points)} of the second search")
+            held = search.certify_point(point)
+            if held.status.converged:
+                words = f"the first search's design was refused ({refused.status.verdict}); better ones may exist"
+                best = _improve(search, longer, held)
+                return replace(best, status=best.status.with_details(words))
+    except KeyboardInterrupt:
+        sentences = (f"nothing found so far: {refused.status.verdict}", "run again for an answer")
+        return replace(refused, status=Status(Code.INTERRUPTED, sentences))
+    failed = f"of {len(points)} designs that it finds none is certified" if points else "finds none that comes to rest"
+    words = f"{describe_confirmation(Confirmation(search.space.start, np.inf, count))}, {failed}, either"
+    stats = {**refused.stats, "confirmation.simulations": float(count)}
+    return replace(refused, status=refused.status.with_details(words), stats=stats)
+
+
+def _excess(resting: Search, longer: Search, points: Array) -> Array:
+    """The largest relative excess over a limit; of points that keep all of them, over the longer horizon as well."""
+    found = _excess_within(resting, points)
+    kept = found <= 0
+    if kept.any() and longer is not resting:
+        found[kept] = np.maximum(found[kept], _excess_within(longer, points[kept]))
+    return found
+
+
+def _excess_within(search: Search, points: Array) -> Array:
+    """The largest relative excess over a limit within a search's horizon, in which the response has to settle."""
+    spec = search.tighten(0.0)
+    return limit_excess(search.simulator.coarse(spec).values(points, spec), spec)
+
+
+def _improve(search: Search, longer: Search, held: TuningResult) -> TuningResult:
+    """A design that is certified, or a better one that a short search about it finds."""
+    margin = search.method.margin
+    found = longer.find(margin, end_point(held, search.space), 1)
+    if not (found.is_complete and found.status.converged):
+        return held
+    better = search.certify_roundings(search.restate(found), margin)
+    gains = better.status.converged and certified_objective(search.task, better) < certified_objective(
+        search.task, held
+    )
+    return better if gains else held

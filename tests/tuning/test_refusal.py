@@ -1,0 +1,105 @@
+"""A certificate's refusal is confirmed by a second search under the same certificate before it is given."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.models.linear import SecondOrder
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.confirmation import CANDIDATE_DISTANCE, MAX_CANDIDATES, find_candidates
+from pneuopt.tuning.method import SearchResult
+from pneuopt.tuning.racing import Racing
+from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.search import Search
+from pneuopt.tuning.space import Space
+from pneuopt.tuning.tune import tune
+
+SMALL = Racing(members=10, trials=10, polish=0)
+STEP = Step(1.0, horizon=1.5)
+
+
+def problem() -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(SecondOrder().system(), PID(limits=False))
+    plant = {"plant.gain": 1.0, "plant.natural_frequency": 10.0, "plant.damping": 0.7}
+    free = {"pid.Kp": (0.0, 20.0), "pid.Ki": (0.0, 30.0)}
+    return loop, loop.parameters.with_values(plant | {"pid.Kp": 0.5, "pid.Ki": 1.0}).with_bounds(free).freed(*free)
+
+
+def refuse(result: TuningResult) -> TuningResult:
+    return replace(result, status=Status(Code.NOT_CERTIFIED, ("it hunts", "a remedy")))
+
+
+@pytest.fixture
+def _refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the first search finds is refused; its certificate is told from the second's by its method."""
+    certify = Search.certify_roundings
+
+    def refuse_roundings(search: Search, found: SearchResult, margin: float) -> TuningResult:
+        return refuse(certify(search, found, margin))
+
+    monkeypatch.setattr(Search, "certify_roundings", refuse_roundings)
+
+
+def asked() -> Any:
+    return {"minimise": SettlingTime(), "subject_to": [Overshoot(0.05)], "method": SMALL, "plants": {}, "throw": False}
+
+
+@pytest.mark.usefixtures("_refuses")
+def test_a_design_of_the_second_search_is_the_answer_where_it_holds() -> None:
+    loop, given = problem()
+    found = tune(loop, STEP, given, **asked())
+    assert found.status.converged
+    assert found.certified.loc["Overshoot"].max() <= 5.0
+    assert np.isfinite(found.certified.loc["SettlingTime"].max())
+    assert found.parameters.value("pid.Ki") > 1.0
+    assert "the first search's design was refused (it hunts); better ones may exist" in found.status.sentences
+
+
+@pytest.mark.usefixtures("_refuses")
+def test_a_refusal_says_what_the_second_search_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    (loop, given), certify = problem(), Search.certify_point
+    monkeypatch.setattr(Search, "certify_point", lambda search, point: refuse(certify(search, point)))
+    found = tune(loop, STEP, given, **asked())
+    assert found.status.code is Code.NOT_CERTIFIED
+    assert found.status.sentences[0] == "it hunts"
+    assert found.status.sentences[-1] == "a remedy"
+    assert "a second search, SciPy's differential evolution" in found.status.message
+    assert "designs that it finds none is certified, either" in found.status.message
+    assert found.stats["confirmation.simulations"] > 100
+
+
+@pytest.mark.usefixtures("_refuses")
+def test_an_interrupted_second_search_is_no_answer() -> None:
+    loop, given = problem()
+
+    def stop(text: str) -> None:
+        if "certifying candidate" in text:
+            raise KeyboardInterrupt
+
+    found = tune(loop, STEP, given, progress=stop, **asked())
+    assert found.status.code is Code.INTERRUPTED
+
+
+def test_candidates_lie_within_the_limits_and_apart() -> None:
+    two = {n: Parameter(0.5, "1", 0.0, 1.0, free=True) for n in ("pid.Kp", "pid.Ki")}
+    space = Space(ParameterSet(two), tuple(two))
+    points, count = find_candidates(lambda at: np.linalg.norm(at - 0.3, axis=1) - 0.2, space, lambda _: None)
+    assert count > 100
+    assert len(points) == MAX_CANDIDATES
+    assert np.linalg.norm(points[0] - 0.3) < 0.01
+    assert max(float(np.linalg.norm(p - 0.3)) for p in points) <= 0.2
+    gaps = [np.max(np.abs(a - b)) for k, a in enumerate(points) for b in points[:k]]
+    assert min(gaps) > CANDIDATE_DISTANCE
+
+    def far(at: Array) -> Array:
+        return np.asarray(1.0 + at.sum(axis=1))
+
+    assert find_candidates(far, space, lambda _: None)[0] == []
