@@ -152,9 +152,7 @@ class Simulator:
         if 2 * max(self.substeps) > MAX_LOOP_SUBSTEPS:
             return self
         part = copy.copy(self)
-        part._rate = max(
-            (2 * k - 0.5) * RK4_MAX_H_LAMBDA / g.spacing for k, g in zip(self.substeps, self.grids, strict=True)
-        )
+        part._rate = (2 * max(self.substeps) - 0.5) * RK4_MAX_H_LAMBDA / min(grid.spacing for grid in self.grids)
         part.substeps = [rk4_substeps(part._rate, grid.spacing) for grid in part.grids]
         part._find_points = PointFinder(self.loop, self.rollout, part._rate)
         return part
