@@ -44,8 +44,9 @@ from pneuopt.quantities.units import write_value
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.sweep import grid, sweep
+from pneuopt.tuning.certifier import certified_objective
 from pneuopt.tuning.pareto import pareto_front
-from pneuopt.tuning.tune import certified_objective, tune
+from pneuopt.tuning.tune import tune
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -70,7 +70,5 @@ def _improve(search: Search, longer: Search, held: TuningResult) -> TuningResult
     if not (found.is_complete and found.status.converged):
         return held
     better = search.certify_roundings(search.restate(found), margin)
-    gains = better.status.converged and certified_objective(search.task, better) < certified_objective(
-        search.task, held
-    )
-    return better if gains else held
+    before, after = (certified_objective(search.spec, result) for result in (held, better))
+    return better if better.status.converged and after < before else held

@@ -148,11 +148,11 @@ class Simulator:
         return part if part._is_refined else self
 
     def shorten_steps(self) -> "Simulator":
-        """A copy whose RK4 steps are half as long; itself where that takes too many."""
+        """A copy whose longest RK4 steps are half as long; itself where that takes too many."""
         if 2 * max(self.substeps) > MAX_LOOP_SUBSTEPS:
             return self
         part = copy.copy(self)
-        part._rate = (2 * max(self.substeps) - 0.5) * RK4_MAX_H_LAMBDA / min(grid.spacing for grid in self.grids)
+        part._rate = max(2 * self._rate, 1.5 * RK4_MAX_H_LAMBDA / max(grid.spacing for grid in self.grids))
         part.substeps = [rk4_substeps(part._rate, grid.spacing) for grid in part.grids]
         part._find_points = PointFinder(self.loop, self.rollout, part._rate)
         return part
