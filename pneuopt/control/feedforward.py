@@ -8,7 +8,7 @@ import casadi as ca
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.units import unit_ratio
+from pneuopt.quantities.unit_algebra import unit_ratio
 
 MIN_FEEDFORWARD_TIME = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast leads are refused
 

@@ -13,7 +13,7 @@ from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.units import difference_unit
+from pneuopt.quantities.unit_algebra import difference_unit
 
 DIRECTION_SMOOTHING = 1e-3  # [measured unit] default: m/s or rad/s; a small one chatters about rest, a large one gives
 # slow motions too little

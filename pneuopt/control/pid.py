@@ -13,7 +13,7 @@ from pneuopt.control.forms import ZERO_N_MESSAGE, ZERO_TI_MESSAGE, Form, paralle
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.units import difference_unit, unit_ratio
+from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
 
 
 @dataclass(frozen=True)

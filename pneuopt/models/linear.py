@@ -22,7 +22,8 @@ from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
-from pneuopt.quantities.units import difference_unit, read_si
+from pneuopt.quantities.unit_algebra import difference_unit
+from pneuopt.quantities.units import read_si
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
 MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known (see above)

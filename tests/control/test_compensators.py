@@ -37,7 +37,7 @@ from pneuopt.quantities.errors import InputError, ModelError
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import unit_ratio
+from pneuopt.quantities.unit_algebra import unit_ratio
 from pneuopt.tuning.linearised import LinearisedProblem, sensitivity_rollout
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.simulator import Simulator

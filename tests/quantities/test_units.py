@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pneuopt.quantities.errors import UnitError
-from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, si_conversion, unit_ratio, write_value
+from pneuopt.quantities.unit_algebra import unit_ratio
+from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, si_conversion, write_value
 
 
 @pytest.mark.parametrize(
