@@ -20,7 +20,7 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show_verdict
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.dynamics.system import System
-from pneuopt.files.drive import read_drive, write_fit
+from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
 from pneuopt.identification.identifiability import identifiability
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult, Verdict
@@ -51,7 +51,7 @@ def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: fl
     outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation")
     model, parameters = _read_free_drive(drive)
     system = model.system()
-    experiments = _read_experiments(logs, window, system)
+    experiments = _read_experiments(logs, window, system, parameters)
     for sentence in identifiability(system, experiments, parameters).sentences:
         warn(f"before the fit: {sentence}")
     with progress("identifying", quiet=quiet) as report_progress:
@@ -89,7 +89,7 @@ def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: floa
     with progress("selecting", quiet=quiet) as report_progress:
         chosen = select_model(
             systems,
-            _read_experiments(logs, window, model.system()),
+            _read_experiments(logs, window, model.system(), known),
             known,
             free=[*free, *usual_unknowns()],
             method=LeastSquares(progress=report_progress),
@@ -104,7 +104,7 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
     outputs.check([fit, log, log.with_suffix(".toml")])
     model, parameters = read_drive(fit)
     system = model.system()
-    experiment = read_log(log, plant=system)
+    experiment = read_log(log, plant=system, ambient_pressure=ambient_pressure(parameters))
     warn_of_status(fit)
     table = validate(system, [experiment], parameters)
     show_fit(make_console(), table)
@@ -120,8 +120,11 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
     return finish(outputs, writers, {"fit": records(table), "provenance": file_hashes(fit, log)}, None)
 
 
-def _read_experiments(logs: Sequence[Path], window: float | None, plant: System) -> list[Experiment]:
-    experiments = [read_log(path, plant=plant) for path in logs]
+def _read_experiments(
+    logs: Sequence[Path], window: float | None, plant: System, parameters: ParameterSet
+) -> list[Experiment]:
+    zero = ambient_pressure(parameters)
+    experiments = [read_log(path, plant=plant, ambient_pressure=zero) for path in logs]
     if window is None:
         return experiments
     require(window > 0, f"--window must be positive, got {window:g} s")

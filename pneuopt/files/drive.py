@@ -20,7 +20,7 @@ from pneuopt.quantities.errors import HardwareError, InputError, ModelError, Unk
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
-from pneuopt.quantities.units import read_value
+from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_value, write_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 FIT_SECTIONS = ("estimates", "covariance", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
+AMBIENT_PRESSURE = "ambient.pressure"  # the parameter of a drive that its gauge pressures count from
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
 _DRIVE_SECTION = {"drive": {"kind": choice(DRIVE_KINDS)}}
 
@@ -67,6 +68,11 @@ def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:
     except ModelError as error:  # a law that asks for what its base, or this plant, has not
         raise ModelError(f"{places.location('friction')}: [friction]: {error}") from None
     return drive, _read_parameters(system, kind, sections, places)
+
+
+def ambient_pressure(parameters: ParameterSet) -> float:
+    """What gauge pressures of a drive and its logs count from [Pa]: its ambient, or the standard atmosphere."""
+    return parameters.value(AMBIENT_PRESSURE) if AMBIENT_PRESSURE in parameters else ATMOSPHERE
 
 
 def read_status(path: str | Path) -> Status | None:
@@ -152,6 +158,8 @@ def write_fit(path: str | Path, source: str | Path, result: "IdentificationResul
     for alias in DRIVE_KINDS[drive.kind].aliases:
         if any(n in given and result.parameters[n] != given[n] for n in (alias.parameter, *alias.uses)):
             given = _without_alias(document, alias, drive, given)
+    if AMBIENT_PRESSURE in given and result.parameters[AMBIENT_PRESSURE].value != given.value(AMBIENT_PRESSURE):
+        _write_absolute(document, given)
     for name, found in result.parameters.items():
         if name in given and found != given[name]:
             write_parameter(document, name, found, given[name])
@@ -163,6 +171,20 @@ def write_fit(path: str | Path, source: str | Path, result: "IdentificationResul
         document["verdict"] = toml_table(result.verdict.to_dict())
     document["provenance"] = toml_table(plain_value(result.provenance))
     write_text(path, tomlkit.dumps(document))
+
+
+def _write_absolute(document: tomlkit.TOMLDocument, given: ParameterSet) -> None:
+    """Write gauge pressures as absolute ones, for a found ambient pressure is another zero than the one they had."""
+    for name, p in given.items():
+        section, _, key = name.partition(".")
+        entries: Any = document.get(section, {})
+        said = entries.get(key)
+        if isinstance(said, dict):
+            for part in ("value", "lower", "upper"):
+                if "(g)" in str(said.get(part)):
+                    said[part] = write_value(getattr(p, part), p.unit, 9)
+        elif "(g)" in str(said):
+            entries[key] = write_value(p.value, p.unit, 9)
 
 
 def _covariance_rows(covariance: "pd.DataFrame") -> dict[str, list[float]]:
@@ -181,9 +203,25 @@ def _without_alias(document: tomlkit.TOMLDocument, alias: Alias, drive: Drive, g
 
 
 def _read_parameters(system: System, kind: DriveKind, sections: Sections, places: FileLocations) -> ParameterSet:
-    defaults, edits = system.parameters, dict[str, Parameter]()
+    defaults = system.parameters
     _check_keys(defaults, kind, sections, places)
     entries = {f"{s}.{k}": v for s, said in sections.items() for k, v in said.items() if f"{s}.{k}" in defaults}
+    with count_gauge_from(_read_ambient_pressure(entries, defaults, places)):
+        return _read_entries(system, kind, sections, entries, places)
+
+
+def _read_ambient_pressure(entries: Mapping[str, Any], defaults: ParameterSet, places: FileLocations) -> float:
+    """What the file's gauge pressures count from [Pa]: the drive's ambient pressure, else the standard atmosphere."""
+    if AMBIENT_PRESSURE not in entries:
+        return ambient_pressure(defaults)
+    where = _parameter_place(AMBIENT_PRESSURE, places)
+    return read_parameter(entries[AMBIENT_PRESSURE], defaults[AMBIENT_PRESSURE], where).value
+
+
+def _read_entries(
+    system: System, kind: DriveKind, sections: Sections, entries: dict[str, Any], places: FileLocations
+) -> ParameterSet:
+    defaults, edits = system.parameters, dict[str, Parameter]()
     _check_hardware(system, entries, places)
     for alias in kind.aliases:
         entries |= _read_alias(alias, sections, entries, defaults, places)

@@ -17,7 +17,7 @@ from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.intersample import Intersample, usual_intersample
 from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import read_si, read_value
+from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value
 
 
 class Plant(Protocol):
@@ -123,6 +123,7 @@ def read_log(
     columns: Mapping[str, str | Mapping[str, str | float]] | None = None,
     sidecar: str | Path | None = None,
     plant: Plant | None = None,
+    ambient_pressure: float = ATMOSPHERE,
 ) -> Experiment:
     """Read a log, and what its sidecar says about it.
 
@@ -142,6 +143,8 @@ def read_log(
     plant : System, optional
         Its inputs and outputs, and their references, are channels in its units, beside and before the usual ones:
         torque [N*m] and angle [rad], say.
+    ambient_pressure : float
+        What gauge pressures, bar(g), count from [Pa]: the drive's "ambient.pressure".
 
     Returns
     -------
@@ -158,9 +161,10 @@ def read_log(
     entries, where = (columns, "columns") if columns is not None else (sections.get("columns"), f"{side}: columns")
     units = {} if plant is None else _plant_channels(plant)
     channels = {**CHANNELS, **units}
-    values = read_channels(read_table(path), entries, where, channels)
+    with count_gauge_from(ambient_pressure):
+        values = read_channels(read_table(path), entries, where, channels)
+        conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
     trajectory = Trajectory(values.pop("time"), values)
-    conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
     noise = _read_noise(sections.get("noise", {}), trajectory, f"{side}: noise", channels)
     own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
     between = _read_intersample(sections.get("intersample", {}), trajectory, f"{side}: intersample")

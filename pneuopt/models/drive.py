@@ -17,8 +17,8 @@ from pneuopt.models.needs import LOAD_EXCITATION, RIG_EXCITATION
 from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
+from pneuopt.quantities.units import ATMOSPHERE
 
-STANDARD_ATMOSPHERE = 101325.0  # pressure of the standard atmosphere, ISO 2533 [Pa]
 POSITION = Quantity("position", "m", nominal=0.1)
 SPEED = Quantity("speed", "m/s", nominal=0.5)
 FORCE = Quantity("force", "N", nominal=100.0)
@@ -133,11 +133,7 @@ MOTION_KIND = DriveKind(
 )
 
 AMBIENT_PARAMETERS = ParameterSet(
-    {
-        "ambient.pressure": Parameter(
-            STANDARD_ATMOSPHERE, "Pa(a)", lower=1e4, upper=2e5, source="ISO 2533 standard atmosphere"
-        )
-    }
+    {"ambient.pressure": Parameter(ATMOSPHERE, "Pa(a)", lower=1e4, upper=2e5, source="ISO 2533 standard atmosphere")}
 )
 _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 

@@ -5,8 +5,12 @@ angular frequency in rad/s and a rate in 1/s are three dimensions: nothing is co
 """
 
 import difflib
+import functools
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from fractions import Fraction
 from functools import cache
 from typing import Any, NamedTuple
@@ -14,7 +18,7 @@ from typing import Any, NamedTuple
 from pneuopt.quantities.errors import UnitError, require
 
 ATMOSPHERE = 101325.0
-"""Standard atmosphere [Pa], which gauge pressures count from (ISO 2533)."""
+"""Standard atmosphere [Pa] (ISO 2533), which gauge pressures count from unless `count_gauge_from` says otherwise."""
 
 # The whole vocabulary; a short one of our own keeps surprises out ("Ns" as "newtons", "pt" as a pint) and loads fast.
 _UNIT_DEFINITIONS = """
@@ -72,6 +76,8 @@ m mm um cm km in s ms us min h kg g t N kN Nm V mV A mA K degC Hz kHz rad deg ra
 cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count kg*m^2 N*m rev N*m*s/rad newton volt meter Pa kPa MPa bar mbar psi
 Pa(a) Pa(g) kPa(a) kPa(g) MPa(a) MPa(g) bar(a) bar(g) mbar(a) mbar(g) psi(a) psi(g)
 """
+_SYMBOLS = {"℃": "degC", "°C": "degC", "°": "deg"}  # which pint takes for no part of a name
+_gauge_zero: ContextVar[float] = ContextVar("gauge_zero", default=ATMOSPHERE)
 _NUMBER_WITH_UNIT = re.compile(
     r"\s*([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?|inf(?![a-z])))\s*(.*?)\s*", re.DOTALL
 )
@@ -121,6 +127,7 @@ def read_value(text: str | float, unit: str, *, where: str = "") -> float:
     factor, offset = _exact_conversion(unit_text, unit, where)
     value = _convert(number, factor, offset)
     _check_vacuum(value, _split_level(unit)[1], text, where)
+    _check_absolute_zero(value, unit_text, text, where)
     return value
 
 
@@ -153,6 +160,23 @@ def read_si(text: str | float, *, where: str = "") -> float:
     if _parse_unit(base, where).dimension == _parse_unit("Pa").dimension:
         return read_value(text, "Pa(a)", where=where)
     return read_value(text, _base_unit(base), where=where)
+
+
+@contextmanager
+def count_gauge_from(pressure: float) -> Iterator[None]:
+    """Count gauge pressures from this absolute one [Pa], a drive's ambient pressure say, in what is read within.
+
+    Examples
+    --------
+    >>> with count_gauge_from(95000.0):
+    ...     read_value("6 bar(g)", "Pa(a)")
+    695000.0
+    """
+    token = _gauge_zero.set(pressure)
+    try:
+        yield
+    finally:
+        _gauge_zero.reset(token)
 
 
 def si_conversion(unit_text: str, unit: str, *, where: str = "") -> tuple[float, float]:
@@ -260,14 +284,14 @@ def _exact_conversion(unit_text: str, unit: str, where: str) -> tuple[Fraction, 
     if target_level and not level:
         raise UnitError(
             f"{_place_prefix(where)}a pressure level in {unit_text!r} may be absolute or gauge; "
-            f'write "{base}(a)" or "{base}(g)" (gauge counts from {ATMOSPHERE:g} Pa)'
+            f'write "{base}(a)" or "{base}(g)" (gauge counts from {_gauge_zero.get():g} Pa)'
         )
     if level and not target_level:
         raise UnitError(
             f"{_place_prefix(where)}{unit_text!r}: (a) and (g) mark a pressure level, which is not meant here; "
             f"write {base!r}"
         )
-    shift = Fraction(ATMOSPHERE) * ((level == "g") - (target_level == "g"))
+    shift = Fraction(_gauge_zero.get()) * ((level == "g") - (target_level == "g"))
     return source.factor / goal.factor, (source.offset - goal.offset + shift) / goal.factor
 
 
@@ -281,7 +305,7 @@ def _split_level(unit_text: str) -> tuple[str, str]:
 
 
 def _check_vacuum(value: float, level: str, text: str | float, where: str) -> None:
-    floor = {"a": 0.0, "g": -ATMOSPHERE}.get(level, -math.inf)
+    floor = {"a": 0.0, "g": -_gauge_zero.get()}.get(level, -math.inf)
     require(
         value >= floor or value == -math.inf,
         f"{_place_prefix(where)}{text!r} lies below vacuum; check (a) and (g)",
@@ -289,10 +313,16 @@ def _check_vacuum(value: float, level: str, text: str | float, where: str) -> No
     )
 
 
+def _check_absolute_zero(value: float, unit_text: str, text: str | float, where: str) -> None:
+    """Refuse a temperature on a scale of its own, as degC, below 0 K; in K it may be a difference."""
+    message = f"{_place_prefix(where)}{text!r} lies below absolute zero, -273.15 degC; check sign and unit"
+    require(value >= 0 or not _parse_unit(_split_level(unit_text)[0]).offset, message, UnitError)
+
+
 def _parse_unit(unit_text: str, where: str = "") -> _UnitScale:
     _registry()
     try:
-        return _parse_with_pint(unit_text)
+        return _parse_with_pint(functools.reduce(lambda text, s: text.replace(s, _SYMBOLS[s]), _SYMBOLS, unit_text))
     except Exception:  # whatever pint raises on a text, the text is not a unit
         raise UnitError(f"{_place_prefix(where)}unknown unit {unit_text!r}; {_suggest_unit(unit_text)}") from None
 

@@ -383,3 +383,12 @@ def test_resample_holds_what_is_said_to_be_held() -> None:
     held = resample(plain.with_intersample({"position": Intersample.HELD}), 2.5e-3)
     assert not np.array_equal(held.trajectory["position"], resample(plain, 2.5e-3).trajectory["position"])
     assert set(held.trajectory["position"]) <= set(plain.trajectory["position"])
+
+
+def test_gauge_sensors_count_from_the_drives_ambient_pressure(tmp_path: Path) -> None:
+    rows = "".join(f"{k * 1e-3:.3f},{k}\n" for k in range(20))
+    path = written(tmp_path, "time [s],pressure_a [bar(g)]\n" + rows, '[conditions]\n"supply.pressure" = "6 bar(g)"\n')
+    high = read_log(path, ambient_pressure=84e3)
+    assert high.trajectory["pressure_a"][2] == pytest.approx(2e5 + 84e3)
+    assert high.conditions["supply.pressure"] == 684e3
+    assert read_log(path).trajectory["pressure_a"][2] == pytest.approx(2e5 + ATMOSPHERE)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.unit_algebra import unit_ratio
-from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, si_conversion, write_value
+from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value, si_conversion, write_value
 
 
 @pytest.mark.parametrize(
@@ -42,6 +42,16 @@ from pneuopt.quantities.units import ATMOSPHERE, read_si, read_value, si_convers
         (0.3, "1", 0.3),
         (2, "1", 2.0),
         ("20 degC", "K", 293.15),
+        ("20 °C", "K", 293.15),
+        ("20 ℃", "K", 293.15),
+        ("-5 K", "K", -5.0),  # a difference
+        ("90 °", "rad", math.pi / 2),
+        ("10 lbf", "N", 44.482216152605),
+        ("10 lbf*s/in", "N*s/m", 44.482216152605 / 0.0254),
+        ("3 in", "m", 0.0762),
+        ("3 inch", "m", 0.0762),
+        ("2 ft/s", "m/s", 0.6096),
+        ("2 lb", "kg", 0.90718474),
         ("6 bar", "Pa", 6e5),
         ("6 bar(g)", "Pa(a)", 6e5 + ATMOSPHERE),
         ("6 bar(a)", "Pa(a)", 6e5),
@@ -79,6 +89,8 @@ def test_reads_a_decimal_number_exactly() -> None:
         ("6 mm", "Pa(a)", 'write for instance "bar(a)"'),
         ("-2 bar(g)", "Pa(a)", "below vacuum"),
         ("-2 bar(g)", "Pa(g)", "below vacuum"),
+        ("-300 degC", "K", "'-300 degC' lies below absolute zero, -273.15 degC; check sign and unit"),
+        ("-300 °C", "K", "below absolute zero"),
         ("6 barg", "Pa(a)", "did you mean 'bar(g)'?"),
         ("6 psia", "Pa(a)", "did you mean 'psi(a)'?"),
         ("6 KPA", "Pa", "did you mean 'kPa'?"),
@@ -178,3 +190,21 @@ def test_units_of_gains_are_simplified(above: str, below: str, expected: str) ->
 def test_an_unreadable_unit_is_refused() -> None:
     with pytest.raises(UnitError, match=r"cannot read the unit 'm\*\*2'"):
         unit_ratio("V", "m**2")
+
+
+def test_gauge_pressures_count_from_where_they_are_told_to() -> None:
+    with count_gauge_from(95e3):
+        assert read_value("6 bar(g)", "Pa(a)") == 695e3
+        assert read_value("6.95 bar(a)", "Pa(g)") == 600e3
+        assert read_si("6 bar(g)") == 695e3
+        assert si_conversion("bar(g)", "Pa(a)") == (1e5, 95e3)
+        with pytest.raises(UnitError, match="below vacuum"):
+            read_value("-0.96 bar(g)", "Pa(a)")
+        with pytest.raises(UnitError, match="gauge counts from 95000 Pa"):
+            read_value("6 bar", "Pa(a)")
+    assert read_value("6 bar(g)", "Pa(a)") == 6e5 + ATMOSPHERE
+
+
+def test_a_temperature_below_absolute_zero_is_refused_where_its_dimension_alone_says_what_it_is() -> None:
+    with pytest.raises(UnitError, match="below absolute zero"):
+        read_si("-300 degC")
