@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.requirements import read_bound
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import read_unit, read_value, si_conversion
+from pneuopt.quantities.units import count_gauge_from, read_unit, read_value, si_conversion
 
 _SECTION_KEYS = {
     "study": ("drive", "tuning", "tune"),
@@ -158,10 +159,11 @@ def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
         If a parameter is unknown, or a value cannot be read.
     """
     check_names("parameter", study.axes, parameters, f"{study.path}: [axes]")
-    return tuple(
-        _read_axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}")
-        for name, entry in study.axes.items()
-    )
+    with count_gauge_from(ambient_pressure(parameters)):
+        return tuple(
+            _read_axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}")
+            for name, entry in study.axes.items()
+        )
 
 
 def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:

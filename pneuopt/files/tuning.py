@@ -18,6 +18,7 @@ from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
+from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.loop import (
     LOOP_SECTIONS,
     TUNABLE_SECTIONS,
@@ -32,7 +33,7 @@ from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_tab
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import read_value
+from pneuopt.quantities.units import count_gauge_from, read_value
 from pneuopt.tuning.method import Method
 
 if TYPE_CHECKING:
@@ -346,7 +347,8 @@ def _read_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterS
         if isinstance(given, list):
             unit = parameters[parameters.match_names(pattern)[0]].unit
             require(len(given) == 2, f'{where} {pattern}: write a fraction, "30 %", or two values, the least first')
-            low, high = (read_value(end, unit, where=f"{where} {pattern}") for end in given)
+            with count_gauge_from(ambient_pressure(parameters)):
+                low, high = (read_value(end, unit, where=f"{where} {pattern}") for end in given)
             found[pattern] = (low, high)
         else:
             found[pattern] = read_value(given, "1", where=f"{where} {pattern}")

@@ -62,7 +62,8 @@ class ReducedEquations:
 
     def back_substitute(self, moved: Array) -> Array:
         """The nodes' step when the parameters move by `moved`, shape (k,)."""
-        return np.asarray(self.nodes - self.node_sensitivity @ moved)
+        with np.errstate(all="ignore"):
+            return np.asarray(self.nodes - self.node_sensitivity @ moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,22 +105,24 @@ class ArrowEquations:
         m, n, k = self.border.shape
         flat = self.border.reshape(m * n, k)
         right = np.concatenate([flat, self.node_gradient.reshape(m * n, 1)], axis=1)
-        try:
-            solved = self._solve_nodes(right, damping + node_damping) if m * n else right
-        except LinAlgError:
-            return None
-        corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-300)
-        eliminated, node_part = solved[:, :k], solved[:, k]
-        return ReducedEquations(
-            -node_part.reshape(m, n),
-            eliminated.reshape(m, n, k),
-            corner - flat.T @ eliminated,
-            self.gradient - flat.T @ node_part,
-        )
+        with np.errstate(all="ignore"):  # of an absurd start what overflows is no number, and its step is refused
+            try:
+                solved = self._solve_nodes(right, damping + node_damping) if m * n else right
+            except LinAlgError:
+                return None
+            corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-300)
+            eliminated, node_part = solved[:, :k], solved[:, k]
+            return ReducedEquations(
+                -node_part.reshape(m, n),
+                eliminated.reshape(m, n, k),
+                corner - flat.T @ eliminated,
+                self.gradient - flat.T @ node_part,
+            )
 
     def descent_rate(self, step: GaussNewtonStep) -> float:
         """Rate at which the cost falls along a step."""
-        return -float(np.sum(self.node_gradient * step.nodes) + self.gradient @ step.parameters)
+        with np.errstate(all="ignore"):
+            return -float(np.sum(self.node_gradient * step.nodes) + self.gradient @ step.parameters)
 
     def _solve_nodes(self, right: Array, damping: Array | float) -> Array:
         factor = cholesky_banded(self._band_storage(damping), overwrite_ab=True, check_finite=False)

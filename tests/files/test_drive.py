@@ -27,7 +27,6 @@ from pneuopt.quantities.errors import InputError, UnitError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import ATMOSPHERE, read_value
 
 AXIS = """# my axis, 2024
 [drive]
@@ -385,23 +384,3 @@ def test_smoothing_widths_are_settable(tmp_path: Path) -> None:
     drive, rig = read_drive(written(tmp_path, text))
     assert drive == PneumaticDrive(ProportionalValve(smoothing=Smoothing(zero=0.01, pressure=1.0)))
     assert (rig.value("valve.rounding"), rig.value("friction.smoothing")) == (0.002, 0.002)
-
-
-@pytest.mark.parametrize("ambient", ["84 kPa(a)", "1.0 bar(a)", None])
-def test_gauge_pressures_count_from_the_drives_own_ambient_pressure(tmp_path: Path, ambient: str | None) -> None:
-    said = f'[ambient]\npressure = "{ambient}"\n' if ambient else "[ambient]\n"
-    text = CYLINDER.replace('pressure = "6 bar(g)"', 'pressure = { value = "6 bar(g)", upper = "9 bar(g)" }')
-    _, rig = read_drive(written(tmp_path, text.replace("[ambient]\n", said)))
-    zero = read_value(ambient, "Pa(a)") if ambient else ATMOSPHERE
-    assert rig.value("supply.pressure") == pytest.approx(6e5 + zero, rel=1e-12)
-    assert rig["supply.pressure"].upper == pytest.approx(9e5 + zero, rel=1e-12)
-
-
-def test_a_found_ambient_pressure_leaves_the_others_what_they_are(tmp_path: Path) -> None:
-    source = written(tmp_path, CYLINDER.replace("[ambient]\n", '[ambient]\npressure = "1 bar(a)"\n'))
-    rig = read_drive(source)[1]
-    found = rig.with_values({"ambient.pressure": 0.98e5})
-    write_fit(tmp_path / "fit.toml", source, fit_of(found))
-    again = read_drive(tmp_path / "fit.toml")[1]
-    assert again.value("ambient.pressure") == 0.98e5
-    assert again.value("supply.pressure") == pytest.approx(rig.value("supply.pressure"), rel=1e-9)

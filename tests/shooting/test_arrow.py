@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -125,3 +127,17 @@ def test_what_rounding_has_eaten_is_indistinct() -> None:
     assert indistinguishable_parameters(weak, 1e8 * np.eye(2)).tolist() == [0, 1]
     assert indistinguishable_parameters(np.full((2, 2), np.nan), np.eye(2)).tolist() == [0, 1]
     assert indistinguishable_parameters(np.zeros((0, 0)), np.zeros((0, 0))).tolist() == []
+
+
+@pytest.mark.parametrize("bad", [np.inf, np.nan, 1e300])
+@pytest.mark.parametrize("part", ["diagonal", "border", "corner", "node_gradient"])
+def test_equations_of_an_absurd_start_give_no_warning(part: str, bad: float) -> None:
+    """Warnings are errors here; what overflows is no number, and no step of it counts as a descent."""
+    arrow, _, _ = random_problem(4, 2, 3, 0)
+    spoiled = getattr(arrow, part).copy()
+    spoiled[1] = bad
+    equations = replace(arrow, **{part: spoiled})
+    for damping in (0.0, 1e10):
+        reduced = equations.eliminate(damping)
+        step = None if reduced is None else reduced.step(np.ones(3, dtype=bool))
+        assert step is None or bad == 1e300 or not equations.descent_rate(step) > 0

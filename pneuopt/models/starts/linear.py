@@ -22,6 +22,9 @@ Polynomials = tuple[list[float], list[float]]
 # Samples of all logs together in the grid search and in the refinement: fewer hide fast plants, more cost time.
 MAX_GRID_SAMPLES, MAX_REFINEMENT_SAMPLES = 600, 4000
 MIN_START_SAMPLES = 20  # samples that a log needs: fewer than a few for each parameter fit anything
+# Least dead time that is tried where its bound is 0, over two samples [1]: at 0 the model of a delay divides by
+# it, and further below the delay line is needlessly stiff.
+MIN_DEAD_TIME = 0.05
 MAX_CANDIDATES = 4  # candidates that are refined and returned: fewer miss the right one, each costs a refinement
 DAMPING_GRID = (0.1, 0.3, 0.7, 1.5, 4.0)  # damping ratios of the grid [1], from ringing to two separate lags
 PLANT_DAMPING, PLANT_DEAD_TIME, PLANT_GAIN, COULOMB_LEVEL = (
@@ -187,10 +190,17 @@ def _trial_values(name: str, records: Sequence[_EvenLog], parameters: ParameterS
     if name == PLANT_DAMPING:
         values = np.array(DAMPING_GRID)
     elif name == PLANT_DEAD_TIME:
-        values = np.append(known.lower, np.geomspace(fast / 2, slow / 4, 12))
+        least = _least_value(name, records, parameters)
+        values = np.append(least, np.geomspace(max(fast / 2, least), max(slow / 4, least), 12))
     else:
         values = np.geomspace(fast, slow, 24) if name.endswith("constant") else np.geomspace(1 / slow, 1 / fast, 24)
     return np.unique(np.clip(values, known.lower, known.upper))
+
+
+def _least_value(name: str, records: Sequence[_EvenLog], parameters: ParameterSet) -> float:
+    """The least value of a parameter that is tried: its lower bound, but never 0."""
+    fast = 2 * min(float(r.t[1]) for r in records)
+    return max(parameters[name].lower, MIN_DEAD_TIME * fast if name == PLANT_DEAD_TIME else 1e-9)
 
 
 def _search_grid(shape: ResponseShape, records: Sequence[_EvenLog], grids: Sequence[Array]) -> list[_Fit]:
@@ -221,7 +231,7 @@ def _refine_fit(
     free = [i for i, n in enumerate(names) if parameters[n].free]
     if not free:
         return fit_at(np.empty(0))
-    bounds = [(max(parameters[names[i]].lower, 1e-9), min(parameters[names[i]].upper, 1e9)) for i in free]
+    bounds = [(_least_value(names[i], records, parameters), min(parameters[names[i]].upper, 1e9)) for i in free]
     low, high = np.log(np.array(bounds)).T
     start = np.clip(np.log([fit.values[i] for i in free]), low + 1e-6, high - 1e-6)
     return fit_at(optimize.least_squares(residuals, start, bounds=(low, high), max_nfev=40).x)

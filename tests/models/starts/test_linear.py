@@ -94,3 +94,15 @@ def test_logs_that_tell_nothing_are_refused() -> None:
         system.starts({"run": Log(still, system.parameters.freed("plant.*"))})
     with pytest.raises(LogError, match=r"run: 10 samples of valve_voltage and speed are too few"):
         system.starts({"run": Log(still.rows(0, 10), system.parameters.freed("plant.*"))})
+
+
+@pytest.mark.parametrize("dead", [0.02, 0.0])
+def test_a_dead_time_may_have_a_lower_bound_of_zero(dead: float) -> None:
+    """The model of a delay divides by it, and the candidates are told apart by their logarithms."""
+    system = FirstOrder(pade_order=2).system()
+    log = logged(FirstOrder().system(), {"plant.gain": 0.4, "plant.time_constant": 0.13}, (0.0, 2.0, -1.0, 1.0))
+    late = np.interp(log.measured.t - dead, log.measured.t, log.measured["speed"])
+    free = system.parameters.with_bounds({"plant.dead_time": (0.0, 1.0)}).freed("plant.*")
+    starts = system.starts({"run": Log(log.measured.with_columns({"speed": late}), free)})
+    assert all(start.parameters["plant.dead_time"] > 0 for start in starts)
+    assert starts[0].parameters["plant.dead_time"] == pytest.approx(dead, abs=2e-3)
