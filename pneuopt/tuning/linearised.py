@@ -44,6 +44,9 @@ PROGRAM_LIMIT_PENALTY = 2.0
 SETTLING_RADIUS_RATIO = 5.0
 # Lanes with sensitivities that are run and read at a time. Fewer leave cores idle; more do not fit the cache.
 MAX_SENSITIVITY_LANES = 64
+# Share of a limit on a margin from which on it has derivatives. Below it no step of a descent reaches the limit; nearer
+# to it a step breaks a limit that it did not see; farther ones cost a frequency response a gain.
+NEAR_LIMIT = 0.75
 # Step of the difference quotients of margins and rest, a fraction of a gain's range. A smaller one divides rounding
 # errors; a larger one linearises a curved function.
 DIFFERENCE_STEP = 1e-4
@@ -305,19 +308,29 @@ class LinearisedProblem:
         if not sound.any():
             return found
         steps = DIFFERENCE_STEP * np.diff(self._space.bounds, axis=1)[:, 0]
-        nudged = [p, *(p + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping)]
-        x, u = (np.tile(a[:, sound], (1, len(nudged), 1)) for a in at)
-        stacked = np.concatenate([q[sound] for q in nudged])
-        metrics = requirement_values(self._simulator.robustness(stacked, x, u, [k.metric.name for k in kinds]))
-        factors = np.array([c.slopes(names) for c in self._simulator.cases])[case[sound]]
-        rates = self._space.from_unit_slope(points[sound]) * factors
+        only, read = [k.metric.name for k in kinds], self._simulator.robustness
+        first = requirement_values(read(p[sound], at[0][:, sound], at[1][:, sound], only))
+        near = np.zeros(len(p), dtype=bool)
+        for kind, (values, _) in found.items():
+            values[sound, 0] = np.nan_to_num(first[kind.__name__], nan=np.inf, posinf=np.inf)
+            near |= np.isfinite(values[:, 0]) & (values[:, 0] >= self._slope_threshold(kind))
+        if not shaping or not near.any():
+            return found
+        nudged = [p[near] + steps[k] * (np.arange(p.shape[1]) == self._wrt[k]) for k in shaping]
+        x, u = (np.tile(a[:, near], (1, len(nudged), 1)) for a in at)
+        moved = requirement_values(read(np.concatenate(nudged), x, u, only))
+        factors = np.array([c.slopes(names) for c in self._simulator.cases])[case[near]]
+        rates = self._space.from_unit_slope(points[near]) * factors
         for kind, (values, slopes) in found.items():
-            first, *others = np.reshape(metrics[kind.__name__], (len(nudged), -1))
-            values[sound, 0] = np.nan_to_num(first, nan=np.inf, posinf=np.inf)
             with np.errstate(invalid="ignore"):
-                for row, k in zip(others, shaping, strict=True):
-                    slopes[sound, 0, k] = (row - first) / steps[k] * rates[:, k]
+                for row, k in zip(np.reshape(moved[kind.__name__], (len(nudged), -1)), shaping, strict=True):
+                    slopes[near, 0, k] = (row - values[near, 0]) / steps[k] * rates[:, k]
         return found
+
+    def _slope_threshold(self, kind: type[Requirement]) -> float:
+        """The requirement's value from which on its derivatives count."""
+        limit = self._spec.limit(kind)
+        return -np.inf if self._spec.weight(kind) or limit <= 0 else NEAR_LIMIT * limit
 
 
 def sensitivity_rollout(simulator: Simulator) -> Rollout:

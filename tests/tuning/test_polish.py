@@ -93,6 +93,25 @@ def test_slopes_are_those_of_finite_differences(dither: Dither | None) -> None:
         assert np.median(off) < 1e-5 * scale, k
 
 
+def test_a_peak_has_slopes_near_its_limit_and_none_far_below() -> None:
+    """Far below it no step reaches the limit, and a frequency response a gain is saved."""
+    loop, given = friction_loop(Dither(80.0))
+    simulator = Simulator(loop, [Step(0.1, horizon=0.3)], search_space(loop, given))
+    rollout = sensitivity_rollout(simulator)
+    peak = float(simulator.values(simulator.space.start[None], SPEC)["MaxSensitivity"][0])
+    unit, found = simulator.space.to_unit(simulator.space.start)[None], []
+    for share in (0.5, 0.8, 0.95):
+        spec = specify(SettlingTime(), [MaxSensitivity(peak / share)])
+        posed = LinearisedProblem(simulator, rollout, spec, 60, 1.0)
+        (point,) = posed.evaluate(posed.start(unit))
+        row = int(np.argmax(point.group))
+        assert point.values[row] == pytest.approx(share - 1, abs=0.02)
+        found.append(point.slopes[row] / share)
+    assert not found[0].any()
+    assert np.abs(found[1]).max() > 0.01
+    assert found[1] == pytest.approx(found[2], rel=1e-6)
+
+
 TUBE = StepEnvelope(((0.0, -0.2, 1.3), (0.1, 0.7, 1.2)), max=1.0)
 FURTHER: list[Requirement] = [IAE(), ISE(), ITAE(), TUBE, ControlRate(), MaxComplementarySensitivity(), NoiseGain()]
 FURTHER += [GainMargin(), PhaseMargin()]
