@@ -27,13 +27,13 @@ from pneuopt.tuning.simulator import Simulator
 
 # Shares of the trials that the starts get on coarse samples; the rest is for fine ones. Less for the first ends in the
 # nearest optimum, less for the second is no second opinion, less for the rest leaves an optimum of the coarse samples.
-START_SHARES = (0.5, 0.35)
+START_SHARES = (0.65, 0.15)
 # Shares of a start's trials over all bands, and over the nearest wider one. Less ends in the nearest optimum; more
 # leaves the band asked for too few.
 BAND_SHARES = (0.4, 0.25)
 # Generations over which the best merit must improve by this share for a phase to go on, and the spread of the whole
 # population, a share of its best, below which it ends. Shorter or larger ends a search that still advances.
-PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 25, 1e-3, 1e-4
+PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 15, 1e-3, 1e-4
 # Members of the phase on fine samples. Fewer lose the optimum where coarse and fine samples rank points differently;
 # each more costs fine simulations.
 FINE_MEMBERS = 20
@@ -44,6 +44,9 @@ FEW_BEST, NO_DITHER = 6, 0.02
 # ones miss basins; each more costs a descent, and closer ones end in the same point.
 POLISHED, MIN_DISTANCE = 4, 0.03
 AGREEMENT = 0.01  # relative difference of two starts' merits that count as one: larger ones hide a second optimum
+# Best merit after the wide bands, over that with which the first start ended, from which on a start is given up. A
+# smaller one gives up what gradients may still bring to the front; a larger one searches on behind it.
+LAGGING = 1.3
 # Best settling times, and shares of the horizon, that a race sees of each response, whichever is longer. Less takes for
 # settled what leaves the band later; more simulates what seldom changes a merit. Each new best is proved on the whole.
 CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15
@@ -74,7 +77,7 @@ class Racing:
     """
 
     members: int = 40
-    trials: int = 1200
+    trials: int = 1000
     bands: tuple[float, ...] = (1.5, 2.5, 5.0)
     polish: int = 20
     margin: float = 0.015
@@ -243,15 +246,28 @@ class _RacingSearch:
             population[1:] = _near(given, population[1:], self._rng)
         bests = list[float]()
         for share in START_SHARES:
-            population, merits = self._search(population, method, share)
+            population, merits = self._search(population, method, share, LAGGING * min(bests, default=np.inf))
             self._ends.append(population)
             bests.append(float(merits[0]))
             self.starts, self.agreeing = len(bests), sum(b <= min(bests) * (1 + AGREEMENT) for b in bests)
             population = _other_population(method, names, population, self._rng)
+            if "dither.amplitude" in names:  # the next one begins near the best
+                method = replace(method, bands=tuple(sorted(method.bands)[:1]))
         trials = (1 - sum(START_SHARES)) * method.trials * len(names)
         fine = _Phase("fine samples", self._simulator, round(trials))
-        population, merits = self.evolve(np.vstack([*self._ends, given]), fine, FINE_MEMBERS)
-        self._polish(population, merits, self._simulator, method.polish)
+        self._finish(np.vstack([*self._ends, given]), fine, method.polish)
+
+    def _finish(self, population: Array, fine: _Phase, iterations: int) -> None:
+        """Search on fine samples: by gradients from the best points, then by trials, and again where those got on."""
+        for simulator in (self._coarse, fine.simulator):
+            merits, _ = Race(simulator, self._spec, self._scale).merits(self._space.from_unit(population))
+            order = np.argsort(merits, kind="stable")[:FINE_MEMBERS]
+            population, merits = population[order], merits[order]
+        population, merits = self._polish(population, merits, fine.simulator, iterations)
+        best = merits[0] * (1 - LEAST_PROGRESS)
+        population, merits = self.evolve(population, fine)
+        if merits[0] < best:
+            self._polish(population, merits, fine.simulator, iterations)
 
     def best_so_far(self) -> Array:
         """The best of the present phase, which may ask for another band, and of the starts that have ended."""
@@ -259,15 +275,21 @@ class _RacingSearch:
         merits, _ = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(points))
         return np.asarray(points[np.argmin(merits)])
 
-    def _search(self, population: Array, method: Racing, share: float) -> tuple[Array, Array]:
-        """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for."""
+    def _search(self, population: Array, method: Racing, share: float, most: float) -> tuple[Array, Array]:
+        """Search from one start on coarse samples: over wide bands first, by gradients, and in the band asked for.
+
+        It ends after the wide bands where the best merit is above `most`.
+        """
         *wide, last = _phases(self._simulator, self._spec, method, share)
         for phase in wide:
             population, _ = self.evolve(population, phase)
         if wide:
             merits = Race(self._coarse, self._spec, self._scale).merits(self._space.from_unit(population))[0]
             order = np.argsort(merits, kind="stable")
-            population = self._polish(population[order], merits[order], self._coarse, method.polish)[0]
+            population, merits = population[order], merits[order]
+            if merits[0] > most:
+                return population, merits
+            population = self._polish(population, merits, self._coarse, method.polish)[0]
         return self.evolve(population, last)
 
     def _polish(self, population: Array, merits: Array, simulator: Simulator, iterations: int) -> tuple[Array, Array]:
@@ -286,15 +308,14 @@ class _RacingSearch:
         self._progress(f"gradients from {len(chosen)} points: best {merits[order[0]]:.4g}")
         return population[order], merits[order]
 
-    def evolve(self, population: Array, phase: _Phase, members: int | None = None) -> tuple[Array, Array]:
-        """Evolve the best members of a population through a phase; where it ends, the best first, and their merits."""
+    def evolve(self, population: Array, phase: _Phase) -> tuple[Array, Array]:
+        """Evolve a population through a phase; where it ends, the best first, and their merits."""
         race, before, bests = Race(phase.simulator, self._spec, self._scale), self.count, list[float]()
-        merits, worst = self._rank(race, population, members)
-        order = np.argsort(merits, kind="stable")[:members]
-        history, worst = SuccessHistory(population[order], merits[order], self._rng), worst[order]
+        merits, worst = race.merits(self._space.from_unit(population))
+        history = SuccessHistory(population, merits, self._rng)
         self.best, best = history.population[0].copy(), float(history.merits[0])
         self._cut(race)
-        for number in range(-(-phase.trials // len(order))):
+        for number in range(-(-phase.trials // len(population))):
             trials = history.propose()
             merits, cases = race.race(self._space.from_unit(trials), history.merits, worst)
             merits = self._prove(race, trials, merits, best)
@@ -309,17 +330,6 @@ class _RacingSearch:
                 break
         order = np.argsort(history.merits, kind="stable")
         return history.population[order], history.merits[order]
-
-    def _rank(self, race: Race, population: Array, members: int | None) -> tuple[Array, Indices]:
-        """Merits and worst cases of a population, or of that half of it which is best on coarse samples."""
-        points = self._space.from_unit(population)
-        if members is None or members >= len(population):
-            return race.merits(points)
-        coarse, _ = Race(self._coarse, self._spec, self._scale).merits(points)
-        merits, worst = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.intp)
-        few = np.argsort(coarse, kind="stable")[:members]
-        merits[few], worst[few] = race.merits(points[few])
-        return merits, worst
 
     def _prove(self, race: Race, trials: Array, merits: Array, best: float) -> Array:
         """Merits, those that beat the best one on responses cut short replaced by those on whole responses."""

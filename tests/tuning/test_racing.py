@@ -1,5 +1,7 @@
 """The race as a method: the same answer by the same seed, the best so far at Ctrl-C, starts that differ in kind."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,19 @@ def test_a_second_start_tries_hardly_any_dither(monkeypatch: pytest.MonkeyPatch)
     populations = [amplitudes.max() for amplitudes in ranked if len(amplitudes) == 8]
     assert populations[0] > 15.0
     assert min(populations) <= 0.02 * 30.0
+
+
+def test_a_start_that_lags_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It searches the wide bands and no more, and counts as a start that does not agree."""
+    phases = list[list[str]]()
+    for lagging in (np.inf, 0.0):
+        monkeypatch.setattr("pneuopt.tuning.racing.LAGGING", lagging)
+        found, heard = search()
+        phases.append([line.split(",")[0] for line in heard])
+    begun = [sum(a != b == "coarse samples" for a, b in itertools.pairwise(part)) for part in phases]
+    assert begun == [2, 1]
+    assert (found.starts, found.agreeing) == (2, 1)
+    assert phases[1][-1] == "fine samples"
 
 
 def test_the_result_says_how_many_starts_agree() -> None:
