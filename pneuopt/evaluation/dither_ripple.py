@@ -6,7 +6,9 @@ as the ripple explains its distance from the signal: the signal is moved towards
 times the ripple's amplitude. Where the ripple is steady that gives the mean; without ripple it gives the signal.
 
 The ripple's amplitude is read at the end of the record, off the wave that repeats with the dither. A transient does not
-repeat, and an oscillation of the loop itself repeats with another period, so that neither counts as ripple.
+repeat, and an oscillation of the loop itself repeats with another period, so that neither counts as ripple. Where a
+loop hunts with a period of few dither periods, the last of these tell the two apart to about 1 % of the step only: the
+metrics of such a loop, which no certificate lets through, differ by that from those without dither.
 """
 
 from collections.abc import Mapping

@@ -13,7 +13,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.dither_ripple import describe_ripple
-from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.metrics import BandCentre, step_metrics
 from pneuopt.evaluation.requirements import METRICS
@@ -146,3 +146,25 @@ def test_before_a_step_from_motion_the_signal_is_the_old_reference() -> None:
     y = 2.0 - np.exp(-T) + sine(1 / PERIOD, 0.2) * (T > 0)
     found = step_metrics(T, y, 2.0, 1.0, dither_period=PERIOD)
     assert found["Undershoot"] < 6.5
+
+
+def test_a_loop_that_hunts_between_its_limits_differs_in_the_reading_only() -> None:
+    """Under a picovolt the responses are one; of the metrics the hunting that five periods do not tell from ripple is
+    left out, less than 1 % of the step.
+    """
+    build, step, frequency = DRIVES["t32"]
+    runs, found = [], []
+    for amplitude in (0.0, 1e-12):
+        loop, p = build(Dither(frequency), amplitude)
+        p = p.with_values({"pid.Kp": 300.0, "pid.lower": -5.0, "pid.upper": 5.0})
+        runs.append(respond(loop, step, p))
+        found.append(evaluate(loop, step, p).iloc[:, 0])
+    at = np.linspace(0.0, step.horizon, 301)
+    signals = [np.interp(at, run.t, run["speed"]) for run in runs]
+    assert np.ptp(signals[0][150:]) > step.size
+    assert np.mean(np.abs(runs[0]["control"]) > 4.99) > 0.9
+    np.testing.assert_allclose(signals[0], signals[1], atol=1e-6 * step.size)
+    for name in ("Overshoot", "SteadyStateError"):
+        assert found[0][name] == pytest.approx(found[1][name], abs=1.0)
+        assert found[0][name] != found[1][name]
+    assert all(np.isnan(metrics["SettlingTime"]) for metrics in found)
