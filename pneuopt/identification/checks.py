@@ -10,6 +10,7 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import System, names
+from pneuopt.identification.command_centre import centre_command
 from pneuopt.identification.repairs import repair_log
 from pneuopt.logs.doctor import PISTON_CHANNELS, AxisChannels, Finding, examine
 from pneuopt.logs.experiments import Experiment
@@ -52,7 +53,8 @@ def check_logs(
         system.check_log(experiment.trajectory, name)
         _check_channels(system, experiment, name, known)
         _check_conditions(system, experiment, parameters, name)
-        out.append(repair_log(system, replace(experiment, name=name))[0])
+        own = centre_command(system, replace(experiment, name=name), parameters)
+        out.append(repair_log(system, own)[0])
     return _fill_noise(system, out)
 
 
