@@ -14,7 +14,7 @@ from pneuopt.identification.command_centre import centre_command
 from pneuopt.identification.repairs import repair_log
 from pneuopt.logs.doctor import PISTON_CHANNELS, AxisChannels, Finding, examine
 from pneuopt.logs.experiments import Experiment
-from pneuopt.logs.noise import noise_level
+from pneuopt.logs.noise import estimate_noise, noise_level
 from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import InputError, LogError, ModelError, PhysicsWarning, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -99,8 +99,9 @@ def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence
     for log, named in zip(given, checked, strict=True):
         out += repair_log(system, replace(log, name=named.name))[1]
         for channel in outputs_in_log(system, named):
-            stated, shown = log.noise.get(channel), noise_level(named.trajectory[channel], named.trajectory.t)
-            if stated is not None and not shown / MAX_NOISE_FACTOR <= stated <= shown * MAX_NOISE_FACTOR:
+            stated, found = log.noise.get(channel), estimate_noise(named.trajectory[channel], named.trajectory.t)
+            shown, least = found.level, found.level / MAX_NOISE_FACTOR if found.is_white else 0.0
+            if stated is not None and not least <= stated <= shown * MAX_NOISE_FACTOR:
                 unit = next(q.unit for q in system.outputs if q.name == channel)
                 levels = f"stated as {stated:.2g} {unit}, the log itself shows {shown:.2g} {unit}"
                 out.append(f"{named.name}: the noise of {channel} is {levels}; leave it out to have it estimated")

@@ -27,6 +27,9 @@ BLOCK = 100
 MIN_BLOCKS = 4  # with fewer a quarter of them is none
 QUIET_QUARTILE = -0.674  # of a normal variable: a quarter of the blocks need to be quiet
 MAD_SPREAD = 1.17  # standard deviation of the median absolute deviation of n normal numbers, over itself, times sqrt(n)
+# Correlation [1] of differences at this many lags beyond their length, above which they are motion or hum: noise has
+# none, and a sine of any frequency nearly 1; lower, filtered noise counts as motion.
+MAX_CORRELATION, WHITE_LAGS = 0.2, 20
 # Distance of a value from the lattice of a resolution, in its steps [1]: rounded decimals lie nearer, noise farther.
 LATTICE_TOLERANCE = 0.02
 ROUNDING = 1e-12  # share of the largest value [1] that is rounding of doubles; above, fine steps are missed
@@ -41,10 +44,14 @@ class NoiseEstimate(NamedTuple):
         Standard deviation of its white noise [unit of the channel]; NaN for a constant channel.
     resolution : float
         Step of the lattice on which its values lie [unit of the channel]; 0 where they lie on none.
+    is_white : bool
+        Whether what `random` counts is uncorrelated; otherwise it is motion too fast for the sampling, say, or hum, and
+        the noise is less.
     """
 
     random: float
     resolution: float
+    is_white: bool = True
 
     @property
     def level(self) -> float:
@@ -96,8 +103,10 @@ def estimate_noise(column: ArrayLike, t: ArrayLike | None = None) -> NoiseEstima
     # a lattice leaves medians on its steps; a uniform dither of its step takes them off, and its variance is known
     dithered = y + resolution * (np.random.default_rng(0).random(y.size) - 0.5)
     levels = _levels(time, dithered) or _levels(time[known], dithered[known])  # every other sample may be missing
-    level = next(found for found, tolerance in levels if found <= (1 + tolerance) * min(f for f, _ in levels))
-    return NoiseEstimate(math.sqrt(max(level**2 - resolution**2 / 12, 0.0)), resolution)
+    least = min(level.value for level in levels)
+    chosen = next(level for level in levels if level.value <= (1 + level.uncertainty) * least)
+    random = math.sqrt(max(chosen.value**2 - resolution**2 / 12, 0.0))
+    return NoiseEstimate(random, resolution, _is_white(chosen))
 
 
 def find_resolution(values: ArrayLike) -> float:
@@ -139,14 +148,36 @@ def _without_rounding(t: Array) -> Array:
     return np.arange(t.size, dtype=float) if even else t - t[0]
 
 
-def _levels(t: Array, y: Array) -> list[tuple[float, float]]:
-    """By order of difference, the standard deviation of white noise that would show as much, and its uncertainty."""
+class _Level(NamedTuple):
+    """The standard deviation of white noise that would show as much in the differences `off` of an order.
+
+    The uncertainty is its standard deviation by chance, over itself.
+    """
+
+    value: float
+    uncertainty: float
+    order: int
+    off: Array
+
+
+def _is_white(level: _Level) -> bool:
+    """Whether differences are uncorrelated beyond their own length."""
+    known = np.isfinite(level.off)
+    e = np.where(known, np.clip(level.off, -4 * level.value, 4 * level.value), 0.0)
+    lags = range(level.order + 1, min(level.order + 1 + WHITE_LAGS, e.size - 1))
+    correlations = [abs(float(e[k:] @ e[:-k])) for k in lags]
+    chance = 4 * (1 + level.order) ** 0.25 / math.sqrt(max(1, int(known.sum())))
+    return bool(max(correlations, default=0.0) <= min(MAX_CORRELATION + chance, 0.5) * float(e @ e))
+
+
+def _levels(t: Array, y: Array) -> list[_Level]:
+    """Levels by order of difference."""
     out = []
     for order in (k for k in ORDERS if 2 * k < y.size):
         off = _differences(t, y, order)
-        off = off[np.isfinite(off)]
-        if off.size > order:
-            out.append(_quiet_level(off, order))
+        found = off[np.isfinite(off)]
+        if found.size > order:
+            out.append(_Level(*_quiet_level(found, order), order, off))
     return out
 
 

@@ -99,6 +99,17 @@ def test_windows_of_250_ms_of_a_fast_servo_read_the_encoder() -> None:
         assert 1e-6 / math.sqrt(12) / 1.1 < found.level < 2 * 1e-6 / math.sqrt(12)
 
 
+@pytest.mark.parametrize("rate", [50.0, 100.0, 1000.0])
+@pytest.mark.parametrize("frequency", [0.5, 5.0, 20.0])
+def test_motion_too_fast_for_the_sampling_is_not_white(rate: float, frequency: float) -> None:
+    """The level is then an upper bound, and says that it is."""
+    t = np.arange(round(8 * rate)) / rate
+    y = 0.02 * np.sin(2 * math.pi * frequency * t) + 1e-5 * np.random.default_rng(0).standard_normal(t.size)
+    found = estimate_noise(y)
+    assert found.is_white == (found.level < 2e-5)
+    assert found.is_white or frequency > rate / 11
+
+
 def test_a_step_and_outliers_do_not_count_as_noise() -> None:
     column = 0.01 * np.random.default_rng(0).standard_normal(4000)
     column[2000:] += 5.0
