@@ -16,7 +16,7 @@ from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, ProgressCallback, Status
-from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
+from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations, positive_definite_inverse
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, ConvergenceTest, assess_convergence
 from pneuopt.shooting.equations import (
     weigh_gaps,
@@ -31,6 +31,9 @@ from pneuopt.shooting.transcription import Transcription
 STAGE_COST_TOLERANCE = 1e-3
 # promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
 FINAL_COST_TOLERANCE = 5e-7
+# step of a parameter over the tolerance of convergence [1] at which a stage with noise of the states ends: lower
+# settles states that no parameter depends on, higher leaves the parameters short of their optimum
+STATE_NOISE_TOLERANCE = 0.01
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
@@ -52,7 +55,7 @@ class Stage:
     iterations : int
         Largest number of iterations.
     refine : int
-        Integration steps of the answer, as a multiple of the search's.
+        Integration steps at the end of the stage, as a multiple of those before.
     """
 
     gap: float
@@ -136,7 +139,7 @@ class _Search:
         self.required_substeps = method.substeps or stable_substeps(
             segments, nodes, self.stiffness_parameters, RK4_MAX_H_LAMBDA
         )
-        self.substeps = self.min_substeps = method.substeps or min(self.required_substeps, MAX_SEARCH_SUBSTEPS)
+        self.substeps = self.start_substeps = method.substeps or min(self.required_substeps, MAX_SEARCH_SUBSTEPS)
         self.output_substeps, self.correction, self.integration_change = self.substeps, None, math.nan
         self.current = self._evaluate(nodes, self.scaling.start)
 
@@ -149,7 +152,7 @@ class _Search:
         return self._fit(status, time.perf_counter() - began)
 
     def _run_stages(self) -> Status:
-        if self.required_substeps > self.min_substeps:
+        if self.required_substeps > self.start_substeps:
             verdict = f"the model is so stiff that a sample takes {self.required_substeps} integration steps"
             remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
             return Status(Code.NOT_CONVERGED, (verdict, remedy))
@@ -162,7 +165,7 @@ class _Search:
             self._enter_stage(stage, self.current.nodes, self.current.z)
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
-            self.has_stalled = self._run_stage()
+            self.has_stalled = self._finish_stage()
             self.stage_ends.append(_StageEnd(self.current.nodes, self.current.z, self.current.cost))
         status = self._convergence_status(self.current)
         # gaps that absorb the misfit of the model: the answer depends on their weight
@@ -182,7 +185,7 @@ class _Search:
                 snapshot = self.stage, self.current, self.correction, self.substeps, self.output_substeps
                 self.noisy_gaps = True
                 self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), end.nodes, end.z)
-                self._run_stage()
+                self._finish_stage()
                 found = self._convergence_status(self.current)
                 if found.converged:
                     return found
@@ -196,7 +199,7 @@ class _Search:
         steps, q = self.substeps, self.scaling.values(z)
         if not self.method.substeps and not np.allclose(q, self.stiffness_parameters, rtol=STIFFNESS_UPDATE_CHANGE):
             needed, self.stiffness_parameters = stable_substeps(self.segments, nodes, q, RK4_MAX_H_LAMBDA), q
-            steps = min(max(needed, self.min_substeps), MAX_STAGE_REFINEMENT * self.min_substeps)
+            steps = min(needed, MAX_STAGE_REFINEMENT * self.start_substeps)  # fewer, too: a bad start may be stiff
         is_known = steps == self.substeps and self.correction is None and nodes is self.current.nodes
         self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
         if is_known:
@@ -204,8 +207,6 @@ class _Search:
             self.current = Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
         else:
             self.current = self._evaluate(nodes, z)
-        if stage.refine > 1:
-            self._apply_finer_steps(stage.refine * steps)
 
     def _apply_finer_steps(self, steps: int) -> float:
         """Integrate the current outputs and ends by finer steps; return the largest change of y [standard deviations].
@@ -248,6 +249,17 @@ class _Search:
             status = self._convergence_status(self.current)
         return status
 
+    def _finish_stage(self) -> bool:
+        """Run a stage, then again with the finer steps that it asks for; return as `_run_stage` does."""
+        has_ended = self._run_stage()
+        if self.stage.refine > 1:
+            before = self.current, self.correction, self.substeps, self.output_substeps
+            self._apply_finer_steps(self.stage.refine * self.substeps)
+            if math.isfinite(self.current.cost):
+                return self._run_stage()
+            self.current, self.correction, self.substeps, self.output_substeps = before
+        return has_ended
+
     def _run_stage(self) -> bool:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
@@ -261,13 +273,26 @@ class _Search:
             self._report()
         return before - self.current.cost < STALL_COST_DECREASE * before
 
-    def _is_negligible_step(self, current: Iterate, _reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
-        """Whether a step promises a negligible decrease: in the last stage, 0.1 % of a deviation in any direction."""
-        if self.noisy_gaps or self.stage is self.method.stages[-1]:
-            enough = FINAL_COST_TOLERANCE * max(1.0, 2 * current.cost / max(1, current.equations.count))
-        else:
-            enough = STAGE_COST_TOLERANCE * current.cost
-        return 0.5 * current.equations.arrow.descent_rate(step) < enough
+    def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
+        """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction.
+
+        Where the gaps stand for noise of the states, a hundredth of the tolerance in the parameters' directions: the
+        states of such a fit estimate that noise, and settle long after the parameters.
+        """
+        promised = 0.5 * current.equations.arrow.descent_rate(step)
+        if self.noisy_gaps and promised < STAGE_COST_TOLERANCE * current.cost:
+            return self._largest_parameter_step(current, reduced, step) < STATE_NOISE_TOLERANCE * self.method.tolerance
+        if self.stage is self.method.stages[-1]:
+            return promised < FINAL_COST_TOLERANCE * max(1.0, 2 * current.cost / max(1, current.equations.count))
+        return not self.noisy_gaps and promised < STAGE_COST_TOLERANCE * current.cost
+
+    def _largest_parameter_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> float:
+        """The largest step of a parameter in its standard deviations; infinite where the data do not determine all."""
+        keep = self.scaling.movable(current.z, current.equations, reduced)
+        if current.equations.unidentifiable_parameters(reduced, keep).size:
+            return math.inf
+        spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
+        return float(np.max(np.abs(step.parameters[keep]) / spread, initial=0.0))
 
     def _objective(self) -> Objective:
         sigma = self.stage.gap * self.gap_scales

@@ -8,12 +8,14 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, least_squares
 
+from pneuopt.dynamics.compiled.rollout import Gram
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.full_space import solve_full_space
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.segments import IntegrationCorrection, Segments
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
@@ -374,3 +376,24 @@ def test_of_two_that_act_only_together_one_is_unidentifiable_and_the_other_takes
     assert np.sqrt(borrowed[at]) == pytest.approx(10 * fit.parameters.value("damping"), rel=1e-3)
     others = [position(fit, n) for n in ("stiffness", "bias[a]", "bias[b]")]
     assert (borrowed[others] < 1e-6 * own[others]).all()
+
+
+def test_the_steps_fall_again_where_a_start_was_stiffer_than_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[int] = []
+    original = Segments.gram
+
+    def gram(self: Segments, nodes: Array, q: Array, substeps: int, correction: IntegrationCorrection | None) -> Gram:
+        steps.append(substeps)
+        return original(self, nodes, q, substeps, correction)
+
+    monkeypatch.setattr(Segments, "gram", gram)
+    problem = two_logs()
+    stiff = problem.parameters.with_bounds({"damping": (0.0, 1e5)}).with_values({"damping": 2e3})
+    fit = solve_least_squares(replace(problem, parameters=stiff))
+    assert fit.status.converged
+    assert fit.parameters.value("damping") == pytest.approx(TRUTH["damping"], rel=0.05)
+    assert steps[0] >= 20
+    assert steps[-1] <= 2
+    assert fit.stats["substeps"] <= 8
+    # the answer's steps are finer, without a derivative at them
+    assert fit.stats["substeps"] > steps[-1]
