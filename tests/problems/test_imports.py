@@ -17,6 +17,7 @@ INSIDE = {
     "problems/speed/simulation_speed.py": "times the compiled simulation, lane by lane",
     "problems/speed/t32.py": SEARCH,
     "problems/tune/random_designs.py": "confirms refusals by brute force on the search's batched simulator",
+    "problems/tune/random_kinds.py": "hands the checks of random_designs the specification that they read",
     "problems/tune/rule_comparison.py": SEARCH,
     "problems/tune/pareto.py": "times the solver along a front, and sets brute force on its designs",
     "problems/dither/margins_under_dither.py": "injects sines into the full model, one frequency a lane",

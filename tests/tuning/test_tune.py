@@ -11,7 +11,6 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.requirements import (
-    IAE,
     MaxSensitivity,
     Overshoot,
     PeakControl,
@@ -23,7 +22,7 @@ from pneuopt.evaluation.specification import specify
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder
-from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning
+from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.racing import Racing
@@ -155,23 +154,6 @@ def test_impossible_limits_keep_the_given_gains() -> None:
     assert "limit" in result.status.message
 
 
-@pytest.mark.parametrize(
-    ("aim", "limits"),
-    [(PeakControl(), []), (PeakControl(), [SettlingTime(max=0.9)]), ({PeakControl(): 1.0, SettlingTime(): 1e-3}, [])],
-)
-def test_the_exact_problem_reads_the_steady_state_error_at_the_horizon(
-    aim: dict[Requirement, float], limits: list[Requirement]
-) -> None:
-    """The least command that brings a lag to within 0.3 % of the reference by the horizon; slower gains do later."""
-    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
-    given = loop.parameters.with_bounds({"pid.Kp": (0.01, 20.0), "pid.Ki": (0.0, 200.0)}).freed("pid.Kp", "pid.Ki")
-    limits, method = [SteadyStateError(0.003), *limits], TwoPhase((20, 25), starts=1)
-    best = tune(loop, Step(1.0), given, minimise=aim, subject_to=limits, method=method, plants={})
-    assert best.certified["0 to 1"]["SteadyStateError"] == pytest.approx(0.3, rel=0.05)
-    assert "margin" in best.stats
-    assert best.stats["margin"] == method.margin
-
-
 def test_an_optimum_that_grazes_is_rejected() -> None:
     """Without a margin and without digits to spare, two printed digits cannot keep a band of 0.1 %.
 
@@ -195,31 +177,6 @@ def friction_loop(sample_time: float | None = 1e-3) -> tuple[ClosedLoop, Paramet
     bounds = {"pid.Kp": (10.0, 1000.0), "pid.Ki": (1.0, 10000.0), "dither.amplitude": (0.0, 50.0)}
     bounds |= {"dither.offset": (-100.0, 100.0)}
     return loop, loop.parameters.with_values(values).with_bounds(bounds).freed(*bounds)
-
-
-def test_a_ripple_beyond_the_band_is_said_before_the_search() -> None:
-    """The first word, with band and ripple; of a calm dither, none at all, or no settling time, nothing is said."""
-
-    class BegunError(Exception):
-        """The search has begun."""
-
-    def begin(_: str) -> None:
-        raise BegunError
-
-    def start(amplitude: float, size: float, minimise: Requirement) -> None:
-        loop, parameters = friction_loop()
-        given = parameters.with_values({"dither.amplitude": amplitude})
-        with pytest.raises(BegunError):
-            tune(loop, Step(size, horizon=0.4), given, minimise=minimise, progress=begin)
-
-    words = (
-        r"dither of 40 N at 80 Hz swings the speed by \+-1\d mm/s, beyond the settling band of \+-1 mm/s \(\+-2 % of"
-    )
-    with pytest.warns(PhysicsWarning, match=words):
-        start(40.0, 0.05, SettlingTime())
-    start(0.0, 0.05, SettlingTime())
-    start(1.0, 0.1, SettlingTime())
-    start(40.0, 0.05, IAE())
 
 
 def test_a_drive_with_friction_is_tuned_by_simulation() -> None:
