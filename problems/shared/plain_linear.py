@@ -82,7 +82,7 @@ def _continuous(
     for i in range(steps):
         x = step @ x
         y[i + 1] = C[0] @ x[:n]
-    return h * np.arange(steps + 1), y
+    return np.linspace(0.0, h * steps, steps + 1), y
 
 
 def _sampled(
@@ -111,4 +111,4 @@ def _sampled(
         for j in range(per_sample):
             x = fine[:n, :n] @ x + fine[:n, n] * held
             y[i * per_sample + j + 1] = C[0] @ x
-    return h / per_sample * np.arange(len(y)), y
+    return np.linspace(0.0, h * samples, len(y)), y
