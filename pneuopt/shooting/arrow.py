@@ -107,7 +107,7 @@ class ArrowEquations:
         right = np.concatenate([flat, self.node_gradient.reshape(m * n, 1)], axis=1)
         with np.errstate(all="ignore"):  # of an absurd start what overflows is no number, and its step is refused
             try:
-                solved = self._solve_nodes(right, damping + node_damping) if m * n else right
+                solved = self.solve_nodes(right, damping + node_damping)
             except LinAlgError:
                 return None
             corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-300)
@@ -124,7 +124,10 @@ class ArrowEquations:
         with np.errstate(all="ignore"):
             return -float(np.sum(self.node_gradient * step.nodes) + self.gradient @ step.parameters)
 
-    def _solve_nodes(self, right: Array, damping: Array | float) -> Array:
+    def solve_nodes(self, right: Array, damping: Array | float) -> Array:
+        """Solve D x = right, shape (m n, any); raises `LinAlgError` where D is not positive definite."""
+        if not right.size:
+            return right
         factor = cholesky_banded(self._band_storage(damping), overwrite_ab=True, check_finite=False)
         return np.asarray(cho_solve_banded((factor, False), right, check_finite=False))
 

@@ -24,7 +24,7 @@ from pneuopt.shooting.equations import (
 from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, segment, stable_substeps, start_nodes
-from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.solution import Fit, Optimum
 from pneuopt.shooting.transcription import Transcription
 
 # promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
@@ -329,11 +329,14 @@ class _Search:
         }
         at_bound, held = self.scaling.at_bound(current.z) & ~self.scaling.held, self.scaling.held
         keep = self.scaling.has_effect(equations) & ~at_bound & ~held
-        covariance, prior, unidentifiable = None, None, tuple[str, ...]()
+        covariance, prior, optimum, unidentifiable = None, None, None, tuple[str, ...]()
         if math.isfinite(equations.cost):
             covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
             prior = equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
             unidentifiable = tuple(free[i] for i in self._assess(current).unidentifiable)
+        if covariance is not None:
+            gaps = self.stage.gap * self.gap_scales
+            optimum = Optimum(equations, run, current.nodes, q, keep, gaps, self.substeps)
         return Fit(
             self.segments.trajectories(run),
             transcription.parameters.with_values(values),
@@ -346,6 +349,7 @@ class _Search:
             equations.gaps[self.segments.linked] if self.noisy_gaps else None,
             unidentifiable,
             prior,
+            optimum=optimum,
         )
 
     def _integration_error(self, run: RolloutResult) -> float:

@@ -3,10 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from pneuopt.dynamics.compiled.rollout import RolloutResult
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.equations import NormalEquations
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,35 @@ class Solution:
     status: Status
     stats: Mapping[str, float] = field(default_factory=dict)
     multipliers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The equations and the run at the end of a search, from which the residuals are diagnosed.
+
+    Attributes
+    ----------
+    equations : NormalEquations
+    run : RolloutResult
+        With states, by the finest steps.
+    nodes : ndarray, shape (m, n_states)
+    values : ndarray
+        All the problem's parameter values.
+    keep : ndarray of bool, shape (k,)
+        The free parameters that have a covariance.
+    gap_deviations : ndarray, shape (n_states,)
+        Standard deviations of the gaps, in nominal sizes.
+    substeps : int
+        Integration steps a sample of the sensitivities.
+    """
+
+    equations: NormalEquations
+    run: RolloutResult
+    nodes: Array
+    values: Array
+    keep: Mask
+    gap_deviations: Array
+    substeps: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +94,8 @@ class Fit:
         is held.
     variance_inflation : float
         Factor on the estimates' variance by weighted squares (robust losses).
+    optimum : Optimum or None
+        None where there is no covariance.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -77,6 +110,7 @@ class Fit:
     unidentifiable: tuple[str, ...] = ()
     prior_covariance: Array | None = None
     variance_inflation: float = 1.0
+    optimum: Optimum | None = None
 
     def with_effort_of(self, *earlier: "Fit") -> "Fit":
         """The fit with the iterations and seconds of earlier ones added to its own."""

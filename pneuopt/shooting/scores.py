@@ -1,0 +1,143 @@
+"""`fit_scores`: what each segment of a fit says about the parameters, with the nodes following them.
+
+A segment's score is the gradient of half its squared residuals (its data, and the gap behind it) by the parameters; at
+an optimum the scores sum to zero. Its information J'J is that of the same residuals.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.shooting.equations import NormalEquations
+from pneuopt.shooting.solution import Optimum
+
+MAX_BATCH_NUMBERS = 4_000_000  # numbers of 8 bytes in a batch: more take memory, fewer time
+
+
+@dataclass(frozen=True, eq=False)
+class FitScores:
+    """The scores and the information of m segments about the k parameters that a fit has kept free, in their own units.
+
+    Attributes
+    ----------
+    optimum : Optimum
+    directions : ndarray, shape (m, n_columns, k)
+        How a segment's start state (in nominal sizes) and sensitivity columns move with the parameters.
+    """
+
+    optimum: Optimum
+    directions: Array
+
+    @cached_property
+    def scores(self) -> Array:
+        """Score of each segment, shape (m, k)."""
+        gaps = self._equations.gaps / self.optimum.gap_deviations
+        data = np.einsum("mck,mc->mk", self.directions, self._equations.linearisation.grams[:, :-1, -1])
+        linked = np.einsum("mnk,mn->mk", self._gap_directions, gaps)
+        return np.asarray(data + linked)
+
+    def information(self, groups: Indices) -> Array:
+        """Information of groups of segments, shape (n_groups, k, k); `groups` has each segment's, in any order."""
+        members = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
+        return np.array([self._group_information(rows) for rows in members])
+
+    def simulate_white(self, count: int, groups: Indices) -> Array:
+        """Scores of groups in linear fits to white residuals of unit variance, shape (count, n_groups, k).
+
+        The nodes follow the residuals of a few segments before and behind them, so that the scores of neighbours are
+        not independent even where the residuals are.
+        """
+        rng, grams = np.random.default_rng(0), self._equations.linearisation.grams[:, :-1, :-1]
+        values, vectors = np.linalg.eigh(grams)
+        roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        out = np.zeros((count, int(groups.max()) + 1, self.directions.shape[2]))
+        for draws in np.array_split(np.arange(count), min(count, -(-count * grams[..., 0].size // MAX_BATCH_NUMBERS))):
+            found = self._respond(roots @ rng.standard_normal((*grams.shape[:2], len(draws))))
+            np.add.at(out, (draws[:, None], groups), found)
+        return out
+
+    def residual_sums(self) -> tuple[Array, Array]:
+        """Sum of each segment's residuals by output, shape (m, n_outputs), and its derivatives, (m, n_outputs, k).
+
+        In noise standard deviations; gaps do not count.
+        """
+        segments, run = self._equations.segments, self.optimum.run
+        weights = np.where(np.isfinite(segments.measured), segments.weights, 0.0)
+        sums = np.sum(weights * (run.y - np.nan_to_num(segments.measured)), axis=1)
+        each = weights[0].size * self.directions.shape[1]
+        batches = np.array_split(np.arange(len(weights)), -(-len(weights) * each // MAX_BATCH_NUMBERS))
+        return sums, np.concatenate([self._summed_derivatives(rows, weights[rows]) for rows in batches])
+
+    @cached_property
+    def whole_information(self) -> Array:
+        """Information of all segments, shape (k, k)."""
+        return self._group_information(np.arange(len(self.directions)))
+
+    @property
+    def _equations(self) -> NormalEquations:
+        return self.optimum.equations
+
+    @cached_property
+    def _gap_directions(self) -> Array:
+        """How the gap behind each segment moves, in its standard deviations, shape (m, n_states, k)."""
+        linear, n = self._equations.linearisation, self._equations.gaps.shape[1]
+        moved = linear.end_sensitivities @ self.directions
+        moved[:-1] -= self.directions[1:, :n]
+        moved[~self._equations.segments.linked] = 0.0
+        return np.asarray(moved / self.optimum.gap_deviations[:, None])
+
+    def _group_information(self, rows: Indices) -> Array:
+        E, gaps = self.directions[rows], self._gap_directions[rows]
+        data = np.tensordot(E, self._equations.linearisation.grams[rows, :-1, :-1] @ E, ((0, 1), (0, 1)))
+        return np.asarray(data + np.tensordot(gaps, gaps, ((0, 1), (0, 1))))
+
+    def _respond(self, noise: Array) -> Array:
+        """Scores of fits to noise, given as the gradient of each segment's data, shape (m, n_columns, count)."""
+        linear, (m, n, count) = self._equations.linearisation, (*self._equations.gaps.shape, noise.shape[2])
+        step = np.zeros_like(noise)
+        step[:, :n] = -self._equations.arrow.solve_nodes(noise[:, :n].reshape(m * n, count), 0.0).reshape(m, n, count)
+        step -= self.directions @ np.linalg.solve(
+            self.whole_information, np.einsum("mck,mcr->kr", self.directions, noise)
+        )
+        ends = linear.end_sensitivities @ step
+        ends[:-1] -= step[1:, :n]
+        ends[~self._equations.segments.linked] = 0.0
+        data = np.einsum("mck,mcr->rmk", self.directions, noise + linear.grams[:, :-1, :-1] @ step)
+        gaps = ends / self.optimum.gap_deviations[:, None]
+        return np.asarray(data + np.einsum("mnk,mnr->rmk", self._gap_directions, gaps))
+
+    def _summed_derivatives(self, rows: Indices, weights: Array) -> Array:
+        """Derivatives of the sums of some segments' weighted outputs, shape (len(rows), n_outputs, k)."""
+        o, s = self.optimum, self._equations.segments
+        p = o.values[s.parameter_positions[rows]]
+        run = s.sensitivities.run(o.nodes[rows], s.inputs[rows], p, s.t[rows], s.h[rows], substeps=o.substeps)
+        assert run.dy is not None
+        sums = np.einsum("mso,msoc->moc", weights, run.dy)
+        sums[:, :, : len(s.nominal)] *= s.nominal
+        return np.asarray(sums @ self.directions[rows])
+
+
+def fit_scores(optimum: Optimum) -> FitScores | None:
+    """The scores of a fit's segments.
+
+    Parameters
+    ----------
+    optimum : Optimum
+
+    Returns
+    -------
+    FitScores or None
+        None where the nodes' equations cannot be eliminated.
+    """
+    equations, keep = optimum.equations, np.flatnonzero(optimum.keep)
+    reduced, linear = equations.arrow.eliminate(0.0), equations.linearisation
+    if reduced is None or not len(keep):
+        return None
+    m, n, columns = *equations.gaps.shape, linear.end_sensitivities.shape[2]
+    directions = np.zeros((m, columns, len(optimum.keep)))
+    directions[:, :n] = -reduced.node_sensitivity
+    for rows, own, unknowns in equations.segments.blocks:
+        directions[rows, n + own, unknowns] = linear.chain[unknowns]
+    return FitScores(optimum, directions[:, :, keep] / linear.chain[keep])
