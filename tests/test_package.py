@@ -95,6 +95,7 @@ PUBLIC_NAMES = [
     "LuGre",
     "Margins",
     "margins",
+    "Mark",
     "MaxComplementarySensitivity",
     "MaxSensitivity",
     "mean_start",

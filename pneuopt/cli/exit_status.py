@@ -2,7 +2,8 @@
 
 EXIT_SUCCESS = 0
 EXIT_FAILURE = 1
-"""Not converged or not certified; in a study, a case failed or never settles."""
+"""Not converged, not certified, or a model that misses the logs so far that no interval holds; in a study a case failed
+or never settles."""
 EXIT_BAD_INPUT = 2
 """Something that the user gave cannot be used. Typer ends with the same number where an option is wrong."""
 EXIT_INTERRUPTED = 130

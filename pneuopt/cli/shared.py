@@ -12,9 +12,9 @@ import numpy as np
 
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.terminal import make_console, show_output_files
-from pneuopt.files.drive import read_drive, read_status
+from pneuopt.files.drive import read_drive, read_marks, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
-from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.plotting import check_figure_path, save_figure
 from pneuopt.quantities.output import check_output_paths, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet
@@ -59,7 +59,7 @@ def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status
     for write in writers.values():
         write()
     show_output_files(make_console(), list(writers))
-    if status is None or status.converged:
+    if status is None or status.code is Code.CONVERGED:
         return EXIT_SUCCESS
     return EXIT_INTERRUPTED if status.code is Code.INTERRUPTED else EXIT_FAILURE
 
@@ -73,10 +73,13 @@ def read_fit_and_tuning(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
 
 
 def warn_of_status(path: Path, what: str = "fit") -> None:
-    """Say on standard error if what wrote a file did not converge."""
+    """Say on standard error if what wrote a file did not converge, or which of its estimates may be biased."""
     status = read_status(path)
-    if status is not None and not status.converged:
+    if status is not None and status.code is not Code.CONVERGED:
         warn(f"{path}: its {what} is {status}")
+    biased = [n for n, mark in read_marks(path).items() if mark is Mark.BIAS_POSSIBLE]
+    if biased and (status is None or status.converged):
+        warn(f"{path}: estimates that may be biased by a model error: {', '.join(biased)}")
 
 
 def warn(message: str) -> None:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from pneuopt.cli.terminal import format_number, new_table
-from pneuopt.identification.result import UNIDENTIFIABLE_NOTE, ChosenWidth, Verdict
+from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, ChosenWidth, Mark, Verdict
 from pneuopt.identification.select_model import ModelSelection
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ MAX_FIT_ROWS = 12
 
 
 def show_estimates(console: Console, estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> None:
-    """Value and 95 % confidence interval of each free parameter, then the widths that the logs have chosen.
+    """Value, 95 % confidence interval (or range) and mark of each free parameter, then the widths that the logs have chosen.
 
     Parameters
     ----------
@@ -28,11 +28,14 @@ def show_estimates(console: Console, estimates: "pd.DataFrame", widths: Sequence
         Of an `IdentificationResult`.
     widths : sequence of ChosenWidth
     """
-    table = new_table("parameter", "value", "95 % confidence interval", "unit", "")
+    table = new_table("parameter", "value", "95 % interval", "unit", "mark")
     for parameter, row in estimates.iterrows():
         value, interval = _format_interval(*(float(row[k]) for k in ("value", "stderr", "ci_low", "ci_high")))
-        value = "-" if row["note"] == UNIDENTIFIABLE_NOTE else value
-        table.add_row(str(parameter), value, interval, str(row["unit"]), str(row["note"]))
+        if math.isnan(row["ci_low"]) and math.isfinite(row["range_low"]):
+            interval = _format_range(float(row["range_low"]), float(row["range_high"]))
+        value = "-" if row["mark"] == Mark.UNIDENTIFIABLE else value
+        mark = AT_BOUND_NOTE if row["note"] == AT_BOUND_NOTE else row["mark"]
+        table.add_row(str(parameter), value, interval, str(row["unit"]), str(mark))
     for width in widths:
         table.add_row(width.name, format_number(width.value, 3), "-", width.unit, "chosen")
     console.print(table)
@@ -103,6 +106,11 @@ def _format_interval(value: float, spread: float, low: float, high: float) -> tu
     if not math.isfinite(spread) or high - low > 1e3 * abs(value) > 0:
         return format_number(value, 4), "not determined"
     return _format_to_stderr(value, spread), f"{_format_to_stderr(low, spread)} to {_format_to_stderr(high, spread)}"
+
+
+def _format_range(low: float, high: float) -> str:
+    """A range, which is no confidence interval, with the digits that show a fiftieth of it."""
+    return f"range {_format_to_stderr(low, (high - low) / 4)} to {_format_to_stderr(high, (high - low) / 4)}"
 
 
 def _format_to_stderr(value: float, spread: float) -> str:

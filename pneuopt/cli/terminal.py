@@ -13,7 +13,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from pneuopt.quantities.status import ProgressCallback, Status
+from pneuopt.quantities.status import Code, ProgressCallback, Status
 
 
 def make_console(*, error: bool = False) -> Console:
@@ -49,7 +49,8 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
 def show_status(console: Console, status: Status) -> None:
     """How a computation ended: the verdict in bold, then its details, a line each."""
     verdict, *details = str(status).splitlines()
-    show_sentence(console, verdict, style="bold green" if status.converged else "bold red")
+    colour = "yellow" if status.code is Code.MISFIT else "green" if status.converged else "red"
+    show_sentence(console, verdict, style=f"bold {colour}")
     for detail in details:
         show_sentence(console, detail.strip(), indent=2)
 
@@ -99,6 +100,7 @@ def new_table(*columns: str) -> Table:
             "rejected",
             "best so far",
             "unit",
+            "mark",
             "in log",
             "",
         )

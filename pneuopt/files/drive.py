@@ -14,6 +14,7 @@ import tomlkit
 
 from pneuopt.dynamics.system import System
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
+from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.models.declaration import Alias, Drive, DriveKind, Sections, Structure, choice
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import HardwareError, InputError, ModelError, UnknownNameError, check_names, require
@@ -25,7 +26,6 @@ from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_value, w
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pneuopt.identification.result import IdentificationResult
 
 FIT_SECTIONS = ("estimates", "covariance", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
@@ -100,6 +100,30 @@ def read_status(path: str | Path) -> Status | None:
     return Status(Code(said["code"]), tuple(filter(None, [str(said.get("message", ""))])))
 
 
+def read_marks(path: str | Path) -> dict[str, Mark]:
+    """How far each estimate in a file can be trusted, by parameter; empty for a file that no fit has written.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    dict of str to Mark
+
+    Raises
+    ------
+    InputError
+        If a mark is none that pneuopt writes.
+    """
+    estimates = read_toml(path).unwrap().get("estimates", {})
+    require(isinstance(estimates, dict), f"{path}: estimates must be a section, [estimates]")
+    marks = {n: str(entry["mark"]) for n, entry in estimates.items() if isinstance(entry, dict) and "mark" in entry}
+    for name, mark in marks.items():
+        check_names("mark", [mark], [m.value for m in Mark], f"{path}: [estimates] {name}")
+    return {n: Mark(mark) for n, mark in marks.items()}
+
+
 def read_covariance(path: str | Path) -> "pd.DataFrame | None":
     """The covariance of a fit's estimates; None for a file that no fit has written.
 
@@ -136,7 +160,7 @@ def read_covariance(path: str | Path) -> "pd.DataFrame | None":
     return pd.DataFrame(matrix, list(rows), list(rows))
 
 
-def write_fit(path: str | Path, source: str | Path, result: "IdentificationResult") -> None:
+def write_fit(path: str | Path, source: str | Path, result: IdentificationResult) -> None:
     """Write a drive's file with the values found: the user's text and comments, [estimates], [covariance], ...
 
     An unidentifiable parameter keeps its given value and text (see `IdentificationResult`).

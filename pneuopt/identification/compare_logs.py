@@ -10,6 +10,7 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem
 from pneuopt.identification.checks import as_experiments, check_logs
+from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.identify import identify
 from pneuopt.identification.problem import as_estimation_model
 from pneuopt.identification.result import IdentificationResult
@@ -115,11 +116,15 @@ def _comparison_table(
 
 
 def _estimate(fit: IdentificationResult, name: str) -> tuple[float, float]:
-    """Value and standard deviation of a parameter; NaN where the log alone does not identify it."""
+    """Value and standard deviation of a parameter; NaN where the log alone does not identify it.
+
+    With few degrees of freedom it is that of a normal distribution with the same interval.
+    """
     if not fit.status.converged or name not in fit.estimates.index:
         return math.nan, math.nan
-    value, stderr = (float(fit.estimates[column][name]) for column in ("value", "stderr"))
-    return (value, stderr) if math.isfinite(stderr) else (math.nan, math.nan)
+    value, stderr, dof = (float(fit.estimates[column][name]) for column in ("value", "stderr", "dof"))
+    width = stderr * float(t_quantile(dof) / t_quantile(math.inf))
+    return (value, width) if math.isfinite(width) else (math.nan, math.nan)
 
 
 def _inverse_variance_mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float]:

@@ -26,6 +26,7 @@ from pneuopt.identification.checks import (
 )
 from pneuopt.identification.identifiability import rests_on_prior
 from pneuopt.identification.losses import Loss
+from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts
 from pneuopt.identification.problem import (
     EstimationProblem,
@@ -38,7 +39,6 @@ from pneuopt.identification.review import review_fit
 from pneuopt.identification.statistics import (
     agreement,
     confidence_interval,
-    correlation_time,
     cross_correlation,
     ljung_box,
 )
@@ -47,7 +47,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
@@ -57,6 +57,10 @@ from pneuopt.shooting.solution import Fit
 if TYPE_CHECKING:
     import pandas as pd
 
+ESTIMATE_COLUMNS = [
+    *("value", "stderr", "dof", "ci_low", "ci_high", "range_low", "range_high"),
+    *("lower", "upper", "at_bound", "mark", "unit", "source"),
+]
 NOTHING_IDENTIFIABLE = Status(
     Code.NOT_CONVERGED,
     ("the logs identify none of the free parameters by itself", "fix some, or log runs that separate them"),
@@ -210,11 +214,10 @@ def _result(
     runs = {e.name: t for e, t in zip(problem.experiments, fit.trajectories, strict=True)}
     starts = len(problem.experiments) * len(problem.system.states)
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
-    variance = squares / max(1, fit.count - len(free) - starts)
-    correlated = max(
-        _residual_correlation_time(problem.system, problem.experiments, runs), _jump_correlation_time(fit.jumps)
-    )
-    covariance = None if fit.covariance is None else fit.covariance * variance * correlated * fit.variance_inflation
+    dof = max(1, fit.count - len(free) - starts)
+    variance = squares / dof
+    misfit = diagnose_misfit(problem, fit, variance, dof)
+    covariance = misfit.covariance
     prior_dominated = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
@@ -222,15 +225,15 @@ def _result(
     unidentifiable = tuple(
         n for n, dominated in zip(free, prior_dominated, strict=True) if dominated or n in problem.held
     )
-    status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else fit.status
+    status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else misfit.assess(fit.status)
     result = IdentificationResult(
         problem.parameters.with_values(values),
-        _estimates(estimates, covariance, fit.at_bound, status),
+        _estimates(estimates, covariance, fit.at_bound, status, misfit),
         _covariance_frame(free, covariance),
         _fit_table(problem.system, problem.experiments, runs),
         runs,
         status,
-        {**fit.stats, "chi_square_ratio": variance, "correlation_time": correlated},
+        {**fit.stats, "chi_square_ratio": variance, "variance_inflation": misfit.inflation},
         {
             **provenance(problem.method, *([loss] if loss else [])),
             "start": label,
@@ -268,37 +271,43 @@ def _residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajector
     return found
 
 
-def _residual_correlation_time(
-    system: Fittable, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]
-) -> float:
-    """Mean correlation time of the residuals over logs and channels, by which model error widens a variance."""
-    times = [
-        correlation_time(e.trajectory[channel] - runs[e.name][channel])
-        for e in experiments
-        for channel in outputs_in_log(system, e)
-    ]
-    return float(np.mean(times))
-
-
-def _jump_correlation_time(jumps: Array | None) -> float:
-    """Mean correlation time over the states of gaps that stand for their noise; 1 without such gaps."""
-    return 1.0 if jumps is None else float(np.mean([correlation_time(column) for column in jumps.T]))
-
-
 def _estimates(
-    parameters: ParameterSet, covariance: Array | None, at_bound: NDArray[np.bool_], status: Status
+    parameters: ParameterSet,
+    covariance: Array | None,
+    at_bound: NDArray[np.bool_],
+    status: Status,
+    misfit: Misfit,
 ) -> "pd.DataFrame":
     import pandas as pd
 
-    usable = covariance is not None and status.code is not Code.DIVERGED
+    usable = covariance is not None and status.converged and not misfit.is_excessive
     stderr = np.sqrt(np.diag(covariance)) if usable and covariance is not None else np.full(len(parameters), math.nan)
     rows = {}
-    for (name, p), spread, bound in zip(parameters.items(), stderr, at_bound, strict=True):
-        deviation = math.nan if bound else float(spread)
-        low, high = confidence_interval(p.value, deviation, log=p.log)
-        rows[name] = [p.value, deviation, low, high, p.lower, p.upper, bool(bound), p.unit, p.source]
-    columns = ["value", "stderr", "ci_low", "ci_high", "lower", "upper", "at_bound", "unit", "source"]
-    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    for i, (name, p) in enumerate(parameters.items()):
+        deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
+        low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
+        ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
+        mark = misfit.mark(is_optimum=status.converged and not at_bound[i])
+        rows[name] = [
+            p.value,
+            deviation,
+            dof,
+            low,
+            high,
+            *ends,
+            p.lower,
+            p.upper,
+            bool(at_bound[i]),
+            mark,
+            p.unit,
+            p.source,
+        ]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
+
+
+def _move(p: Parameter, change: float) -> float:
+    """A parameter's value after a change; its logarithm moves where it is searched as one."""
+    return p.value * math.exp(change / p.value) if p.log else p.value + change
 
 
 def _covariance_frame(free: Sequence[str], covariance: Array | None) -> "pd.DataFrame":

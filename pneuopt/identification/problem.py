@@ -26,6 +26,7 @@ from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
+STATIC_SEGMENTS = 100  # segments of a static map's log: fewer make uneven blocks of time, more cost time
 REFIT_STAGES = 3  # last stages of a method that a refit runs, near its answer: more cost time, fewer may not converge
 
 
@@ -131,9 +132,9 @@ class EstimationProblem:
         return Phase(experiment.name, t, h, driven, nodes, start, guess=guess, breaks=np.array(breaks, dtype=np.intp))
 
     def _samples_a_segment(self, h: Array) -> int:
-        """Samples between two nodes; a static map has no gaps, so its cut is only for batching."""
+        """Samples between two nodes; a static map has no gaps, and is cut only for batches and blocks of time."""
         if not self.system.states:
-            return 100
+            return min(max(1, len(h) // STATIC_SEGMENTS), 100)
         samples = self.method.segment_time / float(np.median(h))
         return len(h) if math.isinf(samples) else max(2, round(samples))
 

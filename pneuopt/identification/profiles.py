@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from scipy.stats import chi2
-
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import HasSystem
 from pneuopt.identification.checks import check_logs
+from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
@@ -44,8 +43,10 @@ class Profile:
         Ends of the confidence interval; infinite where the logs set no limit within the parameter's bounds.
     level : float
     curve : DataFrame
-        A row a refit, by rising value: value, deviance (twice the cost above the least, in the variance and correlation
-        of the fit's own residuals), and what the other parameters became.
+        A row a refit, by rising value: value, deviance (twice the cost above the least, in units that make its
+        curvature at the estimate that of the estimate's standard error), and what the other parameters became.
+    dof : float
+        Degrees of freedom of the estimate's variance.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Profile:
     high: float
     level: float
     curve: "pd.DataFrame"
+    dof: float = math.inf
 
     @property
     def is_open(self) -> bool:
@@ -67,7 +69,7 @@ class Profile:
     @property
     def threshold(self) -> float:
         """The deviance up to which a value lies within the interval."""
-        return float(chi2.ppf(self.level, 1))
+        return float(t_quantile(self.dof, self.level)) ** 2
 
     @property
     def sentence(self) -> str:
@@ -111,8 +113,9 @@ def profile(
     Returns
     -------
     Profile
-        Its ends are where the deviance reaches the chi-square quantile (Venzon, Moolgavkar, Applied Statistics 37(1),
-        1988), in the units in which the curvature at the estimate is that of the estimate's own standard error.
+        Its ends are where the deviance reaches the squared quantile of Student's t, chi-square's where the degrees of
+        freedom are many (Venzon, Moolgavkar, Applied Statistics 37(1), 1988), in the units in which the curvature at
+        the estimate is that of the estimate's own standard error.
 
     Raises
     ------
@@ -137,12 +140,13 @@ def trace_profile(problem: EstimationProblem, result: IdentificationResult, name
     if problem.method.progress is not None:
         problem.method.progress(f"profile of {name}")
     refits = _Refits(problem, result, name)
-    target = math.sqrt(float(chi2.ppf(level, 1)))
+    dof = float(result.estimates["dof"][name])
+    target = float(t_quantile(dof, level))
     for side in (-1, 1):
         _bracket(refits, side, target)
     p = refits.parameter
     low, high = (_interval_end(refits, side, target) for side in (-1, 1))
-    return Profile(name, p.unit, p.value, low, high, level, refits.curve())
+    return Profile(name, p.unit, p.value, low, high, level, refits.curve(), dof)
 
 
 class _ProfilePoint(NamedTuple):
@@ -168,7 +172,8 @@ class _Refits:
         self.spread = self._search_deviation(float(result.estimates["stderr"][name]))
         self.points: list[_ProfilePoint] = []
         self.refit_at(self.to_search(self.parameter.value))
-        self.scale = self._scale(result.stats["chi_square_ratio"] * result.stats["correlation_time"])
+        inflation = result.stats["variance_inflation"]
+        self.scale = self._scale(result.stats["chi_square_ratio"] * inflation, limited=inflation <= 1)
 
     @property
     def centre(self) -> float:
@@ -218,8 +223,11 @@ class _Refits:
     def _search_deviation(self, stderr: float) -> float:
         return stderr / self.parameter.value if self.parameter.log else stderr
 
-    def _scale(self, noise: float) -> float:
-        """The cost that counts as one variance, from the curvature: weighted gaps rise less than the likelihood."""
+    def _scale(self, noise: float, *, limited: bool) -> float:
+        """The cost that counts as one variance, from the curvature: weighted gaps rise less than the likelihood.
+
+        It is limited to the variance of the residuals where these are white.
+        """
         if not (math.isfinite(self.spread) and self.spread > 0):
             return noise
         step = min(self.spread, MAX_LOG_PROBE) if self.parameter.log else self.spread
@@ -230,7 +238,8 @@ class _Refits:
         middle = self.points[0].cost
         rise = sum(self.refit_at(z).cost - middle for z in around)
         found = rise * (self.spread / step) ** 2
-        return min(max(found, 0.1 * noise), noise) if math.isfinite(found) else noise
+        most = noise if limited else math.inf
+        return min(max(found, 0.1 * noise), most) if math.isfinite(found) else noise
 
 
 def _bracket(refits: _Refits, side: int, target: float) -> None:

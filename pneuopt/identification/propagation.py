@@ -45,7 +45,8 @@ def propagate_error(result: IdentificationResult, function: Callable[[ParameterV
     -------
     PropagatedValue
         ``stderr = sqrt(g C g')`` with g the slope at the estimates (central differences) and C their covariance: right
-        where the function is nearly linear within the intervals.
+        where the function is nearly linear within the intervals. Its interval has the fewest degrees of freedom among
+        the estimates that the figure depends on.
 
     Examples
     --------
@@ -55,16 +56,18 @@ def propagate_error(result: IdentificationResult, function: Callable[[ParameterV
     >>> names = ["static", "coulomb"]
     >>> fit = SimpleNamespace(
     ...     parameters=ParameterSet({n: Parameter(v, "N") for n, v in zip(names, (60.0, 40.0))}),
-    ...     estimates=pd.DataFrame({"value": [60.0, 40.0]}, index=names),
+    ...     estimates=pd.DataFrame({"value": [60.0, 40.0], "dof": [900.0, 3.0]}, index=names),
     ...     covariance=pd.DataFrame([[4.0, 0.0], [0.0, 1.0]], index=names, columns=names),
     ... )
     >>> ratio = propagate_error(fit, lambda p: p["static"] / p["coulomb"])
-    >>> ratio.value, round(ratio.stderr, 4)
-    (1.5, 0.0625)
+    >>> ratio.value, round(ratio.stderr, 4), round(ratio.ci_high, 4)
+    (1.5, 0.0625, 1.6989)
     """
-    values, stderr = propagate_deviations(result, lambda p: [function(p)])
-    value, spread = float(values[0]), float(stderr[0])
-    return PropagatedValue(value, spread, *confidence_interval(value, spread, log=False))
+    values, slopes = _linearise(result, lambda p: [function(p)])
+    value, spread = float(values[0]), float(_deviations(result, slopes)[0])
+    used = result.covariance.index[slopes[0] != 0]
+    dof = float(result.estimates["dof"][used].min()) if len(used) else math.inf
+    return PropagatedValue(value, spread, *confidence_interval(value, spread, log=False, dof=dof))
 
 
 def propagate_deviations(
@@ -83,19 +86,28 @@ def propagate_deviations(
     (ndarray, ndarray)
         Each of shape (n,).
     """
+    values, slopes = _linearise(result, function)
+    return values, _deviations(result, slopes)
+
+
+def _linearise(result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]) -> tuple[Array, Array]:
+    """The figures at the estimates, shape (n,), and their slopes by these, shape (n, k)."""
     known = {n: p.value for n, p in result.parameters.items()}
     found = {str(n): float(v) for n, v in result.estimates["value"].items()}
     at = {**known, **{n: known[n.partition("[")[0]] if math.isnan(v) else v for n, v in found.items()}}
-    covariance = result.covariance.to_numpy(dtype=float)
-    variances = np.diag(covariance)
+    variances = np.diag(result.covariance.to_numpy(dtype=float))
     slopes = [
         _central_difference(function, at, str(n), v) for n, v in zip(result.covariance.index, variances, strict=True)
     ]
     value = np.asarray(function(at), dtype=float)
-    J = np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
-    used = np.any(J != 0, axis=0)  # parameters without an interval do no harm where no figure depends on them
-    variance = np.einsum("ni,ij,nj->n", J[:, used], covariance[np.ix_(used, used)], J[:, used])
-    return value, np.sqrt(variance)
+    return value, np.stack(slopes, axis=-1) if slopes else np.zeros((len(value), 0))
+
+
+def _deviations(result: IdentificationResult, slopes: Array) -> Array:
+    """Standard deviations of figures with these slopes, shape (n,)."""
+    used = np.any(slopes != 0, axis=0)  # parameters without an interval do no harm where no figure depends on them
+    covariance = result.covariance.to_numpy(dtype=float)[np.ix_(used, used)]
+    return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", slopes[:, used], covariance, slopes[:, used])))
 
 
 def _central_difference(

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.dynamics.excitation import Excitation
@@ -18,6 +19,27 @@ AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "unidentifiable"
 # inflation of a standard deviation [1] from which "nothing separates them" is shown: lower hides useful figures, higher
 # shows rounding
 INFINITE_INFLATION = 1e5
+
+
+class Mark(StrEnum):
+    """How far an estimate and its interval can be trusted.
+
+    Attributes
+    ----------
+    EXACT
+        The residuals look like noise; the interval is that of white residuals.
+    WIDENED
+        The residuals exceed the noise, are correlated, or differ from log to log; the interval counts that.
+    BIAS_POSSIBLE
+        The model misses a part of the motion, or the estimate is at its bound; no interval holds the error of that.
+    UNIDENTIFIABLE
+        The logs do not determine the parameter.
+    """
+
+    EXACT = "exact"
+    WIDENED = "widened"
+    BIAS_POSSIBLE = "bias possible"
+    UNIDENTIFIABLE = "unidentifiable"
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +145,15 @@ class IdentificationResult:
         does an unidentifiable one, unless the logs reject that value or identify it only together with another: then
         it has the value that belongs to the other estimates.
     estimates : DataFrame
-        A row a free parameter ("name[log]" for one of a log): value, stderr, ci_low, ci_high (95 %), lower, upper,
-        at_bound, unit, source, note. The value is NaN where the note is "unidentifiable". No interval there, at a
-        bound, or without convergence. Where a linear interval would be wrong it is the profile likelihood's, infinite
-        at an open end.
+        A row a free parameter ("name[log]" for one of a log): value, stderr, dof (degrees of freedom of that, for
+        Student's t), ci_low, ci_high (95 %), range_low, range_high, lower, upper, at_bound, mark (a `Mark`), unit,
+        source, note. The value is NaN where the mark is "unidentifiable". No interval there, at a bound, without
+        convergence, or with a status of `Code.MISFIT`. Where a linear interval would be wrong it is the profile
+        likelihood's, infinite at an open end. The range is what the estimate becomes when a sixth of the logs' time,
+        any log, or a class of the motion on which the residuals depend is left out (linearised).
         An unidentifiable parameter may lie a factor of ten from where it is held: the other intervals allow for that.
     covariance : DataFrame
-        Of the estimates, scaled by the residuals' own level and correlation; NaN for what has no interval.
+        Of the estimates, as wide as their intervals count the residuals (`stderr`); NaN for what has no interval.
     fit : DataFrame
         A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit.
     trajectories : mapping of str to Trajectory

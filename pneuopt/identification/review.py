@@ -22,6 +22,7 @@ from pneuopt.identification.result import (
     AT_BOUND_NOTE,
     UNIDENTIFIABLE_NOTE,
     IdentificationResult,
+    Mark,
     Verdict,
     join_names,
 )
@@ -108,7 +109,7 @@ def _blank_covariance(covariance: "pd.DataFrame", names: Iterable[str]) -> "pd.D
 def _blank_intervals(estimates: "pd.DataFrame", names: Iterable[str]) -> "pd.DataFrame":
     """The estimates without intervals for the named parameters."""
     out = estimates.copy()
-    out.loc[list(names), ["stderr", "ci_low", "ci_high"]] = math.nan
+    out.loc[list(names), ["stderr", "ci_low", "ci_high", "range_low", "range_high"]] = math.nan
     return out
 
 
@@ -121,7 +122,7 @@ def _names_at_given_value(problem: EstimationProblem) -> tuple[str, ...]:
 def _verdict_at(problem: EstimationProblem, start: Start, result: IdentificationResult) -> Verdict:
     """The verdict from the sensitivities at a start, with the residuals of a result."""
     return verdict_from_sensitivities(
-        problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["correlation_time"])
+        problem, start, max(1.0, result.stats["chi_square_ratio"] * result.stats["variance_inflation"])
     )
 
 
@@ -183,7 +184,8 @@ def _add_notes(estimates: "pd.DataFrame", verdict: Verdict) -> "pd.DataFrame":
     unidentifiable, bound = set(verdict.unidentifiable), estimates["at_bound"]
     notes = [AT_BOUND_NOTE if bound[n] else UNIDENTIFIABLE_NOTE if n in unidentifiable else "" for n in estimates.index]
     out = estimates.assign(note=notes)
-    return out.assign(value=out["value"].where(out["note"] != UNIDENTIFIABLE_NOTE))
+    known = out["note"] != UNIDENTIFIABLE_NOTE
+    return out.assign(value=out["value"].where(known), mark=out["mark"].where(known, Mark.UNIDENTIFIABLE))
 
 
 def _locate_failure(problem: EstimationProblem, start: Start, status: Status, verdict: Verdict) -> Status:

@@ -93,8 +93,9 @@ def select_model(
 
     Notes
     -----
-    The deviance is the squared residuals over their variance in the best candidate, and over their correlation time: as
-    if only independent samples counted. Between nested candidates it falls as chi-square with the extra parameters
+    The deviance is the squared residuals over their variance in the best candidate, and over the factor by which that
+    candidate's variances exceed those of white residuals: as if only independent samples counted. Between nested
+    candidates it falls as chi-square with the extra parameters
     (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable parameters count among the k, so
     that a candidate with such parameters gives way to a simpler one that fits as well.
     """
@@ -168,8 +169,8 @@ def _candidate_rows(
 ) -> dict[str, _CandidateRow]:
     """A row for each candidate, the lowest BIC first, those that did not converge last."""
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
-    scale = _variance(fits[best]) * fits[best].stats["correlation_time"]
-    count = _residual_count(fits[best]) / fits[best].stats["correlation_time"]
+    scale = _variance(fits[best]) * fits[best].stats["variance_inflation"]
+    count = _residual_count(fits[best]) / fits[best].stats["variance_inflation"]
     rows = {}
     for name, fit in fits.items():
         k, deviance = len(fit.estimates), _chi_square(fit) / scale

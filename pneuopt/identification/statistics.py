@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2, norm
+from scipy.stats import chi2, t
 
 from pneuopt.quantities.arrays import Array
 
@@ -37,49 +37,20 @@ def agreement(measured: ArrayLike, predicted: ArrayLike) -> Mapping[str, float]:
     return {"rmse": rmse, "nrmse": nrmse, "fit_percent": 100 * (1 - nrmse), "samples": float(y.size)}
 
 
-def correlation_time(residuals: ArrayLike) -> float:
-    """Correlation time of residuals in samples: 1 + 2 (rho_1 + rho_2 + ...), up to the first rho <= 0.
-
-    Parameters
-    ----------
-    residuals : array_like, shape (n,)
-        NaN where a sample is missing.
-
-    Returns
-    -------
-    float
-        1 for white residuals: if rho_1 is below 3 / sqrt(n), nothing is summed. The variance of an estimate from n
-        correlated samples is this much larger (Geyer, Statistical Science 7(4), 1992, for the truncation).
-
-    Examples
-    --------
-    >>> correlation_time(np.random.default_rng(1).standard_normal(1000))
-    1.0
-    """
-    e = np.asarray(residuals, dtype=float)
-    e = e[np.isfinite(e)]
-    n = e.size
-    if n < 10 or not np.any(e - e.mean()):
-        return 1.0
-    spectrum = np.abs(np.fft.rfft(e - e.mean(), 2 * n)) ** 2
-    rho = np.fft.irfft(spectrum)[1 : n // 2]
-    rho = rho / (spectrum[0] + 2 * spectrum[1:-1].sum() + spectrum[-1]) * (2 * n)
-    if rho[0] < 3 / math.sqrt(n):
-        return 1.0
-    negative = np.flatnonzero(rho <= 0)
-    return float(1 + 2 * rho[: negative[0] if negative.size else rho.size].sum())
-
-
-def confidence_interval(value: float, stderr: float, *, log: bool, level: float = 0.95) -> tuple[float, float]:
-    """Normal confidence interval; symmetric in the logarithm where the parameter is searched as one.
+def confidence_interval(
+    value: float, stderr: float, *, log: bool, level: float = 0.95, dof: float = math.inf
+) -> tuple[float, float]:
+    """Confidence interval by Student's t; symmetric in the logarithm where the parameter is searched as one.
 
     Examples
     --------
     >>> low, high = confidence_interval(10.0, 1.0, log=False)
     >>> round(low, 2), round(high, 2)
     (8.04, 11.96)
+    >>> round(confidence_interval(10.0, 1.0, log=False, dof=3.0)[1], 2)
+    13.18
     """
-    width = float(norm.ppf(0.5 + level / 2)) * stderr
+    width = float(t.ppf(0.5 + level / 2, dof)) * stderr
     if log and math.isfinite(width):
         ratio = math.exp(min(width / value, 700.0))
         return value / ratio, value * ratio

@@ -11,6 +11,7 @@ class Code(Enum):
     """Why a solver stopped."""
 
     CONVERGED = "converged"
+    MISFIT = "converged, but the model misses the logs"
     NOT_CONVERGED = "not converged"
     ITERATION_LIMIT = "iteration limit reached"
     INFEASIBLE = "the limits contradict each other"
@@ -35,8 +36,8 @@ class Status:
 
     @property
     def converged(self) -> bool:
-        """Whether the answer may be trusted."""
-        return self.code is Code.CONVERGED
+        """Whether the search ended at an optimum; the answer may be trusted unless the code is `Code.MISFIT`."""
+        return self.code in (Code.CONVERGED, Code.MISFIT)
 
     @property
     def verdict(self) -> str:
@@ -57,5 +58,5 @@ class Status:
         return replace(self, sentences=(*self.sentences, *filter(None, remedies)))
 
     def __str__(self) -> str:
-        lead = "converged" if self.converged else f"NOT converged ({self.code.value})"
+        lead = self.code.value if self.converged else f"NOT converged ({self.code.value})"
         return "\n  ".join((f"{lead}: {self.sentences[0]}", *self.sentences[1:])) if self.sentences else lead

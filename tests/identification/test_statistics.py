@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from pneuopt.identification.statistics import agreement, confidence_interval, correlation, correlation_time
+from pneuopt.identification.statistics import agreement, confidence_interval, correlation
 
 
 def test_agreement_of_a_known_error() -> None:
@@ -27,24 +27,6 @@ def test_predicting_the_mean_explains_nothing() -> None:
     y = np.random.default_rng(0).standard_normal(100)
     assert agreement(y, np.full(100, y.mean()))["fit_percent"] == pytest.approx(0, abs=1e-9)
     assert agreement(y, y)["fit_percent"] == 100
-
-
-@pytest.mark.parametrize(("a", "time"), [(0.0, 1.0), (0.5, 3.0), (0.8, 9.0)])
-def test_correlation_time_of_an_autoregression(a: float, time: float) -> None:
-    """An AR(1) process with coefficient a: (1 + a) / (1 - a)."""
-    rng = np.random.default_rng(1)
-    e = np.empty(20000)
-    e[0] = 0
-    for i, w in enumerate(rng.standard_normal(e.size - 1)):
-        e[i + 1] = a * e[i] + w
-    assert correlation_time(e) == pytest.approx(time, rel=0.15)
-
-
-def test_correlation_time_of_nothing_much() -> None:
-    assert correlation_time([1.0, 2.0]) == 1.0
-    assert correlation_time(np.ones(100)) == 1.0
-    assert correlation_time(np.full(50, math.nan)) == 1.0
-    assert correlation_time([1.0, -1.0] * 50) == 1.0
 
 
 @given(value=st.floats(1e-3, 1e3), ratio=st.floats(1e-6, 2.0))
@@ -71,6 +53,13 @@ def test_no_deviation_no_interval_and_a_huge_one_no_overflow() -> None:
 
 def test_levels() -> None:
     assert confidence_interval(0.0, 1.0, log=False, level=0.6827)[1] == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("dof", "quantile"), [(1.5, 6.0), (3.0, 3.18245), (10.0, 2.22814), (math.inf, 1.95996)])
+def test_few_degrees_of_freedom_take_students_quantile(dof: float, quantile: float) -> None:
+    """The table of Student's t; 1.5 lies between 12.71 and 4.30."""
+    low, high = confidence_interval(5.0, 2.0, log=False, dof=dof)
+    assert (high - low) / 4 == pytest.approx(quantile, rel=0.06 if dof == 1.5 else 1e-5)
 
 
 def test_correlation_matrix() -> None:
