@@ -19,7 +19,7 @@ MAX_FIT_ROWS = 12
 
 
 def show_estimates(console: Console, estimates: "pd.DataFrame", widths: Sequence[ChosenWidth] = ()) -> None:
-    """Value, 95 % confidence interval (or range) and mark of each free parameter, then the widths that the logs have chosen.
+    """Value, interval or range, and mark of each free parameter, then the widths that the logs have chosen.
 
     Parameters
     ----------

@@ -116,7 +116,10 @@ def identify(
     check_free(experiments, parameters)
     check_content(model, experiments)
     log_warnings = emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
-    problem = EstimationProblem(model, tuple(experiments), model.parameters | parameters, method)
+    stated = all(channel in e.noise for e in given for channel in outputs_in_log(model, e))
+    problem = EstimationProblem(
+        model, tuple(experiments), model.parameters | parameters, method, noise_is_stated=stated
+    )
     problem, widths = choose_widths(problem)
     held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
     result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths)

@@ -6,6 +6,7 @@ interval says anything.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from pneuopt.dynamics.system import names
+from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.clusters import (
     SIMULATIONS,
     TIME_BLOCKS,
@@ -22,6 +24,7 @@ from pneuopt.identification.clusters import (
 )
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.result import Mark, join_names
+from pneuopt.identification.statistics import agreement
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
@@ -36,10 +39,16 @@ MOTION_BLOCKS = 32
 # probability [1], over all signals and outputs, below which residuals depend on a signal: higher blames chance, lower
 # misses stick-slip that the model smooths
 MOTION_LEVEL = 0.001
-# residuals in noise standard deviations [1] beyond which there is no interval: the parameters of a model that misses so
-# much are not those of the drive, and how far they are off is not in the residuals. Sensors at the wrong place have
-# left 26 to 49, friction that depends on load or position 2 to 8
+# residuals in noise standard deviations [1] from which most of their power is an error of the model: a lower one blames
+# the model for noise that a log states too low, a higher one trusts intervals of wrong models
+MODEL_ERROR_LEVEL = 2.0
+# residuals in standard deviations of the stated noise [1] beyond which there is no interval: the parameters of a model
+# that misses so much are not those of the drive, and how far they are off is not in the residuals. Sensors at the wrong
+# place have left 26 to 49, friction that depends on load or position 2 to 8
 MAX_MISFIT = 20.0
+# the same over the channel's own variation [1], where the noise is estimated: that of a fine encoder is far below what
+# any model explains
+MAX_NRMSE = 0.2
 MIN_SIGNAL_SPREAD = 1e-6  # spread of a signal over its size [1]: a smaller one is rounding, and has no classes
 
 
@@ -64,6 +73,8 @@ class Misfit:
         Residuals over the noise, root mean squares [1].
     noisy_states : bool
         Whether gaps between segments stand for noise of the states.
+    is_excessive : bool
+        Whether the residuals are so large that there is no interval.
     signals : tuple of str
         The simulated signals on which the residuals depend, the clearest first.
     is_slow, lone
@@ -76,22 +87,18 @@ class Misfit:
     ranges: Array
     level: float
     noisy_states: bool
+    is_excessive: bool
     widened: bool = False
     signals: tuple[str, ...] = ()
     is_slow: bool = False
     lone: tuple[str, ...] = ()
 
-    @property
-    def is_excessive(self) -> bool:
-        """Whether the residuals exceed the noise so far that there is no interval."""
-        return self.level > MAX_MISFIT
-
     def mark(self, *, is_optimum: bool) -> Mark:
         """The mark of an estimate, which may be at an optimum or at a bound."""
-        if self.signals or self.is_excessive or not is_optimum:
+        is_missed = self.noisy_states or self.level > MODEL_ERROR_LEVEL
+        if self.signals or is_missed or not is_optimum:
             return Mark.BIAS_POSSIBLE
-        exceeds = self.noisy_states or self.level**2 > MAX_CHI_SQUARE_RATIO
-        return Mark.WIDENED if self.widened or exceeds else Mark.EXACT
+        return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
 
     def assess(self, status: Status) -> Status:
         """The status of a fit with what its residuals tell."""
@@ -132,12 +139,12 @@ def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: 
     k, free = len(fit.parameters.free_names), fit.parameters.free_names
     scores = None if fit.optimum is None else fit_scores(fit.optimum)
     white = None if fit.covariance is None else fit.covariance * variance * fit.variance_inflation
-    level = math.sqrt(variance)
+    size = math.sqrt(variance), fit.jumps is not None, _is_excessive(problem, fit, variance)
     if fit.optimum is None or scores is None or white is None:
-        return Misfit(white, np.full(k, dof), 1.0, np.full((k, 2), np.nan), level, fit.jumps is not None)
+        return Misfit(white, np.full(k, dof), 1.0, np.full((k, 2), np.nan), *size)
     keep = np.flatnonzero(fit.optimum.keep)
     blocks = _clusters(scores, _split_in_time(fit.optimum.equations.segments, TIME_BLOCKS), simulate=fit.jumps is None)
-    signals = _signals_behind_residuals(scores)
+    signals = _signals_behind_residuals(scores, names((*problem.system.states, *problem.system.inputs)))
     classes = [_clusters(scores, _classes(signals[0].values, of_size=True))] if signals else []
     square = np.ix_(keep, keep)
     found = robust_covariance(blocks, white[square], variance * fit.variance_inflation, dof, classes=classes)
@@ -152,8 +159,7 @@ def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: 
         degrees,
         float(np.mean(np.diag(found.covariance) / np.diag(white[square]))),
         ranges,
-        level,
-        fit.jumps is not None,
+        *size,
         found.widened,
         tuple(s.name for s in signals),
         found.is_slow,
@@ -198,6 +204,15 @@ def motion_p(values: Array, residuals: Array, derivatives: Array, scores: FitSco
     return _hotelling_p(sums)
 
 
+def _is_excessive(problem: EstimationProblem, fit: Fit, variance: float) -> bool:
+    """Whether residuals exceed the noise so far, or the variation of a channel where its noise is estimated."""
+    if variance <= MAX_MISFIT**2:
+        return False
+    pairs = zip(problem.experiments, fit.trajectories, strict=True)
+    figures = [agreement(e.trajectory[c], run[c]) for e, run in pairs for c in outputs_in_log(problem.system, e)]
+    return problem.noise_is_stated or float(np.nanmean([f["nrmse"] for f in figures])) > MAX_NRMSE
+
+
 def _hotelling_p(rows: Array) -> float:
     """Probability that rows of mean zero have so large a mean; 1 where they are too few."""
     count, mean = len(rows), rows.mean(axis=0)
@@ -212,12 +227,12 @@ def _hotelling_p(rows: Array) -> float:
     return float(f_distribution.sf(square * (count - rank) / (rank * (count - 1)), rank, count - rank))
 
 
-def _signals_behind_residuals(scores: FitScores) -> list[Signal]:
-    """The simulated states and inputs on which the residuals depend, the clearest first."""
+def _signals_behind_residuals(scores: FitScores, known: Sequence[str]) -> list[Signal]:
+    """The simulated signals, of those known, on which the residuals depend, the clearest first."""
     segments = scores.optimum.equations.segments
     blocks, (sums, derivatives) = _split_in_time(segments, MOTION_BLOCKS), scores.residual_sums()
     measured = np.flatnonzero(segments.counts)
-    means = _segment_means(scores.optimum)
+    means = {n: v for n, v in _segment_means(scores.optimum).items() if n in known}
     found = []
     for name, values in means.items():
         ps = [motion_p(values, sums[:, i], derivatives[:, i], scores, blocks) for i in measured]

@@ -44,6 +44,8 @@ class EstimationProblem:
         By log, the weight of each sample's squared residual; 1 for logs that are absent.
     held : mapping of str to float
         Values of free parameters that are held, for the logs cannot identify them.
+    noise_is_stated : bool
+        Whether the logs state the noise of all outputs; otherwise it is estimated from them.
     """
 
     system: Fittable
@@ -52,6 +54,7 @@ class EstimationProblem:
     method: LeastSquares
     weights: Mapping[str, Array] = field(default_factory=dict)
     held: Mapping[str, float] = field(default_factory=dict)
+    noise_is_stated: bool = False
 
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""

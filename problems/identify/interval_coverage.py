@@ -76,7 +76,8 @@ def identified(case: str, truth: po.ParameterSet) -> dict[str, Any]:
         row[f"covered {name}"] = float(found["ci_low"] <= true <= found["ci_high"])
         row[f"scaled {name}"] = (found["value"] - true) / found["stderr"]
         row[f"found {name}"] = found["value"]
-    return row | {"correlation_time": fit.stats["correlation_time"], "status": str(fit.status)}
+    marks = {f"mark {name}": str(mark) for name, mark in fit.estimates["mark"].items()}
+    return row | marks | {"inflation": fit.stats["variance_inflation"], "status": str(fit.status)}
 
 
 def drawn(case: str, seed: int) -> po.Experiment:

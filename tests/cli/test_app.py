@@ -92,16 +92,32 @@ def test_an_unidentifiable_parameter_is_named_before_and_after_the_fit(folder: P
 
 
 def test_open_ends_and_what_is_unidentifiable_are_no_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    ends = {
-        "a.open": (2.0, math.nan, 1.5, math.inf, ""),
-        "b.blind": (7.0, math.nan, -math.inf, math.inf, "unidentifiable"),
+    none = math.nan
+    rows = {
+        "a.open": (2.0, none, 1.5, math.inf, none, none, "widened", ""),
+        "b.blind": (7.0, none, -math.inf, math.inf, none, none, "unidentifiable", "unidentifiable"),
+        "c.missed": (7.0, none, none, none, 6.0, 9.0, "bias possible", ""),
+        "d.pressed": (7.0, none, none, none, none, none, "bias possible", "at its bound"),
     }
-    columns = ["value", "stderr", "ci_low", "ci_high", "note"]
-    table = pd.DataFrame.from_dict(ends, orient="index", columns=columns).assign(unit="N")
+    columns = ["value", "stderr", "ci_low", "ci_high", "range_low", "range_high", "mark", "note"]
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns).assign(unit="N")
     show_estimates(make_console(), table)
-    first, second = capsys.readouterr().out.splitlines()[-3:-1]
-    assert first.split() == ["a.open", "2", "above", "1.5", "N"]
-    assert second.split() == ["b.blind", "-", "not", "determined", "N", "unidentifiable"]
+    shown = [line.split() for line in capsys.readouterr().out.splitlines()[-5:-1]]
+    assert shown == [
+        ["a.open", "2", "above", "1.5", "N", "widened"],
+        ["b.blind", "-", "not", "determined", "N", "unidentifiable"],
+        ["c.missed", "7", "range", "6.00", "to", "9.00", "N", "bias", "possible"],
+        ["d.pressed", "7", "not", "determined", "N", "at", "its", "bound"],
+    ]
+
+
+def test_marks_fit_a_terminal_of_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    row = [0.020014, 2.8e-5, 0.019958, 0.02007, math.nan, math.nan, "bias possible", "", "m/s"]
+    columns = ["value", "stderr", "ci_low", "ci_high", "range_low", "range_high", "mark", "note", "unit"]
+    show_estimates(make_console(), pd.DataFrame([row], index=["friction.stribeck_velocity"], columns=columns))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert sum("bias possible" in line and "0.019958 to 0.020070" in line for line in lines) == 1
 
 
 def test_many_windows_are_shown_in_short(folder: Path) -> None:
