@@ -1,6 +1,7 @@
 """The order of starts: the model's first, then all, settled with their guesses held."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb, FrictionModel, Stribeck
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import Code
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.solution import Fit
@@ -114,3 +115,27 @@ def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.M
     assert "the best of 2 starts so far" in result.status.message
     assert result.provenance["start"] != "far off"
     assert result.fit["nrmse"].max() < 0.01
+
+
+def test_a_refit_is_taken_only_where_the_logs_do_not_reject_its_held_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the given value the sum of squares rises by 20; where the search had left the parameter, it does not."""
+    problem = posed(Coulomb())
+    start = problem.candidates()[0]
+    good = solve_least_squares(problem.transcription(start), problem.method)
+    first = replace(good, unidentifiable=("friction.viscous",))
+    worse = replace(good, chi_square=good.chi_square + 20, stats={**good.stats, "cost": good.stats["cost"] + 10})
+    refits = {True: worse, False: good}
+
+    def hold(problem: EstimationProblem, label: str, first: Fit, *, is_given: bool) -> tuple[EstimationProblem, Fit]:
+        return replace(problem, held={"friction.viscous": float(is_given)}), refits[is_given]
+
+    status = Status(Code.NOT_CONVERGED, ("the data do not determine friction.viscous",))
+    monkeypatch.setattr(starting, "solve_least_squares", lambda *_: replace(first, status=status))
+    monkeypatch.setattr(starting, "_hold_unidentifiable", hold)
+    held, fit = starting.fit_holding_unidentifiable(problem, start)
+    assert fit is good
+    assert held.held == {"friction.viscous": 0.0}
+    refits[False] = worse
+    held, fit = starting.fit_holding_unidentifiable(problem, start)
+    assert held.held == {}
+    assert fit.status == status
