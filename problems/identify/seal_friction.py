@@ -7,8 +7,8 @@ and fro at 5-15 mm/s with a constant pressure behind it. The published half-rang
 method: force less pressure x area) stand beside ours, which share one level and one slope against pressure, with a
 sensor offset a log. Speeds are so few that viscous and Stribeck terms, and a mass, cannot be identified;
 `identifiability` refuses them in words, before anything is fitted, and they are left out. The interval
-counts correlated residuals as fewer samples; how far the slope moves when one of the four logs is left out stands
-beside it.
+counts how the four logs scatter about the line, with hardly more than one degree of freedom; how far the slope moves
+when one of the four logs is left out stands beside it.
 """
 
 import sys

@@ -44,9 +44,9 @@ def test_what_did_not_converge_covers_nothing_and_is_counted() -> None:
 
 def test_draws_share_the_exact_log_and_state_their_noise() -> None:
     one, two, wrong = (
-        interval_coverage.drawn("right", 1),
-        interval_coverage.drawn("right", 2),
-        interval_coverage.drawn("wrong", 1),
+        interval_coverage.drawn("right", 1)[0],
+        interval_coverage.drawn("right", 2)[0],
+        interval_coverage.drawn("wrong", 1)[0],
     )
     assert np.array_equal(one.trajectory["valve_voltage"], two.trajectory["valve_voltage"])
     apart = one.trajectory["position"] - two.trajectory["position"]
