@@ -263,7 +263,7 @@ class _Search:
     def _run_stage(self) -> bool:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
-        descent = Descent(self._objective(), damping, self._is_negligible_step)
+        descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
         for _ in range(self.stage.iterations):
             trial = descent.step(self.current)
             if trial is None:

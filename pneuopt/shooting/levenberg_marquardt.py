@@ -72,7 +72,7 @@ IsNegligible = Callable[[Iterate, ReducedEquations, GaussNewtonStep], bool]
 
 
 class Descent:
-    """Levenberg-Marquardt steps on one objective; a node that overshoots is damped alone.
+    """Levenberg-Marquardt steps on one objective.
 
     Parameters
     ----------
@@ -81,9 +81,15 @@ class Descent:
         Of the first step.
     is_negligible : callable
         Whether a step that is hardly damped is not worth a try.
+    damps_nodes : bool
+        Whether nodes that overshoot are damped alone. Near an optimum this saves the rest of the log many short steps;
+        far from it, nodes are left behind that tighter gaps then cannot free.
     """
 
-    def __init__(self, objective: Objective, damping: float, is_negligible: IsNegligible) -> None:
+    def __init__(
+        self, objective: Objective, damping: float, is_negligible: IsNegligible, *, damps_nodes: bool = False
+    ) -> None:
+        self._damps_nodes = damps_nodes
         self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
         self.node_damping = np.zeros(objective.segments.count)
 
@@ -102,7 +108,7 @@ class Descent:
                     break
                 trial = self._trial(current, reduced, step)
                 is_lower = trial.cost < current.cost
-                if not is_lower or self.node_damping.any():
+                if self._damps_nodes and (not is_lower or self.node_damping.any()):
                     self.node_damping = self._missed_curvature(current, trial)
                 if is_lower:
                     self.damping = self.damping * 0.1 if self.damping > MIN_DAMPING else 0.0
