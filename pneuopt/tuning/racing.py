@@ -27,13 +27,13 @@ from pneuopt.tuning.simulator import Simulator
 
 # Shares of the trials that the starts get on coarse samples; the rest is for fine ones. Less for the first ends in the
 # nearest optimum, less for the second is no second opinion, less for the rest leaves an optimum of the coarse samples.
-START_SHARES = (0.65, 0.15)
+START_SHARES = (0.5, 0.35)
 # Shares of a start's trials over all bands, and over the nearest wider one. Less ends in the nearest optimum; more
 # leaves the band asked for too few.
 BAND_SHARES = (0.4, 0.25)
 # Generations over which the best merit must improve by this share for a phase to go on, and the spread of the whole
 # population, a share of its best, below which it ends. Shorter or larger ends a search that still advances.
-PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 15, 1e-3, 1e-4
+PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 25, 1e-3, 1e-4
 # Members of the phase on fine samples. Fewer lose the optimum where coarse and fine samples rank points differently;
 # each more costs fine simulations.
 FINE_MEMBERS = 20
@@ -77,7 +77,7 @@ class Racing:
     """
 
     members: int = 40
-    trials: int = 1000
+    trials: int = 1200
     bands: tuple[float, ...] = (1.5, 2.5, 5.0)
     polish: int = 20
     margin: float = 0.015
