@@ -35,6 +35,9 @@ DATA = Path(__file__).parents[2] / "data" / "pneumatic_rig"
 TRUTH: dict[str, Any] = tomllib.loads((DATA / "truth.toml").read_text(encoding="utf-8"))  # the generating values [SI]
 RIG = TRUTH.pop("rig")
 SAMPLE, BAND = 1e-3, 0.02  # [s], of the step
+# Band that the search is asked for. What settles into the whole band on the smooth model leaves it on the rig, which
+# sticks and whose valve has a hysteresis; a narrower one costs speed.
+ASKED_BAND = 0.015
 STEPS = [
     po.Step(0.1, horizon=0.6),  # [m/s], from 120 mm of 300 mm
     po.Step(0.25, horizon=0.45),
@@ -101,7 +104,9 @@ def run() -> Demo:
     designs = {"hand": on_rig(free, po.evaluate(loop, STEPS, free))}
     for name, start in {"pid_only": free.fixed("dither.*"), "tuned": free}.items():
         began = perf_counter()
-        best = po.tune(loop, STEPS, start, minimise=po.SettlingTime(BAND), subject_to=LIMITS, method=SEARCH)
+        asked = po.SettlingTime(ASKED_BAND)
+        plants: dict[str, Any] | None = {} if name == "pid_only" else None  # a rival is tried on no other plants
+        best = po.tune(loop, STEPS, start, minimise=asked, subject_to=LIMITS, method=SEARCH, plants=plants)
         seconds[name] = perf_counter() - began
         designs[name] = on_rig(best.parameters, best.certified)
     return Demo(log, fit, predicted(drive.system(), held_out, fit.parameters), designs, seconds)
