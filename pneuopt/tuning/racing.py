@@ -54,6 +54,9 @@ CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15
 # Share of the horizon from which on gradients see whole responses. A cut one ends at another operating point, whose
 # margins they meet: on the drive of problems/shared/t32.py, cut at half, Ms 1.98 where the end of the whole has 2.11.
 LONGEST_POLISHED_CUT = 0.4
+# Trials for each free gain of a short search, unless the whole one has fewer. With 200 the smallest relaxation of one
+# gain's limit came out 4 % too large; more cost time where there are many gains.
+LEAST_SHORT_TRIALS = 400
 NEARBY = 0.05  # spread about a start that is close, a share of each range: a wider one leaves it, a narrower one sticks
 
 
@@ -129,7 +132,8 @@ class Racing:
 
     def shorten(self, margin: float) -> "Racing":
         """The method for a short search from a point that is close."""
-        return Racing(24, max(1, self.trials // 6), (), self.polish, margin, digits=self.digits)
+        trials = min(self.trials, max(LEAST_SHORT_TRIALS, self.trials // 6))
+        return Racing(24, trials, (), self.polish, margin, digits=self.digits)
 
     def limit_path(self, task: TuningTask, spec: Specification) -> None:
         """No path: each set of limits needs a new search."""
