@@ -69,7 +69,8 @@ class ParameterScaling:
     def weak_prior(self, z: Array) -> Array:
         """Standard deviation of a weak prior: a factor of ten, or for linear parameters ten times their size."""
         size = np.abs(np.where(self.log, 0.0, z))
-        return np.where(self.log, WEAK_PRIOR_DEVIATION, np.where(size > 0, 10 * size, np.inf))
+        sized = size > np.finfo(float).tiny  # a start at a bound of 0 may leave rounding only
+        return np.where(self.log, WEAK_PRIOR_DEVIATION, np.where(sized, 10 * size, np.inf))
 
     def has_effect(self, equations: NormalEquations) -> Mask:
         """The mask of parameters that have an effect on the residuals here."""
