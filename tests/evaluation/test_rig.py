@@ -168,10 +168,10 @@ def test_a_coarse_encoder_roughens_a_loop_that_is_smooth_on_paper() -> None:
 
 
 def test_friction_identified_from_a_rig_is_near_with_a_bias_that_the_mismatch_explains() -> None:
-    """The smooth model (1 mm/s) on a log with true sticking, 0.5 ms of sensor lag and 10 um counts.
+    """The smooth model on a log with true sticking, 0.5 ms of sensor lag and 10 um counts.
 
-    Coulomb and viscous friction come back within 1 %, static friction 5 to 10 % high; the fit says that the model
-    does not follow the log to its noise.
+    Coulomb and viscous friction come back within 1 %, static friction within 3 % and high, at the width that the log
+    chooses (at 1 mm/s 5 to 10 % high); the fit says that the model does not follow the log to its noise.
     """
     truth = ForceDrive(Karnopp(Stribeck())).system()
     t = np.linspace(0, 2, 2001)
@@ -179,11 +179,11 @@ def test_friction_identified_from_a_rig_is_near_with_a_bias_that_the_mismatch_ex
     p = truth.parameters.with_values(FRICTION)
     log = record(Rig(truth, REAL), Trajectory(t, {"force": push}), p, seed=1).experiment
     model = ForceDrive(Stribeck()).system()
-    start = model.parameters.with_values({"friction.smoothing": 1e-3, "load.mass": 3.0})
+    start = model.parameters.with_values({"load.mass": 3.0})
     fit = identify(model, [log], start.freed("friction.coulomb", "friction.static", "friction.viscous"), throw=False)
     assert fit.parameters.value("friction.coulomb") == pytest.approx(30.0, rel=0.01)
     assert fit.parameters.value("friction.viscous") == pytest.approx(40.0, rel=0.01)
-    assert 1.05 < fit.parameters.value("friction.static") / 45.0 < 1.10
+    assert 1.0 < fit.parameters.value("friction.static") / 45.0 < 1.03
     assert "the model does not explain the log to its noise" in str(fit.status)
 
 
