@@ -63,7 +63,7 @@ def search(method: TwoPhase, lines: list[str]) -> TuningResult:
 
 
 def test_a_result_says_how_many_of_its_starts_agree() -> None:
-    found = search(TwoPhase(nodes=(20, 20), starts=2), [])
+    found = search(TwoPhase(nodes=(50, 50), starts=2), [])
     assert found.stats["starts"] == 2
     words, _ = describe_agreement(found.stats)
     assert words
