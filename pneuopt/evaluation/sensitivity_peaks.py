@@ -38,7 +38,7 @@ def sensitivity_peaks(opened: ComplexArray, closed: ComplexArray, low: float, hi
 
     >>> peak = sensitivity_peaks(np.array([[0.0, -3.0]]), np.roots([1.0, 3.0, 25.0])[None], 0.01, 1e3)
     >>> round(float(peak[0]), 4)
-    1.9437
+    1.9946
     """
     parts = np.arange(0, len(opened), LOOPS_AT_A_TIME)[1:]
     pairs = zip(np.split(opened, parts), np.split(closed, parts), strict=True)

@@ -118,7 +118,7 @@ def find_resolution(values: ArrayLike) -> float:
 
     Examples
     --------
-    >>> x = np.cumsum(np.linspace(0.0, 0.3, 50))
+    >>> x = np.sqrt(np.arange(50.0))
     >>> round(find_resolution(np.round(x / 0.02) * 0.02), 9), find_resolution(x)
     (0.02, 0.0)
     """
