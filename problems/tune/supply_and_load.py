@@ -8,6 +8,10 @@ slow and a fast step, then simulated, gains as printed, over 4 to 8 bar(g) and 2
 Rows map.*: it keeps the overshoot that it was tuned for in fewer than half of the 25 cases, half of them take half as
 long again to settle, and in the worst one it takes more than five times as long or never settles. A case that never
 settles counts so in the median and in the worst: its settling time is infinite.
+
+Rows retuned.*: what a tuning of its own is worth in nine of these cases, each begun from the gains of the best case
+beside it (`sweep_from_neighbours`): none breaks with its neighbours, and the worst settles sooner than the nominal
+gains do in half of the map.
 """
 
 import sys
@@ -44,14 +48,17 @@ ATMOSPHERE = 1.01325e5  # [Pa(a)]
 PRESSURES = [1e5 * gauge + ATMOSPHERE for gauge in (4.0, 5.0, 6.0, 7.0, 8.0)]  # [Pa(a)]
 MASSES = [2.0, 3.5, 5.0, 7.5, 10.0]  # [kg]
 METRICS = {"SettlingTime": "s", "Overshoot": "%"}
+RETUNED = {"supply.pressure": PRESSURES[::2], "load.mass": MASSES[::2]}
+STARTS = {f"found {name}": name for name in RANGES}
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What was tuned, and its study: a row a case, each metric the worst of the steps."""
+    """What was tuned, and its study: a row a case, each metric the worst of the steps; cells that were tuned."""
 
     best: po.TuningResult
     study: "pd.DataFrame"
+    retuned: "pd.DataFrame"
     seconds: float
 
 
@@ -68,7 +75,17 @@ def run() -> Job:
     seconds = time.perf_counter() - began
     for metric in METRICS:
         study[metric] = study[[c for c in study if str(c).startswith(f"{metric}[")]].max(axis=1, skipna=False)
-    return Job(best, study, seconds)
+    cell = partial(tune_case, loop)
+    retuned = po.sweep_from_neighbours(cell, best.parameters, RETUNED, value="SettlingTime", starts=STARTS)
+    return Job(best, study, retuned, seconds)
+
+
+def tune_case(loop: po.ClosedLoop, parameters: po.ParameterSet) -> dict[str, float]:
+    """The certified settling time of a tuning for one case, the worst of the steps, and its gains."""
+    aim = po.SettlingTime(band=0.02)
+    found = po.tune(loop, STEPS, parameters, minimise=aim, subject_to=LIMITS, plants={})
+    settled = float(np.max(found.certified.loc["SettlingTime"].to_numpy(dtype=float)))
+    return {"SettlingTime": settled} | {column: found.parameters.value(n) for column, n in STARTS.items()}
 
 
 def main(job: Job) -> "pd.DataFrame":
@@ -84,6 +101,7 @@ def main(job: Job) -> "pd.DataFrame":
     ]
     nominal = float(np.max(job.best.certified.loc["SettlingTime"].to_numpy(dtype=float)))
     bounds = {"settling_time.median": f">= {1.5 * nominal:.3g}", "settling_time.worst": f">= {5 * nominal:.3g}"}
+    median = np.nan
     for metric, unit in METRICS.items():
         values = good[metric].to_numpy(dtype=float)
         counted = np.where(np.isnan(values), np.inf, values)
@@ -96,9 +114,23 @@ def main(job: Job) -> "pd.DataFrame":
         }.items():
             row = f"{name}.{figure_of}"
             claims.append(Claim(f"map.{row}", float(value), unit, None, bounds.get(row, "")))
+            median = float(value) if row == "settling_time.median" else median
         claims.append(Claim(f"map.{name}.worst.pressure", worst["supply.pressure"] / 1e5, "bar"))
         claims.append(Claim(f"map.{name}.worst.mass", worst["load.mass"], "kg"))
-    return frame(claims)
+    return frame([*claims, *retuned_claims(job.retuned, median)])
+
+
+def retuned_claims(cells: "pd.DataFrame", median: float) -> list[Claim]:
+    """The rows of the cells that were tuned, beside the median of the nominal gains."""
+    settled = cells["SettlingTime"].fillna(np.inf)
+    return [
+        Claim("retuned.cells", len(cells)),
+        Claim("retuned.failed", int((cells["error"] != "").sum()), "1", None, "<= 0"),
+        Claim("retuned.again", int(cells["again"].sum())),
+        Claim("retuned.breaks", int(cells["breaks"].sum()), "1", None, "<= 0"),
+        Claim("retuned.settling_time.median", float(settled.median()), "s"),
+        Claim("retuned.settling_time.worst", float(settled.max()), "s", median, f"<= {median:.3g}"),
+    ]
 
 
 def figure(job: Job) -> "Figure":

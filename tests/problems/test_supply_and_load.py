@@ -18,7 +18,8 @@ def rows_of(settled: list[float]) -> dict[str, float]:
     study["supply.pressure"], study["load.mass"] = 1e5 * np.arange(1, n + 1), 5.0
     certified = pd.DataFrame({"0 to 0.1": {"SettlingTime": 0.1, "Overshoot": 4.0}})
     best = SimpleNamespace(parameters=po.ParameterSet({}), certified=certified)
-    job = supply_and_load.Job(cast(po.TuningResult, best), study, 0.0)
+    cells = {"SettlingTime": [0.1, np.nan], "error": ["", "refused"], "again": [False, True], "breaks": [False, True]}
+    job = supply_and_load.Job(cast(po.TuningResult, best), study, pd.DataFrame(cells), 0.0)
     return dict(zip(*(supply_and_load.main(job)[k] for k in ("name", "value")), strict=True))
 
 
@@ -39,3 +40,9 @@ def test_where_all_settle_nothing_changes() -> None:
     rows = rows_of([0.3, 0.1, 0.2])
     assert (rows["map.never_settle"], rows["map.settling_time.worst"]) == (0, 0.3)
     assert rows["map.settling_time.worst.pressure"] == 1
+
+
+def test_a_cell_that_fails_or_breaks_is_counted_and_never_settles() -> None:
+    rows = rows_of([0.3, 0.1, 0.2])
+    assert (rows["retuned.failed"], rows["retuned.breaks"]) == (1, 1)
+    assert rows["retuned.settling_time.worst"] == np.inf
