@@ -181,10 +181,13 @@ def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
     try:
         x, command = _find_operating_point(loop, case, space, reference.final)
         plant = linear_plant(loop, own, x, {loop.command.name: command})
-        slow = complex(frequency_response(plant, [STATIC_SIGN_FREQUENCY / reference.horizon])[0])
+        slow, faster = frequency_response(plant, STATIC_SIGN_FREQUENCY / reference.horizon * np.array([1.0, 2.0]))
     except (ConvergenceError, InputError, ModelError, np.linalg.LinAlgError):
         return 0.0
-    return float(np.sign(slow.real if abs(slow.real) >= abs(slow.imag) else -slow.imag))
+    if abs(slow.real) >= abs(slow.imag):
+        return float(np.sign(slow.real))
+    # it integrates, with a lag of 90 degrees, or differentiates, with a lead, as where a drifting position counters
+    return float(np.sign(-slow.imag if abs(faster) < abs(slow) else slow.imag))
 
 
 def _parameter_range(space: Space, n: str) -> tuple[float, float]:

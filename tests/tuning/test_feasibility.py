@@ -27,6 +27,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.scenarios import NO_SCENARIOS
 from pneuopt.evaluation.specification import specify
+from pneuopt.models.catalog import s32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
@@ -36,7 +37,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.feasibility import check_feasibility
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.space import search_space
-from pneuopt.tuning.tune import tune
+from pneuopt.tuning.tune import prepare_task, tune
 
 FREE = {"pid.Kp": (1.0, 40.0), "pid.Ki": (5.0, 200.0)}
 CLIP = {"pid.lower": -5.0, "pid.upper": 5.0}
@@ -118,6 +119,24 @@ def test_an_integrating_plant_has_a_sign_too() -> None:
     loop = ClosedLoop(Integrator().system(), PID(limits=False), measured=None)
     given = loop.parameters.with_values({"pid.Kp": -1.0}).with_bounds({"pid.Kp": (-5.0, -0.1)}).freed("pid.Kp")
     assert "wrong sign" in refusal((loop, given), Step(1.0))
+
+
+def test_a_plant_whose_drift_counters_a_slow_command_keeps_its_sign() -> None:
+    """Under dither the mean force on a cylinder changes with its position: at low frequency the speed leads.
+
+    Gains that were tuned are a start like others, and gains of the other sign are still refused.
+    """
+    drive, rig = s32()
+    loop = ClosedLoop(drive.system(), PID(sample_time=1e-3), Dither(100.0), measured="speed")
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
+    start = {"supply.pressure": 7.01325e5, "load.mass": 5.0, "dither.amplitude": 0.9, "pid.Kp": 2.4, "pid.Ki": 100.0}
+    given = (rig.fixed("*") | own).with_values(start | {"pid.lower": -5.0, "pid.upper": 5.0})
+    gains = given.with_bounds({"pid.Kp": (0.2, 60.0), "pid.Ki": (0.5, 400.0)}).freed("pid.Kp", "pid.Ki")
+    prepare_task(loop, Step(0.1, horizon=0.8), gains, specify(SettlingTime()))
+    turned = given.with_values({"pid.Kp": -2.4, "pid.Ki": -100.0})
+    turned = turned.with_bounds({"pid.Kp": (-60.0, -0.2), "pid.Ki": (-400.0, -0.5)}).freed("pid.Kp", "pid.Ki")
+    with pytest.raises(InputError, match="speed rises with valve_voltage"):
+        prepare_task(loop, Step(0.1, horizon=0.8), turned, specify(SettlingTime()))
 
 
 def test_a_dither_above_the_sampling_limit_is_refused_by_its_upper_bound() -> None:
