@@ -4,7 +4,9 @@ Friction's sign and a valve's edges are sharp; a model rounds them, for its inte
 the log: a wide one creeps where the drive sticks and hides a dead zone, a narrow one takes many integration steps. So
 each width that nobody has stated is narrowed, or else widened, as long as that lowers the cost of a short search with
 loose gaps (problems/identify/foreign_rig.py); a search at a wide width, followed by narrower ones, would stay in the
-optimum of the wide one. A width is stated where its parameter differs from the model's own, in its value or its source.
+optimum of the wide one. A wider one must explain the logs: where the model lacks a term, it would take the term's
+place (problems/identify/seal_friction.py). A width is stated where its parameter differs from the model's own, in its
+value or its source.
 """
 
 from collections.abc import Sequence, Set
@@ -43,6 +45,9 @@ MIN_RELATIVE_FALL = 2e-3
 # width over what it hides [1], above which it is narrowed even where the cost does not fall: above .25 a rounded edge
 # shifts the dead zone that it is fitted with
 MAX_HIDING_SHARE = 0.25
+# squared residuals over the noise's [1] up to which a wider one counts: above it the model lacks something that a wide
+# one would hide, as viscous friction that is held at zero; below 2 the tails of the noise alone refuse it
+MAX_WIDENED_MISFIT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +68,12 @@ class _Trial:
 
     @property
     def significant_fall(self) -> float:
-        noise = max(1.0, 2 * self.cost / max(1, self.count))
-        return max(0.5 * SIGNIFICANT_FALL * noise, MIN_RELATIVE_FALL * self.cost)
+        return max(0.5 * SIGNIFICANT_FALL * max(1.0, self.misfit), MIN_RELATIVE_FALL * self.cost)
+
+    @property
+    def misfit(self) -> float:
+        """Squared residuals over the noise's [1]."""
+        return 2 * self.cost / max(1, self.count)
 
 
 def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[ChosenWidth, ...]]:
@@ -174,7 +183,11 @@ def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> b
     """Whether tighter gaps, too, prefer a width to the given one."""
     if best is given:
         return True
-    return _is_better(width, *(race.run(t.widths, race.confirming_stages) for t in (best, given)))
+    trial, other = (race.run(t.widths, race.confirming_stages) for t in (best, given))
+    is_wider = trial.widths[width.name] > other.widths[width.name]
+    if is_wider and other.cost < inf and trial.misfit > MAX_WIDENED_MISFIT:
+        return False
+    return _is_better(width, trial, other)
 
 
 def _is_better(width: Width, trial: _Trial, other: _Trial) -> bool:

@@ -156,8 +156,11 @@ class ParameterSet(Mapping[str, Parameter]):
         return self._with_parameters({n: replace(self[n], per_log=True) for n in self.match_names(*patterns)})
 
     def with_values(self, values: Mapping[str, float]) -> "ParameterSet":
-        """Give the named parameters new values, by copy; one outside its bounds is an error that names it."""
-        return self._with_parameters({n: self._replace_fields(n, value=float(v)) for n, v in values.items()})
+        """Give the named parameters new values, by copy; one outside its bounds is an error that names it.
+
+        The sources of the old values go with them.
+        """
+        return self._with_parameters({n: self._replace_fields(n, value=float(v), source="") for n, v in values.items()})
 
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> "ParameterSet":
         """Give the named parameters new bounds, by copy."""
@@ -179,7 +182,7 @@ class ParameterSet(Mapping[str, Parameter]):
         rows = {n: [getattr(p, f) for f in fields] for n, p in self.items()}
         return pd.DataFrame.from_dict(rows, orient="index", columns=fields)
 
-    def _replace_fields(self, name: str, **fields: float) -> Parameter:
+    def _replace_fields(self, name: str, **fields: float | str) -> Parameter:
         try:
             return replace(self[name], **fields)  # type: ignore[arg-type]
         except InputError as error:

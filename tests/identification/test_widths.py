@@ -1,7 +1,5 @@
 """The widths over which a model rounds its kinks are chosen by the logs, unless the user states them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -68,7 +66,7 @@ def test_a_stated_width_stays_and_a_failure_names_a_better_one() -> None:
 def test_a_width_is_stated_by_its_source_even_at_the_usual_value() -> None:
     system, log = po.ForceDrive(po.Stribeck()).system(), sticking()
     usual = system.parameters.with_values({"load.mass": 5.0}).freed(*FREE)
-    stated = usual | po.ParameterSet({WIDTH: replace(usual[WIDTH], source="")})
+    stated = usual.with_values({WIDTH: usual.value(WIDTH)})
     assert choose_widths(problem(system, log, stated))[1] == ()
     chosen, widths = choose_widths(problem(system, log, usual))
     assert len(widths) == 1
@@ -81,6 +79,20 @@ def test_a_log_that_slides_keeps_or_gets_the_width_of_its_friction(width: float,
     system = po.ForceDrive(po.Stribeck()).system()
     found = choose_widths(problem(system, sliding(width), system.parameters.freed(*FREE)))[1]
     assert found[0].value == pytest.approx(chosen)
+
+
+def test_a_width_does_not_take_the_place_of_a_term_that_the_model_lacks() -> None:
+    """Friction that rises with the speed looks like a wide sign to a model without viscous friction."""
+    system = po.MotionDrive(po.Coulomb()).system()
+    t = np.arange(3000) * 1e-3
+    speed = 0.01 * np.sin(2 * np.pi * t) * np.where(t < 1.5, 1.0, 1.5)
+    given = po.Trajectory(t, {"speed": speed, "pressure_a": np.full(len(t), 2e5)})
+    truth = system.parameters.with_values({"friction.coulomb": 5.0, "friction.viscous": 400.0})
+    force = po.simulate(system, given, truth)["force"]
+    noisy = force + 0.01 * np.random.default_rng(2).standard_normal(len(t))
+    log = po.Experiment(given.with_columns({"force": noisy}), {"force": 0.01}, name="rubbed")
+    lacking = system.parameters.with_values({"friction.viscous": 0.0}).freed("friction.coulomb")
+    assert choose_widths(problem(system, log, lacking))[0].parameters.value(WIDTH) <= 1e-3
 
 
 def test_a_width_too_narrow_for_the_log_rate_is_widened_in_place_of_a_refusal() -> None:
