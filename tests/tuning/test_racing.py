@@ -16,6 +16,7 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.method import TuningTask
+from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race
 from pneuopt.tuning.racing import Racing, RacingResult, run_racing
 from pneuopt.tuning.simulator import Simulator
@@ -109,6 +110,31 @@ def test_a_start_that_lags_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert begun == [2, 1]
     assert (found.starts, found.agreeing) == (2, 1)
     assert phases[1][-1] == "fine samples"
+
+
+def test_gradients_see_fine_samples_and_cut_responses_only_where_that_saves_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Coarse samples are gamed, and a response that is cut ends at another operating point, with other margins."""
+    seen = list[tuple[float, float]]()
+
+    def note(_: Polish, unit: np.ndarray, on: Simulator, iterations: int) -> tuple[np.ndarray, int]:
+        assert iterations == 3
+        seen.append((on.grids[0].t[-1], on.grids[0].spacing))
+        return unit, 0
+
+    monkeypatch.setattr(Polish, "improve", note)
+    _, simulator = posed(Dither(500.0))
+    whole, fine = STEP.horizon, simulator.grids[0].spacing
+    assert simulator.coarse(SPEC).grids[0].spacing > 1.5 * fine
+    monkeypatch.setattr("pneuopt.tuning.racing.CUT_SETTLING_TIMES", 0.0)
+    for least, expected in ((0.5, whole), (0.3, 0.3 * whole)):
+        monkeypatch.setattr("pneuopt.tuning.racing.LEAST_CUT", least)
+        seen.clear()
+        search(Racing(members=8, trials=60, polish=3), dither=Dither(500.0))
+        assert len(seen) >= 2
+        assert {spacing for _, spacing in seen} == {fine}
+        assert [end for end, _ in seen] == pytest.approx([expected] * len(seen), abs=fine)
 
 
 def test_the_result_says_how_many_starts_agree() -> None:
