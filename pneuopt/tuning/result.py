@@ -59,10 +59,10 @@ class TuningResult:
     status : Status
     stats : mapping of str to float
         "seconds", "deviation.SettlingTime" and so on (the largest |claimed - certified|), and the search's own:
-        "margin", "optimum" (before rounding), "simulations", and of several starts "starts", "starts_converged",
-        "starts_agreeing", those that end in the best optimum, "starts_optima", the optima that they found,
-        "starts_spread", the relative excess of the worst of them, and "starts_unseen", the chance that one start more
-        finds another optimum (Boender and Rinnooy Kan);
+        "margin", "optimum" (before rounding, where a search found it), "simulations", and of several starts "starts",
+        "starts_converged", "starts_agreeing", those that end in the best optimum, "starts_optima", the optima that they
+        found, "starts_spread", the relative excess of the worst of them, and "starts_unseen", the chance that one start
+        more finds another optimum (Boender and Rinnooy Kan);
         "friction_slope[0 to 0.2]" and so on, the slope of friction with which that case's margins are read [N s/m];
         where the given gains stand "rejected.pid.Kp" and so on, "contacts" where a response ran into an end stop, and
         "fails_late" where only what comes after a horizon refuses the design.

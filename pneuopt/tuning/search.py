@@ -170,7 +170,7 @@ class Search:
         return replace(self.task, references=steps, spec=spec)
 
     def restate(self, found: SearchResult) -> SearchResult:
-        """A result of a search over a longer horizon, with the objective over the horizon asked for."""
+        """A point that was found over another horizon, or by no search, with its objective over the one asked for."""
         values = to_records(self.simulator.values(found.point[None], self.spec))[0]
         return replace(found, stats={**found.stats, "optimum": self.spec.objective(values)})
 
@@ -233,7 +233,7 @@ class Search:
     def certify_point(self, point: Array) -> TuningResult:
         """Round a point and certify it."""
         rounded = self.space.round_point(point, self.method.digits) if self.method.digits else point
-        found = SearchResult(rounded, Status(Code.CONVERGED), (), {"optimum": np.inf})
+        found = self.restate(SearchResult(rounded, Status(Code.CONVERGED), (), {}))
         return self.certifier.certify(self.simulator, found, rounded)
 
     def with_specification(self, spec: Specification, method: Method) -> "Search":

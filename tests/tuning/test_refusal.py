@@ -61,6 +61,7 @@ def test_a_design_of_the_second_search_is_the_answer_where_it_holds() -> None:
     assert np.isfinite(found.certified.loc["SettlingTime"].max())
     assert found.parameters.value("pid.Ki") > 1.0
     assert "the first search's design was refused (it hunts); better ones may exist" in found.status.sentences
+    assert found.stats["optimum"] == pytest.approx(found.requirements["claimed"]["SettlingTime"], rel=1e-6)
 
 
 @pytest.mark.usefixtures("_refuses")
