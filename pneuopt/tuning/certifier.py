@@ -12,6 +12,8 @@ from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate
 from pneuopt.evaluation.requirements import (
     METRICS,
     REQUIREMENT_KINDS,
+    RiseTime,
+    SettlingTime,
     SteadyStateError,
     describe_value,
     metric_name,
@@ -38,6 +40,11 @@ if TYPE_CHECKING:
 MAX_CERTIFIED_EXCESS = 0.01
 # Defects that a status tells: fewer hide that there are several; more bury the remedy.
 MAX_DEFECTS_TOLD = 3
+# What a design does that has no value of a metric, in words; any other "has no" such metric.
+WORDS_WITHOUT_VALUE = {
+    SettlingTime.metric.name: "does not settle within its horizon",
+    RiseTime.metric.name: "does not reach 90 % of its step within its horizon",
+}
 TABLE_METRICS = tuple(kind.metric.name for kind in REQUIREMENT_KINDS if kind.metric.headline)
 
 
@@ -144,7 +151,9 @@ class Certifier:
             verdict = f"{n} is {value}{self._worst_case(certified, n)}, {allowed}, {claim_text}"
             return Status(Code.NOT_CERTIFIED, (verdict, f"give {n} more room"))
         for n in (metric_name(q) for q in spec.weights if np.isnan(proof[metric_name(q)])):
-            verdict = f"{n} has no value{self._worst_case(certified, n)}, claimed {claim[n]:.6g}"
+            claim_text = "" if np.isnan(claim[n]) else f", claimed {claim[n]:.6g}"
+            lack = WORDS_WITHOUT_VALUE.get(n, f"has no {n}")
+            verdict = f"the design found {lack}{self._worst_case(certified, n)}{claim_text}"
             return Status(Code.NOT_CERTIFIED, (verdict, "give the limits more room, or lengthen the horizon"))
         ours, theirs = spec.objective(proof), spec.objective(claim)
         if not objectives_agree(ours, theirs, found.stats["optimum"], spec.resolution):

@@ -126,6 +126,26 @@ def test_every_kind_has_a_resolution_far_below_what_is_asked_for() -> None:
     assert all(0 < kind.metric.resolution <= 1e-5 for kind in REQUIREMENT_KINDS)
 
 
+@pytest.mark.parametrize(("kind", "lack"), [(SettlingTime, "does not settle"), (RiseTime, "does not reach 90 %")])
+def test_a_design_without_the_objectives_value_is_refused_in_words(kind: type[Requirement], lack: str) -> None:
+    """The search over a longer horizon may hand out what does not settle within the one asked for."""
+    refused = search(kind()).certify_point(np.array([0.5, 0.3])).status
+    assert refused.code is Code.NOT_CERTIFIED
+    assert refused.sentences[0].startswith(f"the design found {lack}")
+    assert refused.sentences[0].endswith("within its horizon")
+    two = search(kind(), scenarios={"fast": FAST}).certify_point(np.array([0.5, 0.3])).status
+    assert two.sentences[0].endswith("within its horizon at 0 to 1")
+
+
+def test_a_value_that_only_the_search_has_is_told() -> None:
+    tuning, never = search(SettlingTime()), np.array([0.5, 0.3])
+    found = SearchResult(never, Status(Code.CONVERGED), (), {"optimum": 0.5})
+    row = {**tuning.simulator.table(never, tuning.spec)[0], "SettlingTime": 0.5}
+    forged: Any = type("Claims", (), {"cases": tuning.simulator.cases, "table": lambda *_: [row]})()
+    refused = tuning.certifier.certify(forged, found, never).status
+    assert refused.sentences[0] == "the design found does not settle within its horizon, claimed 0.5"
+
+
 def test_a_simulation_that_stops_certifies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_args: Any, **_options: Any) -> Any:
         raise ConvergenceError("the simulation stopped after t = 0.1 s", None)
