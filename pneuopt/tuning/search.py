@@ -181,16 +181,21 @@ class Search:
         return Simulator(task.loop, task.references, task.space, task.scenarios, task.spec)
 
     def find(self, margin: float, start: Array, attempt: int) -> SearchResult:
-        """Search, and search again on closer samples where the response found is too fast for those of the search."""
+        """Search, and search again where the response found is too fast for the samples, or the steps, of the search.
+
+        Shorter steps leave an optimum near the one that longer steps found, so that search is as one after a refusal.
+        """
         spec = self.tighten(margin)
         found = self.method.find(self.task, self.simulator, spec, start, attempt, self.progress)
         for _ in range(MAX_REFINED_SEARCHES):
-            finer = self._resolve(found.point) if found.is_complete else self.simulator
-            if finer is self.simulator:
+            coarser = self.simulator
+            finer = self._resolve(found.point) if found.is_complete else coarser
+            if finer is coarser:
                 break
             vars(self)["simulator"] = finer
             if "simulations" in found.stats:  # otherwise the method has samples of its own
                 self.progress("the response is too fast for the samples of the search; searching again on closer ones")
+                attempt = attempt if finer.grids is not coarser.grids else max(1, attempt)
                 found = self.method.find(self.task, finer, spec, found.point, attempt, self.progress)
         return found
 

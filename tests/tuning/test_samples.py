@@ -1,5 +1,7 @@
 """The samples of a search follow the response, and a claim holds on them before it is certified or refused."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,13 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import IAE, ITAE, MaxSensitivity, Overshoot, Requirement, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import SecondOrder
+from pneuopt.quantities.status import Code, Status
+from pneuopt.tuning.method import SearchResult
 from pneuopt.tuning.racing import Racing
+from pneuopt.tuning.search import Search
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
-from pneuopt.tuning.tune import tune
+from pneuopt.tuning.tune import prepare_task, tune
 
 STEP = Step(1.0, horizon=20.0)
 FREE = {"pid.Kp": (0.01, 20.0), "pid.Ki": (0.1, 400.0), "pid.Kd": (0.0, 1.0), "pid.Tf": (1e-3, 0.05)}
@@ -43,6 +48,28 @@ def test_slow_responses_need_no_more_samples() -> None:
     _, simulator = problem(Step(1.0, horizon=2.0))
     assert simulator.refine(np.array([0.05, 1.0, 0.0, 0.01])) is simulator
     assert simulator.refine(simulator.space.start) is not simulator
+
+
+def test_steps_that_change_a_claim_are_halved_and_a_short_search_goes_on_from_its_point() -> None:
+    step = Step(1.0, horizon=2.0)
+    loop, simulator = problem(step)
+    method, point = Racing(), np.array([0.05, 1.0, 0.0, 0.01])
+    spec, calls, agree = specify(ITAE(), [IAE(1.0)]), list[tuple[Simulator, int]](), iter([False, True])
+
+    def find(*given: Any) -> SearchResult:
+        calls.append((given[2], given[5]))
+        return SearchResult(given[4], Status(Code.CONVERGED), (), {"simulations": 1.0, "optimum": 1.0})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Racing, "find", find)
+        patch.setattr(Search, "_agree", lambda *_: next(agree))
+        task = prepare_task(loop, step, simulator.space.parameters, spec)
+        found = Search(task, method, lambda _: None).find(method.margin, point, 0)
+    (first, full), (second, short) = calls
+    assert (full, short) == (0, 1)
+    assert second.grids is first.grids
+    assert second.substeps[0] >= 2 * first.substeps[0]
+    assert found.point.tolist() == point.tolist()
 
 
 @pytest.mark.parametrize("minimise", [SettlingTime(), ITAE()])
