@@ -11,11 +11,16 @@ import hypothesis
 import numpy as np
 import pytest
 
+from pneuopt.control.dither import Dither
+from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.reference import Step
 from pneuopt.dynamics.compiled import compiler
 from pneuopt.dynamics.compiled import pieces as kernels
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define
+from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.intersample import Intersample
@@ -197,6 +202,21 @@ def run() -> Run:
         return grid, np.array(states).T, np.array(outputs).T
 
     return march
+
+
+@pytest.fixture
+def light_cylinder() -> tuple[ClosedLoop, ParameterSet, Step]:
+    """A light body at high pressure, with gains whose command crosses the valve's dead zone within a dither period."""
+    drive, hardware = t32()
+    loop = ClosedLoop(drive.system(), PID(), Dither(1000 / (2 * np.pi)), feedforward=Feedforward())
+    p = loop.complete(hardware).with_values(
+        {"pid.Kp": 28.47, "pid.Ki": 264.7, "pid.Kd": 0.3219, "pid.Tf": 5e-4, "pid.b": 0.984, "pid.c": 0.0}
+        | {"pid.Tt": 0.1, "pid.lower": -5.0, "pid.upper": 5.0, "dither.offset": -0.34}
+        | {"feedforward.gain": -20.0, "feedforward.time": 0.00401}
+        | {f"friction.{n}": 0.7 * hardware.value(f"friction.{n}") for n in ("coulomb", "static", "viscous")}
+        | {"load.mass": 0.7 * hardware.value("load.mass"), "supply.pressure": 1.1 * hardware.value("supply.pressure")}
+    )
+    return loop, p, Step(0.2, horizon=0.5, start={"position": 0.05, "pressure_b": 3.5e5})
 
 
 @pytest.fixture(scope="session")

@@ -1,12 +1,13 @@
 """Margins at the operating points that a step passes; what mutants of them would leave out."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import Dither
-from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -15,7 +16,6 @@ from pneuopt.dynamics.system import System, define
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.operating_points import operating_point_margins, operating_points, worst_margins
-from pneuopt.models.catalog import t32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import LuGre, Stribeck
 from pneuopt.models.linear import SecondOrder
@@ -87,18 +87,9 @@ def test_under_dither_the_points_are_means() -> None:
     assert 0.999 * mean <= points[1].x[1] < response["speed"].max()
 
 
-def test_margins_do_not_jump_where_a_dither_begins() -> None:
-    """A light body at high pressure whose command crosses the dead zone within a dither period."""
-    drive, given = t32()
-    loop = ClosedLoop(drive.system(), PID(), Dither(1000 / (2 * np.pi)), feedforward=Feedforward())
-    p = loop.complete(given).with_values(
-        {"pid.Kp": 28.47, "pid.Ki": 264.7, "pid.Kd": 0.3219, "pid.Tf": 5e-4, "pid.b": 0.984, "pid.c": 0.0}
-        | {"pid.Tt": 0.1, "pid.lower": -5.0, "pid.upper": 5.0, "dither.offset": -0.34}
-        | {"feedforward.gain": -20.0, "feedforward.time": 0.00401}
-        | {f"friction.{n}": 0.7 * given.value(f"friction.{n}") for n in ("coulomb", "static", "viscous")}
-        | {"load.mass": 0.7 * given.value("load.mass"), "supply.pressure": 1.1 * given.value("supply.pressure")}
-    )
-    step = Step(0.2, horizon=0.2, start={"position": 0.05, "pressure_b": 3.5e5})
+def test_margins_do_not_jump_where_a_dither_begins(light_cylinder: tuple[ClosedLoop, ParameterSet, Step]) -> None:
+    loop, p, step = light_cylinder
+    step = replace(step, horizon=0.2)
     found = [
         operating_point_margins(loop, q, step, respond(loop, step, q)).set_index("point")[["t", *MARGINS]]
         for q in (p.with_values({"dither.amplitude": a}) for a in (0.0, 1e-12, 1e-3))

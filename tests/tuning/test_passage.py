@@ -7,7 +7,6 @@ import pytest
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
@@ -88,18 +87,11 @@ def test_search_and_certificate_agree_on_random_gains(
     assert compared >= 2
 
 
-def test_a_searchs_margins_do_not_jump_where_a_dither_begins() -> None:
-    """Gains whose command crosses the dead zone within a dither period, so that its mean says nothing of it."""
-    drive, hardware = t32()
-    loop = ClosedLoop(drive.system(), PID(), Dither(1000 / (2 * np.pi)), feedforward=Feedforward())
-    p = loop.complete(hardware).with_values(
-        {"pid.Kp": 28.47, "pid.Ki": 264.7, "pid.Kd": 0.3219, "pid.Tf": 5e-4, "pid.b": 0.984, "pid.c": 0.0}
-        | {"pid.Tt": 0.1, "pid.lower": -5.0, "pid.upper": 5.0, "dither.offset": -0.34}
-        | {"feedforward.gain": -20.0, "feedforward.time": 0.00401}
-        | {f"friction.{n}": 0.7 * hardware.value(f"friction.{n}") for n in ("coulomb", "static", "viscous")}
-        | {"load.mass": 0.7 * hardware.value("load.mass"), "supply.pressure": 1.1 * hardware.value("supply.pressure")}
-    )
-    step = Step(0.2, horizon=0.5, start={"position": 0.05, "pressure_b": 3.5e5})
+def test_a_searchs_margins_do_not_jump_where_a_dither_begins(
+    light_cylinder: tuple[ClosedLoop, ParameterSet, Step],
+) -> None:
+    """The command crosses the dead zone within a dither period, so that its mean says nothing of it."""
+    loop, p, step = light_cylinder
     space = search_space(loop, p.with_bounds({"dither.amplitude": (0.0, 1.0)}).freed("dither.amplitude"))
     simulator = Simulator(loop, [step], space, spec=SPEC)
     tables = [simulator.table(np.array([a]), SPEC)[0] for a in (0.0, 1e-12, 1e-3)]
