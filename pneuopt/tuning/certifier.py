@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 MAX_CERTIFIED_EXCESS = 0.01
 # Defects that a status tells: fewer hide that there are several; more bury the remedy.
 MAX_DEFECTS_TOLD = 3
-# What a design does that has no value of a metric, in words; any other "has no" such metric.
+# What is said of a design that has no value of a metric; where nothing stands here, it "has no" that metric.
 WORDS_WITHOUT_VALUE = {
     SettlingTime.metric.name: "does not settle within its horizon",
     RiseTime.metric.name: "does not reach 90 % of its step within its horizon",

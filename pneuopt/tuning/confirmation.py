@@ -144,12 +144,12 @@ def _minimise_excess(
     return space.from_unit(np.clip(found.x, 0.0, 1.0)), count
 
 
-def describe_confirmation(found: Confirmation) -> str:
-    """Say in words by what an infeasible answer is confirmed.
+def describe_confirmation(simulations: int) -> str:
+    """Say in words by what an infeasible answer, or a refusal, is confirmed.
 
     Examples
     --------
-    >>> describe_confirmation(Confirmation(np.zeros(2), 0.1234, 3600))
+    >>> describe_confirmation(3600)
     "a second search, SciPy's differential evolution over 3600 simulations"
     """
-    return f"a second search, SciPy's differential evolution over {found.simulations} simulations"
+    return f"a second search, SciPy's differential evolution over {simulations} simulations"

@@ -1,8 +1,9 @@
 """`Passage`: where simulated lanes begin, move fastest and end; `PointFinder` makes their operating points of it.
 
-The points are those of `operating_points` in evaluation/operating_points.py. A search keeps no states along a response:
-the fastest sample is read off the outputs, and the states there come from a second run up to it. Under dither that run
-goes through the period around it, and a further one through the period after the end, off which the ripple is read.
+The points are those of `operating_points` in evaluation/operating_points.py. A search keeps few states
+along a response: the fastest sample is read off the outputs, and the states there come from a second run, from the last
+kept ones up to it. Under dither further runs go through the period around it, and through the one after the end, off
+which the ripple is read.
 """
 
 from collections.abc import Iterator, Sequence

@@ -12,7 +12,7 @@ import numpy as np
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.certifier import certified_objective
-from pneuopt.tuning.confirmation import Confirmation, describe_confirmation, find_candidates
+from pneuopt.tuning.confirmation import describe_confirmation, find_candidates
 from pneuopt.tuning.relaxation import limit_excess
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, end_point
@@ -43,7 +43,7 @@ def confirm_refusal(search: Search, refused: TuningResult) -> TuningResult:
         sentences = (f"nothing found so far: {refused.status.verdict}", "run again for an answer")
         return replace(refused, status=Status(Code.INTERRUPTED, sentences))
     failed = f"of {len(points)} designs that it finds none is certified" if points else "finds none that comes to rest"
-    words = f"{describe_confirmation(Confirmation(search.space.start, np.inf, count))}, {failed}, either"
+    words = f"{describe_confirmation(count)}, {failed}, either"
     stats = {**refused.stats, "confirmation.simulations": float(count)}
     return replace(refused, status=refused.status.with_details(words), stats=stats)
 

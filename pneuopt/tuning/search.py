@@ -358,7 +358,7 @@ def relax(search: Search, result: TuningResult) -> TuningResult:
         )
     counts = {"confirmation.simulations": float(second.simulations), "confirmation.share": second.share}
     closest = replace(closest, stats={**result.stats, **closest.stats, **counts})
-    return with_relaxations(closest, rows, describe_confirmation(second))
+    return with_relaxations(closest, rows, describe_confirmation(second.simulations))
 
 
 def _rank_points(search: Search, *points: Array) -> list[Array]:
