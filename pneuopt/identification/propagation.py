@@ -70,10 +70,10 @@ def propagate_error(result: IdentificationResult, function: Callable[[ParameterV
     return PropagatedValue(value, spread, *confidence_interval(value, spread, log=False, dof=dof))
 
 
-def propagate_deviations(
+def propagate_intervals(
     result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]
 ) -> tuple[Array, Array]:
-    """Compute several figures at once with their standard deviations, as a curve over a grid.
+    """Compute several figures at once with their 95 % confidence intervals, as a curve over a grid.
 
     Parameters
     ----------
@@ -83,11 +83,15 @@ def propagate_deviations(
 
     Returns
     -------
-    (ndarray, ndarray)
-        Each of shape (n,).
+    values : ndarray, shape (n,)
+    intervals : ndarray, shape (n, 2)
+        NaN where a figure depends on a parameter without an interval.
     """
     values, slopes = _linearise(result, function)
-    return values, _deviations(result, slopes)
+    dof = result.estimates["dof"][result.covariance.index].to_numpy(dtype=float)
+    spreads, degrees = _deviations(result, slopes), [min(dof[row != 0], default=math.inf) for row in slopes]
+    every = zip(values.tolist(), spreads.tolist(), degrees, strict=True)
+    return values, np.array([confidence_interval(v, s, log=False, dof=d) for v, s, d in every])
 
 
 def _linearise(result: IdentificationResult, function: Callable[[ParameterValues], ArrayLike]) -> tuple[Array, Array]:

@@ -9,10 +9,10 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import System, names, parameter_vector
-from pneuopt.identification.propagation import propagate_deviations
+from pneuopt.identification.propagation import propagate_intervals
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment, differentiate
-from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_POINTS, NORMAL_QUANTILE_95, axes_grid, legend_above
+from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_POINTS, axes_grid, legend_above
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -29,10 +29,11 @@ def plot_friction(system: System, result: IdentificationResult, experiments: Seq
     """The friction force that the logs imply against speed, with the fitted curve and its 95 % band on top.
 
     For a `MotionDrive` the force as measured, offset and pressure and all. For a drive with a mass what pushes it (the
-    logged force or pressures, less the load) less mass times acceleration, each derivative a local slope of the log:
-    the fit has no part in the points but for what is not logged, and the load. Where the motion reverses there are
-    none, for a slope taken across the jump is none. The curve is that of steady motion, at the median
-    of the pressures, and of the size of a logged force, for laws that depend on them.
+    logged force or pressures, less the load) less mass times acceleration. The acceleration is the fitted run's and
+    the local slope of what the log deviates from it: so the points of a perfect fit lie on its friction at any speed,
+    where a slope of the log itself would round off fast motion, and a misfit slower than the slope's window is seen
+    whole. Where the motion reverses there are none, for a slope taken across the jump is none. The curve is that of
+    steady motion, at the median of the pressures, and of the size of a logged force, for laws that depend on them.
 
     Parameters
     ----------
@@ -119,11 +120,17 @@ def _drive_points(
     own = {n.partition("[")[0]: v for n, v in found.items() if n.endswith(f"[{name}]")}
     known = {n: v for n, v in experiment.conditions.items() if n in result.parameters}
     parameters = result.parameters.with_values({**own, **known})
-    speed = log[axis.speed] if axis.speed in log else _smooth_derivative(log.t, log[axis.position])
-    seen = {n: log[n] if n in log else run[n] for n in names(system.states)}
+    deviation = {n: log[n] - run[n] for n in (axis.speed, axis.position) if n in log}
+    if axis.speed not in deviation:
+        deviation[axis.speed] = _smooth_derivative(log.t, deviation[axis.position])
+    speed = run[axis.speed] + deviation[axis.speed]
+    states, inputs = names(system.states), {q: log[q] for q in names(system.inputs)}
+    seen = {n: log[n] if n in log else run[n] for n in states}
     idle = {n: np.zeros(len(log)) for n in seen if n == axis.speed or n.startswith("friction.")}
-    pushed = _state_rates(system, parameters, {**seen, **idle}, {q: log[q] for q in names(system.inputs)})[axis.speed]
-    force = parameters.value(axis.inertia) * (pushed - _smooth_derivative(log.t, speed))
+    pushed, moves = (
+        _state_rates(system, parameters, x, inputs)[axis.speed] for x in ({**seen, **idle}, {n: run[n] for n in states})
+    )
+    force = parameters.value(axis.inertia) * (pushed - moves - _smooth_derivative(log.t, deviation[axis.speed]))
     reverses = np.convolve(np.abs(np.diff(np.sign(speed), prepend=np.nan)) > 0, np.ones(2 * SLOPE_SAMPLES), "same")
     return speed, np.where(reverses > 0, np.nan, force)
 
@@ -144,10 +151,9 @@ def _draw_curve(
         moved = {n: replace(result.parameters[n], value=values[n], lower=-math.inf, upper=math.inf) for n in shared}
         return _steady_friction(system, result.parameters | ParameterSet(moved), usual, grid)
 
-    force, spread = propagate_deviations(result, friction)
-    if np.isfinite(spread).all():
-        low, high = force - NORMAL_QUANTILE_95 * spread, force + NORMAL_QUANTILE_95 * spread
-        axes.fill_between(grid, low, high, color=BLUE, alpha=0.3, lw=0, label="95 % band")
+    force, intervals = propagate_intervals(result, friction)
+    if np.isfinite(intervals).all():
+        axes.fill_between(grid, *intervals.T, color=BLUE, alpha=0.3, lw=0, label="95 % band")
     axes.plot(grid, force, color=BLUE, lw=1.2, label="fitted")
 
 

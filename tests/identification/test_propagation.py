@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import t as student
 
 from pneuopt.identification.identify import identify
-from pneuopt.identification.propagation import ParameterValues, propagate_deviations, propagate_error
+from pneuopt.identification.propagation import ParameterValues, propagate_error, propagate_intervals
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import Stribeck
@@ -58,9 +58,9 @@ def test_it_is_the_delta_method() -> None:
     g[order.index("friction.static")], g[order.index("friction.coulomb")] = 1 / c, -s / c**2
     assert found.value == pytest.approx(s / c)
     assert found.stderr == pytest.approx(math.sqrt(g @ C @ g), rel=1e-5)
-    values, spread = propagate_deviations(fit, lambda p: [ratio(p), 7.0])
+    values, intervals = propagate_intervals(fit, lambda p: [ratio(p), 7.0])
     assert values.tolist() == [found.value, 7.0]
-    assert spread.tolist() == [found.stderr, 0.0]
+    assert intervals.tolist() == [[found.ci_low, found.ci_high], [7.0, 7.0]]
 
 
 def test_what_hangs_on_a_parameter_without_an_interval_has_none() -> None:

@@ -187,7 +187,14 @@ def check_map(name: str, law: FrictionModel) -> None:
     drive, true, run, log = logged(name)
     empty = pd.DataFrame(dtype=float)
     result = IdentificationResult(
-        true, pd.DataFrame({"value": []}, dtype=float), empty, empty, {"run": run}, Status(Code.CONVERGED), {}, {}
+        true,
+        pd.DataFrame({"value": [], "dof": []}, dtype=float),
+        empty,
+        empty,
+        {"run": run},
+        Status(Code.CONVERGED),
+        {},
+        {},
     )
     (axes,) = plot_friction(drive.system(), result, [Experiment(log, name="run")]).axes
     drawn = {str(line.get_label()): np.asarray(line.get_xydata(), dtype=float) for line in axes.lines}

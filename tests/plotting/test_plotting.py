@@ -3,30 +3,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.typing import NDArray
 
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import margins
-from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment, split
-from pneuopt.models.drive import ForceDrive, MotionDrive
-from pneuopt.models.friction import Coulomb, LuGre
-from pneuopt.models.linear import FirstOrder
-from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.plotting import (
     Response,
-    friction_force,
-    has_friction_map,
     plot_bode,
     plot_correlation,
     plot_fit,
-    plot_friction,
     plot_map,
     plot_prediction,
     plot_residuals,
@@ -34,53 +23,13 @@ from pneuopt.plotting import (
     save_figure,
 )
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from tests.plotting.fits import TRUTH, fit_of, fitted, line, texts
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
-DRIVE = ForceDrive(Coulomb())
-TRUTH = DRIVE.parameters.with_values(
-    {"load.mass": 6.0, "load.force": 4.0, "friction.coulomb": 25.0, "friction.viscous": 40.0}
-)
 TRIPLE = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])
-
-
-def table(covariance: Mapping[str, float]) -> pd.DataFrame:
-    """Uncorrelated estimates of these variances."""
-    return pd.DataFrame(np.diag(list(covariance.values())), index=list(covariance), columns=list(covariance))
-
-
-def fit_of(
-    parameters: ParameterSet, trajectories: Mapping[str, Trajectory], covariance: pd.DataFrame | None = None
-) -> IdentificationResult:
-    """A result with nothing but what a figure shows of it."""
-    covariance = table({}) if covariance is None else covariance
-    values = [parameters.value(n) if n in parameters else np.nan for n in covariance.index]
-    estimates = pd.DataFrame({"value": values}, index=covariance.index, dtype=float)
-    status = Status(Code.CONVERGED)
-    return IdentificationResult(parameters, estimates, covariance, pd.DataFrame(), trajectories, status, {}, {})
-
-
-def fitted(seed: int = 0) -> tuple[Experiment, Trajectory]:
-    t = np.arange(0, 1.0, 2e-3)
-    force = 80 * np.sin(2 * np.pi * 1.5 * t + seed)
-    run = simulate(
-        DRIVE.system(), Trajectory(t, {"force": force}), TRUTH, rtol=1e-6, intersample={"force": Intersample.LINEAR}
-    )
-    return Experiment(Trajectory(t, {"force": force, "position": run["position"]}), name=f"run_{seed}"), run
-
-
-def texts(axes: "Axes") -> str:
-    return f"{axes.get_xlabel()}|{axes.get_ylabel()}|{axes.get_title()}"
-
-
-def line(axes: "Axes", label: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    (found,) = [q for q in axes.lines if q.get_label() == label]
-    return np.asarray(found.get_xdata(), dtype=float), np.asarray(found.get_ydata(), dtype=float)
 
 
 def lag(gain: float) -> Linearisation:
@@ -113,57 +62,6 @@ def test_windows_of_a_log_share_its_axes_and_many_logs_are_spread() -> None:
     assert "3 of 7 logs" in [q.get_text() for q in figure.texts]
     with pytest.raises(InputError, match="2 runs do not match 1 experiments"):
         plot_prediction([run, run], [experiment], label="fitted")
-
-
-def test_the_friction_map_is_that_of_the_equations() -> None:
-    experiment, run = fitted()
-    figure = plot_friction(DRIVE.system(), fit_of(TRUTH, {"run_0": run}), [experiment])
-    speed, force = line(figure.axes[0], "fitted")
-    smoothing = TRUTH.value("friction.smoothing")
-    assert np.allclose(force, 25 * np.tanh(speed / smoothing) + 40 * speed)
-    v, implied = line(figure.axes[0], "from the logs")
-    good = np.isfinite(implied) & (np.abs(v) > 0.1)
-    assert good.sum() > 100
-    error = np.abs(implied - (25 * np.sign(v) + 40 * v))[good]
-    assert np.median(error) < 0.7
-    assert error.max() < 5.0
-    assert texts(figure.axes[0]) == "speed [m/s]|friction force [N]|"
-
-
-def test_the_friction_map_of_a_pneumatic_drive_with_bristles_is_the_stribeck_curve() -> None:
-    drive = PneumaticDrive(friction=LuGre())
-    system = drive.system()
-    inputs = Trajectory(t := np.arange(600) * 1e-3, {"valve_voltage": 1.0 * np.sin(12 * t)})
-    run = simulate(system, inputs, drive.parameters, initial={"position": 0.1})
-    logged = run.select(["position", "pressure_a", "pressure_b"])
-    log = Experiment(logged.with_columns({"valve_voltage": inputs["valve_voltage"]}))
-    (axes,) = plot_friction(system, fit_of(drive.parameters, {"log 1": run}), [log]).axes
-    v, force = line(axes, "fitted")
-    Fc, Fs, vs, B = (
-        drive.parameters.value(f"friction.{n}") for n in ("coulomb", "static", "stribeck_velocity", "viscous")
-    )
-    curve = np.sign(v) * (Fc + (Fs - Fc) * np.exp(-((v / vs) ** 2))) + B * v
-    assert np.allclose(force, curve, atol=0.02 * Fc)
-    speed, implied = line(axes, "from the logs")
-    fast = np.isfinite(implied) & (np.abs(speed) > 4 * vs)
-    assert fast.sum() > 100
-    assert np.median(np.abs(implied - Fc * np.sign(speed) - B * speed)[fast]) < 0.05 * Fc
-
-
-def test_the_friction_maps_band_is_that_of_the_estimates() -> None:
-    experiment, run = fitted()
-    result = fit_of(TRUTH, {"run_0": run}, table({"friction.coulomb": 4.0, "friction.viscous": 25.0}))
-    axes = plot_friction(DRIVE.system(), result, [experiment]).axes[0]
-    (band,) = axes.collections
-    speed, force = line(axes, "fitted")
-    edges = np.asarray(band.get_paths()[0].vertices, dtype=float)
-    for v in (speed[5], speed[-5]):
-        at = edges[np.isclose(edges[:, 0], v)][:, 1]
-        spread = np.sqrt(4.0 * np.tanh(v / TRUTH.value("friction.smoothing")) ** 2 + 25.0 * v**2)
-        assert at.max() - at.min() == pytest.approx(2 * 1.96 * spread, rel=1e-3)
-    assert np.isfinite(force).all()
-    blind = fit_of(TRUTH, {"run_0": run}, table({"friction.coulomb": np.nan, "friction.viscous": 25.0}))
-    assert len(plot_friction(DRIVE.system(), blind, [experiment]).axes[0].collections) == 0
 
 
 def test_residuals_show_what_is_left_in_them() -> None:
@@ -199,23 +97,6 @@ def test_correlations_are_cells_and_never_a_rounded_one() -> None:
         plot_correlation(fit_of(TRUTH, {}, covariance * np.nan))
 
 
-def test_a_rig_shows_its_measured_force() -> None:
-    rig = MotionDrive(Coulomb(), chamber=False)
-    t = np.linspace(0, 1, 50)
-    speed = 0.1 * np.sin(6 * t)
-    measured = 12 * np.sign(speed)
-    experiment = Experiment(Trajectory(t, {"speed": speed, "force": measured}))
-    figure = plot_friction(
-        rig.system(), fit_of(rig.parameters, {"": Trajectory(t, {"force": measured + 1})}), [experiment]
-    )
-    assert np.array_equal(line(figure.axes[0], "from the logs")[1], measured)
-    assert np.array_equal(line(figure.axes[0], "fitted")[1], measured + 1)
-    assert figure.axes[0].get_ylabel() == "force [N]"
-    assert not has_friction_map(FirstOrder().system())
-    with pytest.raises(InputError, match="a friction map is drawn for"):
-        plot_friction(FirstOrder().system(), fit_of(rig.parameters, {}), [experiment])
-
-
 def test_steps_show_band_reference_and_command() -> None:
     t = np.linspace(0, 1, 101)
     run = Trajectory(t, {"speed": 0.2 * (1 - np.exp(-t / 0.1)), "control": 3 * np.exp(-t)})
@@ -239,21 +120,6 @@ def test_steps_show_band_reference_and_command() -> None:
     assert "3 of 4 steps" in [q.get_text() for q in alone.texts]
     with pytest.raises(InputError, match="no response"):
         plot_steps([])
-
-
-def test_friction_along_a_run_is_what_the_balance_of_forces_leaves() -> None:
-    drive, t = PneumaticDrive(friction=LuGre()), np.linspace(0, 1, 400)
-    p = drive.parameters
-    speed, bristle = 0.1 * np.sin(9 * t), 3e-4 * np.sin(5 * t)
-    rest = drive.rest(p)
-    states = {n: np.full(len(t), x) for n, x in rest.states.items()} | {"speed": speed, "friction.bristle": bristle}
-    run = Trajectory(t, {**states, "valve_voltage": 0 * t})
-    g = LuGre().force
-    z = {q.name: ca.SX.sym(q.name) for q in LuGre().states}
-    v, values = ca.SX.sym("v"), {n: ca.SX(q.value) for n, q in LuGre().parameters.items()}
-    force = ca.Function("force", [v, *z.values()], [g(v, z, {}, values).value])
-    expected = np.array(force(speed, bristle)).ravel()
-    assert friction_force(drive.system(), run, p) == pytest.approx(expected, abs=0.02)  # the end stops reach so far
 
 
 def test_steps_show_what_goes_on_inside_where_it_is_known() -> None:
