@@ -152,7 +152,7 @@ class _Search:
         return self._fit(status, time.perf_counter() - began)
 
     def _run_stages(self) -> Status:
-        if self.required_substeps > self.start_substeps:
+        if self._is_too_stiff:
             verdict = f"the model is so stiff that a sample takes {self.required_substeps} integration steps"
             remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
             return Status(Code.NOT_CONVERGED, (verdict, remedy))
@@ -171,6 +171,11 @@ class _Search:
         # gaps that absorb the misfit of the model: the answer depends on their weight
         gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
         return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
+
+    @property
+    def _is_too_stiff(self) -> bool:
+        """Whether a sample of the start takes more integration steps than a search can afford."""
+        return self.required_substeps > self.start_substeps
 
     def _gaps_absorb_misfit(self) -> bool:
         """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""
@@ -333,7 +338,7 @@ class _Search:
         if math.isfinite(equations.cost):
             covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
             prior = equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
-            unidentifiable = tuple(free[i] for i in self._assess(current).unidentifiable)
+            unidentifiable = self._unidentifiable()
         if covariance is not None:
             gaps = self.stage.gap * self.gap_scales
             optimum = Optimum(equations, run, current.nodes, q, keep, gaps, self.substeps)
@@ -351,6 +356,13 @@ class _Search:
             prior,
             optimum=optimum,
         )
+
+    def _unidentifiable(self) -> tuple[str, ...]:
+        """The parameters that the data do not determine; none where the search refused its start, which shows none."""
+        if self._is_too_stiff:
+            return ()
+        free = self.segments.transcription.parameters.free_names
+        return tuple(free[i] for i in self._assess(self.current).unidentifiable)
 
     def _integration_error(self, run: RolloutResult) -> float:
         """Largest change of an output when the steps are halved [noise standard deviations]."""

@@ -77,9 +77,10 @@ class ParameterScaling:
         return np.asarray(np.diag(equations.arrow.corner) > np.where(self.log, MIN_LOG_INFORMATION, 0.0))
 
     def movable(self, z: Array, equations: NormalEquations, reduced: ReducedEquations) -> Mask:
-        """The mask of parameters with an effect on the residuals that are not pressed against a bound."""
+        """The mask of parameters with an effect on the residuals that are neither held nor pressed against a bound."""
         below, above = (z <= self.lower) & (reduced.gradient > 0), (z >= self.upper) & (reduced.gradient < 0)
-        return self.has_effect(equations) & ~(below | above)
+        # a held one may have no gradient that presses it
+        return np.asarray(self.has_effect(equations) & ~(below | above | self.held))
 
     def _to_search_units(self, values: Array) -> Array:
         """Logarithms of log parameters; a bound that is not positive is minus infinity there."""

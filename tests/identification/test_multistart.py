@@ -139,3 +139,22 @@ def test_a_refit_is_taken_only_where_the_logs_do_not_reject_its_held_values(monk
     held, fit = starting.fit_holding_unidentifiable(problem, start)
     assert held.held == {}
     assert fit.status == status
+
+
+def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A one-way log has proposed a static friction of a hundred times Coulomb's: the holding never ended."""
+    calls = 0
+
+    def counted(transcription: Transcription, method: LeastSquares) -> Fit:
+        nonlocal calls
+        calls += 1
+        assert calls < 5
+        return solve_least_squares(transcription, method)
+
+    monkeypatch.setattr(starting, "solve_least_squares", counted)
+    problem = posed(Stribeck())
+    start = problem.candidates()[0]
+    stiff = replace(start, parameters={**start.parameters, "friction.static": 5e4, VELOCITY: 0.5})
+    held, fit = starting.fit_holding_unidentifiable(problem, stiff)
+    assert "so stiff that a sample takes" in fit.status.verdict
+    assert (dict(held.held), fit.unidentifiable, calls) == ({}, (), 1)
