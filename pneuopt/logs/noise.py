@@ -192,12 +192,15 @@ def _quiet_level(off: Array, order: int) -> tuple[float, float]:
     # neighbours share samples: this many count as one
     shared = math.comb(4 * order, 2 * order) / math.comb(2 * order, order) ** 2
     uncertainty = MAD_SPREAD * math.sqrt(shared / off.size)
-    whole = 1.4826 * float(np.median(np.abs(off)))
-    blocks = np.array_split(off, max(1, off.size // BLOCK))
-    if len(blocks) < MIN_BLOCKS:
+    sizes, count = np.abs(off), max(1, off.size // BLOCK)
+    whole = 1.4826 * float(np.median(sizes))
+    if count < MIN_BLOCKS:
         return whole, uncertainty
-    deviations = [1.4826 * float(np.median(np.abs(block))) for block in blocks]
-    quiet = float(np.quantile(deviations, 0.25)) / (1 + QUIET_QUARTILE * uncertainty * math.sqrt(len(blocks)))
+    length, longer = divmod(off.size, count)  # the first blocks are one longer
+    parts = np.split(sizes, [longer * (length + 1)])
+    blocks = parts[0].reshape(longer, length + 1), parts[1].reshape(-1, length)
+    deviations = 1.4826 * np.concatenate([np.median(block, axis=1) for block in blocks])
+    quiet = float(np.quantile(deviations, 0.25)) / (1 + QUIET_QUARTILE * uncertainty * math.sqrt(count))
     return whole if whole < (1 + 4 * uncertainty) * quiet else quiet, uncertainty
 
 
