@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -156,3 +157,54 @@ def test_what_blurs_is_noted_and_no_fault() -> None:
     assert ["clipped" in f.message and not f.fault for f in examine(clipped)] == [True]
     coarse = swing(position=np.round(log["position"] / 5e-3) * 5e-3)
     assert ["levels" in f.message for f in examine(coarse)] == [True]
+
+
+def hunting(frequency: float, rate: float, seconds: float, lag: float = 0.0) -> dict[str, Array]:
+    """A mass under friction that swings; its speed comes late by `lag`."""
+    t = np.arange(round(seconds * rate)) / rate
+    w, rng = 2 * np.pi * frequency, np.random.default_rng(7)
+    size = 0.2 / w
+    force = 20 * np.sign(np.cos(w * t)) + 40 * size * w * np.cos(w * t) - 3 * size * w**2 * np.sin(w * t)
+    position = 0.1 + size * np.sin(w * t) + 1e-5 * rng.standard_normal(t.size)
+    speed = size * w * np.cos(w * (t - lag)) + 1e-3 * rng.standard_normal(t.size)
+    return {"time": t, "position": position, "speed": speed, "force": force}
+
+
+@pytest.mark.parametrize("frequency", [0.1, 1.7, 3.0, 12.5, 20.0])
+@pytest.mark.parametrize(("rate", "seconds"), [(50.0, 60.0), (1000.0, 60.0), (50.0, 1000.0), (5000.0, 4.0)])
+def test_a_right_log_is_sound_at_any_frequency_rate_and_length(frequency: float, rate: float, seconds: float) -> None:
+    """The speed from positions was taken over a hundredth of the log, be that several cycles."""
+    run = hunting(frequency, rate, max(seconds, 2 / frequency), lag=5e-3)
+    t = run.pop("time")
+    assert faults(Experiment(Trajectory(t, run))) == []
+    for channels in (["position", "force"], ["speed", "force"]):
+        assert faults(Experiment(Trajectory(t, run).select(channels))) == []
+
+
+@pytest.mark.parametrize("frequency", [0.3, 1.7, 3.0])
+def test_wrong_signs_and_units_are_seen_in_long_logs_too(frequency: float) -> None:
+    run = hunting(frequency, 500.0, 60.0)
+    t = run.pop("time")
+    alone = Experiment(Trajectory(t, {"position": run["position"], "force": -run["force"]}))
+    assert [f.check for f in examine(alone) if f.fault] == ["work"]
+    for changed in ({"position": -run["position"]}, {"speed": 60 * run["speed"]}, {"position": 1e3 * run["position"]}):
+        log = Experiment(Trajectory(t, {"position": run["position"], "speed": run["speed"], **changed}))
+        assert [f.check for f in examine(log) if f.fault] == ["speed"]
+
+
+def test_a_fault_shows_the_signals_that_contradict_each_other() -> None:
+    log = swing()
+    (told,) = faults(
+        swing(
+            position=-log.trajectory["position"],
+            force=np.zeros(T.size),
+            pressure_a=np.full(T.size, 4e5),
+            pressure_b=np.full(T.size, 4e5),
+        )
+    )
+    found = re.search(r"at (\S+) s the position rises by (\S+) a second, the speed says ([^)]+)\)", told)
+    assert found is not None
+    at, slope, speed = map(float, found.groups())
+    true = 0.3 * np.cos(2 * np.pi * at)
+    assert slope == pytest.approx(-true, rel=0.1)
+    assert speed == pytest.approx(true, rel=0.1)
