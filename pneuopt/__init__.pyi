@@ -68,7 +68,7 @@ from .identification.identify import identify, predict, validate
 from .identification.losses import Huber, SoftL1
 from .identification.profiles import Profile, profile
 from .identification.propagation import PropagatedValue, propagate_error
-from .identification.result import ChosenWidth, IdentificationResult, Mark, Verdict
+from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
 from .logs.experiments import Experiment, differentiate, read_log, resample, split
 from .models import catalog
@@ -134,6 +134,7 @@ __all__ = [
     "BandCentre",
     "Certificate",
     "ChosenWidth",
+    "ChosenWindow",
     "ClosedLoop",
     "Code",
     "CompensatorVerdict",

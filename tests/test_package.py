@@ -26,6 +26,7 @@ PUBLIC_NAMES = [
     "Certificate",
     "certificate",
     "ChosenWidth",
+    "ChosenWindow",
     "ClosedLoop",
     "coarse_delay",
     "Code",

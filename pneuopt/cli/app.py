@@ -27,6 +27,9 @@ app = typer.Typer(
 )
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all figures as JSON.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw: .png, .pdf or .svg.")]
+Window = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
 
@@ -61,9 +64,7 @@ def identify_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write fit.toml.")] = None,
     json: Json = None,
     plot: Plot = None,
-    window: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
-    ] = None,
+    window: Window = None,
     select: Annotated[
         bool, typer.Option("--select", help="Compare friction models instead, and recommend one.")
     ] = False,
@@ -110,6 +111,7 @@ def simulate_command(
         Path | None, typer.Argument(metavar="[TUNING]", help="tuning.toml or tuned.toml: simulate its closed loop.")
     ] = None,
     log: Annotated[Path | None, typer.Option(metavar="LOG", help="Predict this log instead, in open loop.")] = None,
+    window: Window = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
     plot: Plot = None,
@@ -122,10 +124,11 @@ def simulate_command(
         from pneuopt.cli.tune import run_simulate
 
         outputs = Outputs(output, json, plot)
+        require(window is None or log is not None, "--window cuts a log: give it with --log")
         if tuning is not None:
             raise typer.Exit(run_simulate(fit, tuning, outputs))
         if log is not None:
-            raise typer.Exit(run_predict(fit, log, outputs))
+            raise typer.Exit(run_predict(fit, log, window, outputs))
 
 
 @app.command("study")

@@ -25,7 +25,7 @@ from pneuopt.identification.identifiability import identifiability
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.identification.select_model import select_model
-from pneuopt.logs.experiments import Experiment, read_log, split
+from pneuopt.logs.experiments import Experiment, read_log
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
@@ -51,11 +51,12 @@ def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: fl
     outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation")
     model, parameters = _read_free_drive(drive)
     system = model.system()
-    experiments = _read_experiments(logs, window, system, parameters)
+    experiments = _read_experiments(logs, system, parameters)
     for sentence in identifiability(system, experiments, parameters).sentences:
         warn(f"before the fit: {sentence}")
     with progress("identifying", quiet=quiet) as report_progress:
-        result = identify(system, experiments, parameters, method=LeastSquares(progress=report_progress), throw=False)
+        method = LeastSquares(progress=report_progress)
+        result = identify(system, experiments, parameters, method=method, window=window, throw=False)
     console = make_console()
     show_status(console, result.status)
     show_estimates(console, result.estimates, result.widths)
@@ -66,6 +67,7 @@ def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: fl
         "fit": records(result.fit),
         "verdict": _verdict_record(result.verdict),
         "widths": [asdict(width) for width in result.widths],
+        "window": asdict(result.window) if result.window else None,
     }
     writers: Writers = {}
     if outputs.output is not None:
@@ -89,9 +91,10 @@ def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: floa
     with progress("selecting", quiet=quiet) as report_progress:
         chosen = select_model(
             systems,
-            _read_experiments(logs, window, model.system(), known),
+            _read_experiments(logs, model.system(), known),
             known,
             free=[*free, *usual_unknowns()],
+            window=window,
             method=LeastSquares(progress=report_progress),
         )
     show_selection(make_console(), chosen)
@@ -99,18 +102,18 @@ def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: floa
     return finish(outputs, {}, tables, chosen.fits[chosen.recommended].status)
 
 
-def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
-    """Predict a log in open loop; returns the exit status."""
+def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs) -> int:
+    """Predict a log in open loop, in windows if asked for; returns the exit status."""
     outputs.check([fit, log, log.with_suffix(".toml")])
     model, parameters = read_drive(fit)
     system = model.system()
     experiment = read_log(log, plant=system, ambient_pressure=ambient_pressure(parameters))
     warn_of_status(fit)
-    table = validate(system, [experiment], parameters)
+    table = validate(system, [experiment], parameters, window=window)
     show_fit(make_console(), table)
     writers: Writers = {}
     if outputs.output is not None or outputs.plot is not None:
-        run = predict(system, experiment, parameters)
+        run = predict(system, experiment, parameters, window=window)
         if outputs.plot is not None:
             writers |= figure_writers(outputs.plot, {"": plot_prediction([run], [experiment], label="predicted")})
         if outputs.output is not None:
@@ -120,15 +123,9 @@ def run_predict(fit: Path, log: Path, outputs: Outputs) -> int:
     return finish(outputs, writers, {"fit": records(table), "provenance": file_hashes(fit, log)}, None)
 
 
-def _read_experiments(
-    logs: Sequence[Path], window: float | None, plant: System, parameters: ParameterSet
-) -> list[Experiment]:
+def _read_experiments(logs: Sequence[Path], plant: System, parameters: ParameterSet) -> list[Experiment]:
     zero = ambient_pressure(parameters)
-    experiments = [read_log(path, plant=plant, ambient_pressure=zero) for path in logs]
-    if window is None:
-        return experiments
-    require(window > 0, f"--window must be positive, got {window:g} s")
-    return [part for e in experiments for part in split(e, window)]
+    return [read_log(path, plant=plant, ambient_pressure=zero) for path in logs]
 
 
 def _input_files(drive: Path, logs: Sequence[Path]) -> list[Path]:

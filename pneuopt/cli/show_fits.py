@@ -79,20 +79,21 @@ def show_fit(console: Console, fit: "pd.DataFrame") -> None:
     if len(fit) > MAX_FIT_ROWS:
         _show_fit_summary(console, fit)
         return
-    table = new_table("log", "channel", "NRMSE [%]", "RMSE", "unit")
+    table = new_table("log", "channel", "NRMSE [%]", "free run", "RMSE", "free run", "unit")
     for row in fit.reset_index().to_dict(orient="records"):
-        figures = [format_number(100 * row["nrmse"], 4), format_number(row["rmse"], 4)]
+        shares = [format_number(100 * row[n], 4) for n in ("nrmse", "free_run_nrmse")]
+        figures = [*shares, *(format_number(row[n], 4) for n in ("rmse", "free_run_rmse"))]
         table.add_row(str(row["log"]), str(row["channel"]), *figures, str(row["unit"]))
     console.print(table)
 
 
 def _show_fit_summary(console: Console, fit: "pd.DataFrame") -> None:
-    table = new_table("channel", "logs", "NRMSE [%]: median", "worst", "in log", "RMSE: median", "unit")
+    table = new_table("channel", "logs", "NRMSE [%]: median", "worst", "free", "in log", "RMSE: median", "unit")
     flat = fit.reset_index()
     for channel in flat["channel"].unique():
         rows = flat[flat["channel"] == channel].sort_values("nrmse", na_position="first")
         worst, middle = rows.iloc[-1], rows[["nrmse", "rmse"]].median()
-        figures = [format_number(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"])]
+        figures = [format_number(100 * v, 4) for v in (middle["nrmse"], worst["nrmse"], worst["free_run_nrmse"])]
         rmse = format_number(middle["rmse"], 4)
         table.add_row(str(channel), str(len(rows)), *figures, str(worst["log"]), rmse, str(worst["unit"]))
     console.print(table)

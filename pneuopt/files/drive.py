@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-FIT_SECTIONS = ("estimates", "covariance", "status", "verdict", "provenance")
+FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
 AMBIENT_PRESSURE = "ambient.pressure"  # the parameter of a drive that its gauge pressures count from
@@ -190,6 +190,7 @@ def write_fit(path: str | Path, source: str | Path, result: IdentificationResult
     rows = result.estimates.to_dict(orient="index")
     document["estimates"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
     document["covariance"] = toml_table(_covariance_rows(result.covariance))
+    document["agreement"] = toml_table(_agreement_rows(result.fit))
     document["status"] = toml_table({"code": result.status.code.value, "message": result.status.message})
     if result.verdict is not None:
         document["verdict"] = toml_table(result.verdict.to_dict())
@@ -209,6 +210,16 @@ def _write_absolute(document: tomlkit.TOMLDocument, given: ParameterSet) -> None
                     said[part] = write_value(getattr(p, part), p.unit, 9)
         elif "(g)" in str(said):
             entries[key] = write_value(p.value, p.unit, 9)
+
+
+def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:
+    """A table a log with a row a channel: how far the fit, and a simulation from end to end, are from it."""
+    figures = fit[["rmse", "nrmse", "free_run_rmse", "free_run_nrmse", "unit"]]
+    logs = {str(log): rows.droplevel("log") for log, rows in figures.groupby(level="log", sort=False)}
+    return {
+        log: toml_table({str(c): inline_table(row) for c, row in rows.to_dict(orient="index").items()})
+        for log, rows in logs.items()
+    }
 
 
 def _covariance_rows(covariance: "pd.DataFrame") -> dict[str, list[float]]:

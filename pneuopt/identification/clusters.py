@@ -148,9 +148,9 @@ def robust_covariance(
     -------
     RobustCovariance
     """
-    times = _distinct([blocks, blocks.halve(), blocks.halve().halve()])
+    times = [c for c in _distinct([blocks, blocks.halve(), blocks.halve().halve()]) if c.count > 1]
     logs = [blocks.by_log()] if len(np.unique(blocks.logs)) > 1 else []
-    levels = [c for c in (*times, *logs) if c.count > 1]
+    levels = [*times, *logs]
     none = np.zeros(len(white), dtype=bool)
     agree = min((disagreement_p(c, variance) for c in levels), default=1.0) * len(levels) >= GATE_LEVEL
     if not levels or (agree and not classes):

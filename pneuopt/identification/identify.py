@@ -4,7 +4,7 @@ The system is any ODE with named signals that proposes its own starts (`System.s
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from pneuopt.identification.checks import (
     outputs_in_log,
 )
 from pneuopt.identification.identifiability import rests_on_prior
-from pneuopt.identification.losses import Loss
+from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts
 from pneuopt.identification.problem import (
@@ -33,8 +33,8 @@ from pneuopt.identification.problem import (
     apply_conditions,
     as_estimation_model,
 )
-from pneuopt.identification.repairs import input_behaviour, known_runs
-from pneuopt.identification.result import IdentificationResult
+from pneuopt.identification.repairs import input_behaviour, known_runs, window_runs
+from pneuopt.identification.result import ChosenWindow, IdentificationResult
 from pneuopt.identification.review import review_fit
 from pneuopt.identification.statistics import (
     agreement,
@@ -43,6 +43,7 @@ from pneuopt.identification.statistics import (
     ljung_box,
 )
 from pneuopt.identification.widths import choose_widths
+from pneuopt.identification.windows import check_window, fit_in_windows, run_freely
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
@@ -75,6 +76,7 @@ def identify(
     method: LeastSquares | None = None,
     loss: Loss | None = None,
     estimate_noise: bool = False,
+    window: float | None = None,
     throw: bool = True,
 ) -> IdentificationResult:
     """Fit the free parameters and every log's start state to the logs; no guess is needed from the user.
@@ -93,6 +95,9 @@ def identify(
         For logs with outliers: `Huber()` or `SoftL1()`; by default every residual counts with its square.
     estimate_noise : bool
         Take each channel's noise from its residuals, whatever the logs declare.
+    window : float, optional
+        Cut the logs into windows of this time [s], each with a start state of its own; by default only where the model
+        does not follow whole logs, and of the length that gives the narrowest intervals (`result.window`).
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
 
@@ -118,11 +123,24 @@ def identify(
     log_warnings = emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
     stated = all(channel in e.noise for e in given for channel in outputs_in_log(model, e))
     problem = EstimationProblem(
-        model, tuple(experiments), model.parameters | parameters, method, noise_is_stated=stated
+        model,
+        tuple(experiments),
+        model.parameters | parameters,
+        method,
+        noise_is_stated=stated,
+        window=math.inf if window is None else window,
     )
+    if window is not None:
+        check_window(problem)
     problem, widths = choose_widths(problem)
     held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
-    result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths)
+    chosen = None if window is None else ChosenWindow(window, window, window, fit.stats["gap_share"])
+    if windowed := fit_in_windows(held, fit):
+        held, fit, chosen = windowed
+        held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
+    result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths, window=chosen)
+    if chosen:
+        result = replace(result, status=result.status.with_details(str(chosen)))
     if log_warnings:
         result = replace(result, status=result.status.with_remedies(*log_warnings))
     if throw and not result.status.converged:
@@ -131,7 +149,11 @@ def identify(
 
 
 def validate(
-    system: HasSystem | ClosedLoop, experiments: Experiment | Sequence[Experiment], parameters: ParameterSet
+    system: HasSystem | ClosedLoop,
+    experiments: Experiment | Sequence[Experiment],
+    parameters: ParameterSet,
+    *,
+    window: float | None = None,
 ) -> "pd.DataFrame":
     """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
 
@@ -141,11 +163,15 @@ def validate(
     experiments : Experiment or sequence of Experiment
         Preferably runs that no fit has seen.
     parameters : ParameterSet
+    window : float, optional
+        Start the simulation anew after this time [s], from a fitted state: a plant that integrates runs away from a
+        long log for the smallest misfit.
 
     Returns
     -------
     DataFrame
-        A row a log and channel: rmse, nrmse, fit_percent, samples, unit; whiteness_p, the probability of residuals so
+        A row a log and channel: rmse, nrmse, fit_percent, samples, unit; free_run_rmse and free_run_nrmse, the same of
+        a simulation from end to end, which has no windows; whiteness_p, the probability of residuals so
         little white by chance (`ljung_box`); of each input how much is left in them (`cross_correlation`, about 3 is
         what chance reaches) and at which lag in samples: "correlation[force]", "lag[force]".
     """
@@ -155,15 +181,18 @@ def validate(
     logs, fixed = check_logs(model, experiments, parameters), _fixed_parameters(model, parameters)
     rows = []
     for experiment in logs:
-        run = _predict_log(model, experiment, fixed)
+        free = _predict_log(model, experiment, fixed)
+        run = free if window is None else _predict_log(model, experiment, fixed, window)
         rows += [
             row | _residual_diagnosis(model, experiment, run, str(row["channel"]))
-            for row in _agreement_rows(model, experiment, run)
+            for row in _agreement_rows(model, experiment, run, free)
         ]
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
 
-def predict(system: HasSystem | ClosedLoop, experiment: Experiment, parameters: ParameterSet) -> Trajectory:
+def predict(
+    system: HasSystem | ClosedLoop, experiment: Experiment, parameters: ParameterSet, *, window: float | None = None
+) -> Trajectory:
     """Simulate a log freely with known parameters, as `validate` does to compare.
 
     Parameters
@@ -171,6 +200,8 @@ def predict(system: HasSystem | ClosedLoop, experiment: Experiment, parameters: 
     system : drive, System or ClosedLoop
     experiment : Experiment
     parameters : ParameterSet
+    window : float, optional
+        As of `validate`.
 
     Returns
     -------
@@ -180,7 +211,7 @@ def predict(system: HasSystem | ClosedLoop, experiment: Experiment, parameters: 
     model = as_estimation_model(system)
     check_argument("experiment", experiment, Experiment, "an Experiment, as read_log(path) gives it")
     log = check_logs(model, experiment, parameters)[0]
-    return _predict_log(model, log, _fixed_parameters(model, parameters))
+    return _predict_log(model, log, _fixed_parameters(model, parameters), window)
 
 
 def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSet:
@@ -188,22 +219,32 @@ def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSe
     return system.parameters | parameters.fixed(*parameters.free_names)
 
 
-def _predict_log(system: Fittable, experiment: Experiment, fixed: ParameterSet) -> Trajectory:
+def _predict_log(
+    system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None = None
+) -> Trajectory:
     inputs, known = experiment.trajectory, apply_conditions(fixed, experiment)
     behaviour = input_behaviour(system, experiment)
     if not system.states:
         return simulate(system, inputs, known, initial={}, intersample=behaviour)
-    method = LeastSquares()  # over the whole log in one segment, stiction would trap the start in a local optimum
-    problem = EstimationProblem(system, (experiment,), fixed, method)
-    start = problem.candidates()[0]
-    initial = solve_least_squares(problem.transcription(start), method).trajectories[0]
-    columns: dict[str, Array] = {}
-    for begin, end in known_runs(experiment):
+    initial, columns = _fit_states(system, experiment, fixed, window), dict[str, Array]()
+    runs = known_runs(experiment) if window is None else window_runs(experiment, window)
+    for begin, end in runs:
         state = {s.name: float(initial[s.name][begin]) for s in system.states}
         run = simulate(system, inputs.rows(begin, end), known, initial=state, intersample=behaviour)
         for name in run:
             columns.setdefault(name, np.full(len(inputs), np.nan))[begin:end] = run[name]
     return Trajectory(inputs.t, columns)
+
+
+def _fit_states(system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None) -> Trajectory:
+    """The states of a log with known parameters; over a whole log in one segment, stiction would trap the start."""
+    problem = EstimationProblem(system, (experiment,), fixed, LeastSquares())
+    if window is None:
+        return solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method).trajectories[0]
+    windows = replace(problem, window=window, method=LeastSquares(segment_time=window))
+    check_window(windows)
+    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    return solve_least_squares(windows.transcription(windows.start_from(fit)), windows.method).trajectories[0]
 
 
 def _result(
@@ -233,7 +274,7 @@ def _result(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, status, misfit),
         _covariance_frame(free, covariance),
-        _fit_table(problem.system, problem.experiments, runs),
+        _fit_table(problem, fit),
         runs,
         status,
         {**fit.stats, "chi_square_ratio": variance, "variance_inflation": misfit.inflation},
@@ -246,20 +287,25 @@ def _result(
     return result, unidentifiable
 
 
-def _fit_table(system: Fittable, experiments: Sequence[Experiment], runs: Mapping[str, Trajectory]) -> "pd.DataFrame":
+def _fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":
     import pandas as pd
 
-    rows = [row for e in experiments for row in _agreement_rows(system, e, runs[e.name])]
+    runs = zip(problem.experiments, fit.trajectories, run_freely(problem, fit), strict=True)
+    rows = [row for e, run, free in runs for row in _agreement_rows(problem.system, e, run, free)]
     return pd.DataFrame(rows).set_index(["log", "channel"])
 
 
-def _agreement_rows(system: Fittable, experiment: Experiment, run: Trajectory) -> list[dict[str, object]]:
+def _agreement_rows(
+    system: Fittable, experiment: Experiment, run: Trajectory, free_run: Trajectory
+) -> list[dict[str, object]]:
     units = {q.name: q.unit for q in system.outputs}
     rows: list[dict[str, object]] = []
     for channel in outputs_in_log(system, experiment):
-        figures = agreement(experiment.trajectory[channel], run[channel])
-        noise = experiment.noise[channel]
-        rows.append({"log": experiment.name, "channel": channel, **figures, "noise": noise, "unit": units[channel]})
+        figures, measured = agreement(experiment.trajectory[channel], run[channel]), experiment.trajectory[channel]
+        free = agreement(measured, free_run[channel])
+        free_figures = {f"free_run_{n}": free[n] for n in ("rmse", "nrmse")}
+        known = {"noise": experiment.noise[channel], "unit": units[channel]}
+        rows.append({"log": experiment.name, "channel": channel, **figures, **free_figures, **known})
     return rows
 
 

@@ -23,10 +23,13 @@ from pneuopt.identification.clusters import (
     robust_covariance,
 )
 from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.repairs import window_runs
 from pneuopt.identification.result import Mark, join_names
 from pneuopt.identification.statistics import agreement
+from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.status import Code, Status
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.scores import FitScores, fit_scores
 from pneuopt.shooting.segments import Segments
@@ -151,8 +154,9 @@ def diagnose_misfit(problem: EstimationProblem, fit: Fit, variance: float, dof: 
     covariance, degrees, ranges = white.copy(), np.full(k, dof), np.full((k, 2), np.nan)
     covariance[square], degrees[keep] = found.covariance, found.dof
     parts = [blocks.halve().halve(), blocks.by_log(), *classes]
-    changes = np.concatenate([jackknife(c).changes for c in parts if c.count > 1])
-    ranges[keep] = np.stack([changes.min(axis=0), changes.max(axis=0)], axis=1)
+    if changes := [jackknife(c).changes for c in parts if c.count > 1]:
+        each = np.concatenate(changes)
+        ranges[keep] = np.stack([each.min(axis=0), each.max(axis=0)], axis=1)
     own = {n for n in free if n not in problem.parameters}
     return Misfit(
         covariance,
@@ -209,8 +213,26 @@ def _is_excessive(problem: EstimationProblem, fit: Fit, variance: float) -> bool
     if variance <= MAX_MISFIT**2:
         return False
     pairs = zip(problem.experiments, fit.trajectories, strict=True)
-    figures = [agreement(e.trajectory[c], run[c]) for e, run in pairs for c in outputs_in_log(problem.system, e)]
-    return problem.noise_is_stated or float(np.nanmean([f["nrmse"] for f in figures])) > MAX_NRMSE
+    shares = [_missed_share(problem, e, run, c) for e, run in pairs for c in outputs_in_log(problem.system, e)]
+    return problem.noise_is_stated or float(np.nanmean(shares)) > MAX_NRMSE
+
+
+def _missed_share(problem: EstimationProblem, experiment: Experiment, run: Trajectory, channel: str) -> float:
+    """Residuals over the variation of a channel; within windows, over what the start of each does not explain."""
+    measured = experiment.trajectory[channel]
+    if math.isinf(problem.window):
+        return agreement(measured, run[channel])["nrmse"]
+    bends = np.concatenate([_bend(measured[a:b]) for a, b in window_runs(experiment, problem.window)])
+    size = float(np.nansum(bends**2))
+    return math.sqrt(float(np.nansum((measured - run[channel]) ** 2)) / size) if size > 0 else math.nan
+
+
+def _bend(values: Array) -> Array:
+    """What a straight line leaves of some samples; NaN where one is missing."""
+    known, at = np.isfinite(values), np.arange(len(values), dtype=float)
+    if known.sum() < 3:
+        return values * math.nan
+    return np.asarray(values - np.polyval(np.polyfit(at[known], values[known], 1), at))
 
 
 def _hotelling_p(rows: Array) -> float:

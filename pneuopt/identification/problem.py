@@ -14,7 +14,7 @@ from pneuopt.dynamics.runnable import Fittable, HasSystem, as_runnable
 from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.logged_loop import LoggedLoop
-from pneuopt.identification.repairs import input_behaviour
+from pneuopt.identification.repairs import input_behaviour, window_runs
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Mask
@@ -46,6 +46,8 @@ class EstimationProblem:
         Values of free parameters that are held, for the logs cannot identify them.
     noise_is_stated : bool
         Whether the logs state the noise of all outputs; otherwise it is estimated from them.
+    window : float
+        Time after which a log starts anew with a state of its own [s]; math.inf where it never does.
     """
 
     system: Fittable
@@ -55,6 +57,7 @@ class EstimationProblem:
     weights: Mapping[str, Array] = field(default_factory=dict)
     held: Mapping[str, float] = field(default_factory=dict)
     noise_is_stated: bool = False
+    window: float = math.inf
 
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
@@ -122,17 +125,25 @@ class EstimationProblem:
     def _phase(self, experiment: Experiment, states: Trajectory) -> Phase:
         t = experiment.trajectory.t
         h = np.append(np.diff(t), np.diff(t)[-1])
-        samples, breaks = (
-            self._samples_a_segment(h),
-            [end for begin, end in experiment.holes if begin > 0 and end < len(t)],
+        breaks = self._breaks(experiment)
+        nodes, guess = (
+            regular_nodes(len(t), self._samples_a_segment(h), breaks),
+            states.matrix(names(self.system.states)),
         )
-        nodes, guess = regular_nodes(len(t), samples, breaks), states.matrix(names(self.system.states))
         for begin, end in experiment.holes:
             h[max(begin - 1, 0) : end] = 0.0  # the state stands still where its inputs are unknown
         driven = self.system.input_matrix(experiment.trajectory, experiment.name)
         driven = append_slopes(t, driven, self._linear, self._rising(experiment))
         start = self.system.unobservable_start(experiment.trajectory, states, self.parameters)
         return Phase(experiment.name, t, h, driven, nodes, start, guess=guess, breaks=np.array(breaks, dtype=np.intp))
+
+    def _breaks(self, experiment: Experiment) -> list[int]:
+        """The samples at which a log starts anew: after a hole in its inputs, and at the start of each window."""
+        t = experiment.trajectory.t
+        holes = [end for begin, end in experiment.holes if begin > 0 and end < len(t)]
+        if math.isinf(self.window):
+            return holes
+        return sorted({*holes, *(begin for begin, _ in window_runs(experiment, self.window) if begin > 0)})
 
     def _samples_a_segment(self, h: Array) -> int:
         """Samples between two nodes; a static map has no gaps, and is cut only for batches and blocks of time."""

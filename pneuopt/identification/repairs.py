@@ -1,5 +1,6 @@
 """Holes of a log's inputs: a short one is bridged, at a long one the log is cut; `repair_log` says which and where."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -75,6 +76,23 @@ def known_runs(experiment: Experiment) -> list[tuple[int, int]]:
     """Begin and end of each part of a repaired log, as a range of samples, that no hole interrupts."""
     edges = [0, *(edge for hole in experiment.holes for edge in hole), len(experiment.trajectory)]
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+
+
+def window_runs(experiment: Experiment, window: float) -> list[tuple[int, int]]:
+    """Begin and end of each window of a repaired log; what is left of a part joins its last one if below half of one.
+
+    Examples
+    --------
+    >>> log = Experiment(Trajectory(np.arange(11) * 0.1, {"speed": np.zeros(11)}))
+    >>> window_runs(log, 0.4), window_runs(log, 0.3)
+    ([(0, 4), (4, 8), (8, 11)], [(0, 3), (3, 6), (6, 9), (9, 11)])
+    """
+    n = max(1, round(window / float(np.median(np.diff(experiment.trajectory.t)))))
+    out: list[tuple[int, int]] = []
+    for begin, end in known_runs(experiment):
+        edges = [begin, *range(begin + n, end - (n + 1) // 2 + 1, n), end]
+        out += itertools.pairwise(edges)
+    return out
 
 
 def _find_holes(log: Trajectory, known: Mask, system: Fittable) -> list[tuple[int, int]]:

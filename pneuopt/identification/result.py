@@ -134,6 +134,34 @@ class ChosenWidth:
         return f"{self.name} {how} {write_value(self.value, self.unit, 3)}, as the logs ask{reason}"
 
 
+@dataclass(frozen=True)
+class ChosenWindow:
+    """The windows in which logs were fitted, each with a start state of its own, and why.
+
+    Attributes
+    ----------
+    duration : float
+        Of a window [s].
+    shortest, longest : float
+        Of the windows that were tried [s]; both the same where the user has given one.
+    gap_share : float
+        Share of the cost that the gaps carried in a fit of whole logs [1].
+    """
+
+    duration: float
+    shortest: float
+    longest: float
+    gap_share: float
+
+    def __str__(self) -> str:
+        start = f"windows of {self.duration:.3g} s are fitted, each with a start of its own"
+        if self.shortest == self.longest:
+            return f"{start}, as given"
+        why = f"over whole logs the gaps between segments carry {self.gap_share:.0%} of the cost"
+        tried = f"windows of {self.shortest:.3g} to {self.longest:.3g} s"
+        return f"{start}: {why}, and of {tried} these give the narrowest intervals"
+
+
 @dataclass(frozen=True, eq=False)
 class IdentificationResult:
     """The result of `identify`: estimates, intervals, fitted trajectories and status.
@@ -155,7 +183,8 @@ class IdentificationResult:
     covariance : DataFrame
         Of the estimates, as wide as their intervals count the residuals (`stderr`); NaN for what has no interval.
     fit : DataFrame
-        A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit.
+        A row a log and channel: rmse, nrmse, fit_percent, samples, noise, unit; free_run_rmse and free_run_nrmse of a
+        simulation from the log's fitted start to its end, which gaps or windows do not help (NaN where it diverges).
     trajectories : mapping of str to Trajectory
         Fitted states and outputs of each log.
     status : Status
@@ -165,6 +194,8 @@ class IdentificationResult:
         What the logs do not identify, why, and which run would: ``print(result.verdict)``.
     widths : tuple of ChosenWidth
         The widths over which the model rounds its kinks, as chosen by the logs; `parameters` holds them, too.
+    window : ChosenWindow or None
+        The windows in which the logs were fitted; None where they were fitted whole.
     """
 
     parameters: ParameterSet
@@ -177,6 +208,7 @@ class IdentificationResult:
     provenance: Mapping[str, str]
     verdict: Verdict | None = None
     widths: tuple[ChosenWidth, ...] = ()
+    window: ChosenWindow | None = None
 
 
 def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:

@@ -64,6 +64,7 @@ def select_model(
     free: Sequence[str],
     held_out: Experiment | Sequence[Experiment] = (),
     method: LeastSquares | None = None,
+    window: float | None = None,
 ) -> ModelSelection:
     """Fit every candidate and recommend one.
 
@@ -79,6 +80,8 @@ def select_model(
     held_out : Experiment or sequence of Experiment, optional
         Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
     method : LeastSquares, optional
+    window : float, optional
+        As of `identify`.
 
     Returns
     -------
@@ -106,7 +109,9 @@ def select_model(
     check_parameters(parameters)
     given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
     _check_names(given, parameters, free)
-    fits = {n: identify(s, experiments, given[n], method=method, throw=False) for n, s in systems.items()}
+    fits = {
+        n: identify(s, experiments, given[n], method=method, window=window, throw=False) for n, s in systems.items()
+    }
     converged = [n for n, fit in fits.items() if fit.status.converged]
     if not converged:
         message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())

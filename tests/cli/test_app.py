@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from pneuopt.cli import identify as identify_module
 from pneuopt.cli import tune as tune_module
 from pneuopt.cli.app import app
-from pneuopt.cli.show_fits import show_estimates
+from pneuopt.cli.show_fits import show_estimates, show_fit
 from pneuopt.cli.terminal import make_console
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.toml import read_toml
@@ -120,11 +120,36 @@ def test_marks_fit_a_terminal_of_80_columns(capsys: pytest.CaptureFixture[str]) 
     assert sum("bias possible" in line and "0.019958 to 0.020070" in line for line in lines) == 1
 
 
-def test_many_windows_are_shown_in_short(folder: Path) -> None:
-    result = run("identify drive.toml run_01.csv run_02.csv --window 0.1")
+def test_many_logs_are_shown_in_short(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [
+        {
+            "log": f"run@{k}",
+            "channel": "position",
+            "nrmse": 1e-3 * k,
+            "free_run_nrmse": 2e-3 * k,
+            "rmse": 1e-6,
+            "unit": "m",
+        }
+        for k in range(13)
+    ]
+    show_fit(make_console(), pd.DataFrame(rows).set_index(["log", "channel"]))
+    out = capsys.readouterr().out
+    assert "median" in out
+    assert out.count("@") == 1
+    assert [word for word in out.splitlines()[-2].split() if word in {"0.6", "1.2", "2.4"}] == ["0.6", "1.2", "2.4"]
+
+
+def test_windows_are_fitted_and_predicted_with_free_runs_beside(folder: Path) -> None:
+    result = run("identify drive.toml run_01.csv -o fit.toml --json fit.json --window 0.1")
     assert result.exit_code == 0
-    assert "NRMSE [%]: median" in result.stdout
-    assert result.stdout.count("@") == 1
+    assert "windows of 0.1 s are fitted, each with a start of its own, as given" in result.stdout.replace("\n", " ")
+    assert json.loads(Path("fit.json").read_text(encoding="utf-8"))["window"]["duration"] == 0.1
+    assert run("simulate fit.toml --log run_02.csv --window 0.1 --json p.json -o p.csv").exit_code == 0
+    (row,) = json.loads(Path("p.json").read_text(encoding="utf-8"))["fit"]
+    assert row["rmse"] < row["free_run_rmse"]
+    assert len(read_log("p.csv").trajectory) == len(read_log("run_02.csv").trajectory)
+    refused = run("simulate fit.toml tuning.toml --window 0.1")
+    assert (refused.exit_code, "--window cuts a log: give it with --log" in refused.stderr) == (2, True)
 
 
 def test_tune_certifies_and_its_file_simulates_to_the_same_figures(folder: Path) -> None:

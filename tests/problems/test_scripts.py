@@ -7,7 +7,7 @@ import pytest
 
 from problems.demo import rig_demo
 from problems.friction import stick_slip
-from problems.identify import b32, b32_partial, emps, foreign_rig, real_logs, seal_friction, step_response
+from problems.identify import b32, b32_partial, emps, foreign_rig, real_logs, seal_friction, step_response, windows
 from problems.speed import simulation_speed
 from problems.tune import pareto, supply_and_load, tune_drive
 
@@ -36,6 +36,11 @@ def test_seal_friction() -> None:
 @pytest.mark.slow
 def test_step_response() -> None:
     assert failed(step_response.main(step_response.GENERATED)) == []
+
+
+@pytest.mark.slow
+def test_windows() -> None:
+    assert failed(windows.main()) == []
 
 
 @pytest.mark.slow

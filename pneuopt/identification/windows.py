@@ -1,0 +1,150 @@
+"""`fit_in_windows`: a long log that the model does not follow from end to end, fitted in windows that it follows.
+
+A plant that integrates adds up whatever its model misses: the position runs away from the log, and the gaps of a fit
+that links its segments take the misfit in their place. In windows with a start state each, the model runs freely for a
+limited time only. Short windows show little of slow terms, long ones gather what the model misses; the length is that
+at which the estimates have the narrowest intervals, which count how parts of the log disagree
+(problems/identify/windows.py holds its estimates to the truth).
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pneuopt.identification.checks import outputs_in_log
+from pneuopt.identification.clusters import t_quantile
+from pneuopt.identification.misfit import Misfit, diagnose_misfit
+from pneuopt.identification.multistart import fit_holding_unidentifiable
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.result import ChosenWindow
+from pneuopt.quantities.errors import InputError, require
+from pneuopt.quantities.status import Code
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.convergence import MAX_GAP_SHARE
+from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.solution import Fit
+
+# measured samples of the shortest window that is tried: with fewer its start states take most of what it tells, with
+# more a plant that runs away quickly is not followed
+MIN_WINDOW_SAMPLES = 20
+MIN_WINDOWS = 12  # windows of all logs: with fewer the scatter between parts is a guess, more leave out long ones
+WINDOW_FACTOR = 2.0  # from one length to the next [1]: lower takes more fits, higher may pass over the best
+
+Windowed = tuple[EstimationProblem, Fit, ChosenWindow]
+
+
+class _Trial(NamedTuple):
+    """The fit in windows of one length."""
+
+    length: float
+    problem: EstimationProblem
+    fit: Fit
+    misfit: Misfit
+
+    @property
+    def rank(self) -> tuple[int, bool, float]:
+        """Parameters without a variance, whether residuals are too large for intervals, and the mean log of these."""
+        if self.misfit.covariance is None:
+            return len(self.fit.parameters.free_names), True, math.inf
+        variances = np.diag(self.misfit.covariance)
+        known = variances > 0
+        half_widths = t_quantile(self.misfit.dof)[known] * np.sqrt(variances[known])
+        return int((~known).sum()), self.misfit.is_excessive, float(np.log(half_widths).sum())
+
+
+def check_window(problem: EstimationProblem) -> None:
+    """Refuse a window that no log of a problem can be cut into.
+
+    Raises
+    ------
+    InputError
+        If it holds fewer than two samples, is longer than every log, or cuts a loop whose controller goes on.
+    """
+    logs = [e.trajectory for e in problem.experiments]
+    step = max(float(np.median(np.diff(log.t))) for log in logs)
+    n, longest = round(problem.window / step), max(len(log) for log in logs)
+    require(
+        2 <= n <= longest,
+        f"windows of {problem.window:g} s hold {n} samples of {problem.experiments[0].name}, which has {len(logs[0])}, "
+        f"one every {step:g} s; choose between {2 * step:g} and {longest * step:g} s",
+    )
+    message = "a sampled controller goes on from window to window; leave the window out"
+    require(problem.system.motion().sample_time is None, message, InputError)
+
+
+def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
+    """The fit in windows of the length with the narrowest intervals, where a fit of whole logs has failed by its gaps.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    fit : Fit
+        Of whole logs, or of windows whose segments are linked.
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With one segment a window.
+    fit : Fit
+    window : ChosenWindow
+        None in place of all three where the fit has not failed by its gaps, and where no window gives an optimum.
+    """
+    if not _has_failed_by_gaps(problem, fit):
+        return None
+    lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
+    found = [trial for length in lengths if (trial := _try_length(problem, fit, length)).fit.status.converged]
+    if not found:
+        return None
+    best = min(found, key=lambda trial: trial.rank)
+    window = ChosenWindow(best.length, lengths[0], lengths[-1], fit.stats["gap_share"])
+    return best.problem, best.fit.with_effort_of(fit), window
+
+
+def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
+    """Each log simulated from its fitted start to its end, without gaps; only a hole in its inputs starts anew.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    fit : Fit
+
+    Returns
+    -------
+    tuple of Trajectory
+        With what is not finite where the model diverges.
+    """
+    if not problem.system.states:
+        return fit.trajectories
+    whole = replace(problem, window=math.inf, method=replace(problem.method, segment_time=math.inf))
+    segments = segment(whole.transcription(whole.start_from(fit)))
+    q = np.array([p.value for p in segments.transcription.parameters.values()])
+    return segments.trajectories(segments.run(start_nodes(segments), q, int(fit.stats["substeps"]), states=True))
+
+
+def _has_failed_by_gaps(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether gaps have taken the misfit of a search that ended by itself, of a plant that windows can cut."""
+    absorbed = fit.stats["gap_share"] > MAX_GAP_SHARE and math.isfinite(fit.stats["cost"])
+    can_cut = bool(problem.system.states) and problem.system.motion().sample_time is None
+    return fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut
+
+
+def _lengths(problem: EstimationProblem) -> list[float]:
+    """Lengths of windows to try, the shortest first; at least one [s]."""
+    shortest, total = 0.0, 0.0
+    for e in problem.experiments:
+        known = np.isfinite(e.trajectory.matrix(outputs_in_log(problem.system, e))).any(axis=1)
+        shortest = max(shortest, MIN_WINDOW_SAMPLES * e.trajectory.duration / max(1, int(known.sum())))
+        total += e.trajectory.duration
+    count = max(1, 1 + math.floor(math.log(max(1.0, total / MIN_WINDOWS / shortest), WINDOW_FACTOR)))
+    return [shortest * WINDOW_FACTOR**k for k in range(count)]
+
+
+def _try_length(problem: EstimationProblem, fit: Fit, length: float) -> _Trial:
+    """The fit in windows of one length, a segment each, and what its residuals tell."""
+    cut = replace(problem, window=length, method=replace(problem.method, segment_time=length))
+    held, found = fit_holding_unidentifiable(cut, cut.start_from(fit))
+    unknowns = len(found.parameters.free_names) + len(held.experiments) * len(held.system.states)
+    freedom = max(1, found.count - unknowns)
+    return _Trial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))
