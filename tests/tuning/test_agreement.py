@@ -1,5 +1,7 @@
 """How far the starts of a search agree, and what that says of optima that none has seen."""
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,13 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import Overshoot, SettlingTime
-from pneuopt.models.linear import SecondOrder
+from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.full_space import FullSpace
 from pneuopt.tuning.agreement import compare_starts, describe_agreement
+from pneuopt.tuning.racing import Racing
+from pneuopt.tuning.search import Search
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.two_phase import TwoPhase
 
@@ -76,3 +81,30 @@ def test_a_search_whose_starts_mostly_fail_ends_after_three() -> None:
     search(TwoPhase(nodes=(20, 20), starts=8, solver=FullSpace(max_iterations=1)), lines)
     asked = {line.partition(":")[0] for line in lines if " of 8:" in line}
     assert asked == {f"start {k} of 8" for k in (1, 2, 3)}
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "exact", "raced", "expected"),
+    [(1, 5.0, 9.0, 9.0), (1, 9.0, 5.0, 9.0), (2, 5.0, 9.0, 5.0), (1, 5.0, math.nan, 5.0), (2, math.nan, 5.0, 5.0)],
+)
+def test_where_fewer_than_two_starts_agree_another_search_runs_and_the_better_design_counts(
+    monkeypatch: pytest.MonkeyPatch, agreeing: int, exact: float, raced: float, expected: float
+) -> None:
+    """Of pid.Ki the larger one settles sooner; NaN: the search finds nothing."""
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    given = loop.parameters.with_values({"pid.Kp": 4.0, "pid.Ki": 1.0, "pid.Tf": 0.1})
+    given = given.with_bounds({"pid.Ki": (0.5, 20.0)}).freed("pid.Ki")
+    ran = list[type]()
+
+    def run(search: Search) -> TuningResult:
+        ran.append(type(search.method))
+        gain = exact if isinstance(search.method, TwoPhase) else raced
+        found = search.certify_point(np.array([1.0 if math.isnan(gain) else gain]))
+        lost = replace(found, status=Status(Code.NOT_CONVERGED, ("nothing found",)))
+        return replace(lost if math.isnan(gain) else found, stats={**found.stats, "starts_agreeing": float(agreeing)})
+
+    monkeypatch.setattr(Search, "run", run)
+    found = tune(loop, Step(1.0, horizon=4.0), given, minimise=SettlingTime(), plants={})
+    assert found.parameters.value("pid.Ki") == expected
+    doubtful = agreeing < 2 or math.isnan(exact)
+    assert ran == ([TwoPhase, Racing] if doubtful else [TwoPhase])
