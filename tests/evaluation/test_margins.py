@@ -22,7 +22,7 @@ from pneuopt.evaluation.margins import (
     sensitivity_terms,
 )
 from pneuopt.models.catalog import s32
-from pneuopt.models.linear import SecondOrder
+from pneuopt.models.linear import FirstOrder, SecondOrder
 from pneuopt.quantities.errors import ModelError
 
 
@@ -288,3 +288,12 @@ def test_the_grids_peaks_are_refined_where_the_loop_rings(damping: float) -> Non
     assert calm.sum() >= 20
     assert_allclose(found[only[0]][calm], [m.max_sensitivity for m in np.array(exact)[calm]], rtol=5e-3)
     assert_allclose(found[only[1]][calm], [m.max_complementary_sensitivity for m in np.array(exact)[calm]], rtol=5e-3)
+
+
+@pytest.mark.parametrize("only", [("MaxSensitivity",), ("MaxSensitivity", "MaxComplementarySensitivity")])
+def test_the_sensitivity_is_1_where_the_loop_rolls_off_beyond_the_grid(only: tuple[str, ...]) -> None:
+    """S = (1 + s T)/(1 + K + s T) is below 1 at every frequency."""
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    p = loop.parameter_vector(loop.parameters.with_values({"pid.Kp": 4.0, "pid.Ki": 0.0}))
+    found = batch_margin_function(loop, [0.01, 0.1, 1.0])(p[None], np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), only)
+    assert found["MaxSensitivity"].tolist() == [1.0]

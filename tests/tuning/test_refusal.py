@@ -9,7 +9,8 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.evaluation.requirements import Overshoot, SettlingTime
+from pneuopt.evaluation.requirements import IAE, Overshoot, Requirement, SettlingTime
+from pneuopt.evaluation.specification import specify
 from pneuopt.models.linear import SecondOrder
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -17,10 +18,11 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.confirmation import CANDIDATE_DISTANCE, MAX_CANDIDATES, find_candidates
 from pneuopt.tuning.method import SearchResult
 from pneuopt.tuning.racing import Racing
+from pneuopt.tuning.refusal import _excess, confirm_refusal
 from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.space import Space
-from pneuopt.tuning.tune import tune
+from pneuopt.tuning.tune import prepare_search, prepare_task, tune
 
 SMALL = Racing(members=10, trials=10, polish=0)
 STEP = Step(1.0, horizon=1.5)
@@ -104,3 +106,32 @@ def test_candidates_lie_within_the_limits_and_apart() -> None:
         return np.asarray(1.0 + at.sum(axis=1))
 
     assert find_candidates(far, space, lambda _: None)[0] == []
+
+
+def search_for(step: Step, minimise: Requirement, *limits: Requirement) -> Search:
+    loop, given = problem()
+    return prepare_search(prepare_task(loop, step, given, specify(minimise, limits)), SMALL)
+
+
+def test_a_design_that_leaves_its_band_after_the_horizon_is_no_candidate() -> None:
+    """With Kp 1 and Ki 18 the response is in a band of 20 % from .138 to .186 s, then overshoots by half the step."""
+    search = search_for(Step(1.0, horizon=0.165), SettlingTime(0.2))
+    resting, late = replace(search, rests=True), np.array([[1.0, 18.0]])
+    assert _excess(resting, resting, late)[0] <= 0
+    assert _excess(resting, resting.lengthen(rests=True), late)[0] > 0
+
+
+def test_a_candidate_that_holds_is_improved_before_it_is_handed_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The candidate certified first is the one with the most room to the limits, not the best."""
+    search = replace(search_for(STEP, IAE(), Overshoot(0.2)), method=Racing(members=10, trials=100, polish=0))
+    refused, held, certify = refuse(search.certify_point(search.space.start)), list[float](), Search.certify_point
+
+    def record(search: Search, point: Array) -> TuningResult:
+        result = certify(search, point)
+        held.append(float(result.certified.loc["IAE"].max()))
+        return result
+
+    monkeypatch.setattr(Search, "certify_point", record)
+    found = confirm_refusal(search, refused)
+    assert found.status.converged
+    assert found.certified.loc["IAE"].max() < 0.95 * held[-1]
