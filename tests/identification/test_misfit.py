@@ -1,7 +1,9 @@
 """Marks, widened intervals and ranges of fits to logs whose residuals are, or are not, noise."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from scipy.signal import lfilter
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_marks, write_fit
 from pneuopt.identification.identify import identify
+from pneuopt.identification.misfit import Misfit
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.logs.experiments import Experiment
@@ -64,6 +67,21 @@ def test_white_residuals_are_exact() -> None:
     assert result.stats["variance_inflation"] == 1.0
     assert_allclose(np.diag(result.covariance), result.estimates["stderr"] ** 2)
     assert_allclose(result.estimates["dof"], TIME.size - len(FREE) - 2)
+
+
+def test_the_mark_of_an_estimate_is_the_gravest_that_anything_gives() -> None:
+    whole = Misfit(np.eye(1), np.ones(1), 1.0, np.zeros((1, 2)), 1.0, noisy_states=False, is_excessive=False)
+    assert whole.mark(is_optimum=True) is Mark.EXACT
+    assert whole.mark(is_optimum=False) is Mark.BIAS_POSSIBLE  # at a bound, or a fit that did not converge
+    for changed, mark in (
+        ({"widened": True}, Mark.WIDENED),
+        ({"level": 1.3}, Mark.WIDENED),
+        ({"level": 2.1}, Mark.BIAS_POSSIBLE),
+        ({"noisy_states": True}, Mark.BIAS_POSSIBLE),
+        ({"signals": ("speed",), "widened": True}, Mark.BIAS_POSSIBLE),
+    ):
+        given: Any = changed
+        assert replace(whole, **given).mark(is_optimum=True) is mark, changed
 
 
 def test_a_slow_residual_below_the_noise_widens_the_intervals() -> None:

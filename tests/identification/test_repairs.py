@@ -92,6 +92,12 @@ def test_a_pause_cuts_the_log() -> None:
     assert repair_log(DRIVE, pausing(800, 800 + MAX_BRIDGE))[0].holes == ()
 
 
+def test_ten_samples_are_bridged_and_eleven_are_cut() -> None:
+    for count, holes in ((10, False), (11, True)):
+        for log in (without(slice(800, 800 + count)), pausing(800, 800 + count)):
+            assert bool(repair_log(DRIVE, log)[0].holes) is holes
+
+
 def test_what_is_left_between_two_holes_has_to_hold_some_samples() -> None:
     few = without(slice(800, 900), slice(900 + MIN_RUN - 1, 1000))
     assert repair_log(DRIVE, few)[0].holes == ((800, 1000),)
