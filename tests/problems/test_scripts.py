@@ -5,7 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from problems.demo import rig_demo
+from problems.demo import other_rigs, rig_demo
 from problems.friction import stick_slip
 from problems.identify import b32, b32_partial, emps, foreign_rig, real_logs, seal_friction, step_response, windows
 from problems.speed import simulation_speed
@@ -54,6 +54,14 @@ def test_rig_demo(tmp_path: Path) -> None:
     assert failed(rig_demo.main(demo)) == []
     rig_demo.figure(demo).savefig(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_other_rigs() -> None:
+    rows = other_rigs.main([2]).set_index("name")
+    assert failed(rows.reset_index()) == []
+    assert rows["value"]["certified"] == 1
+    assert rows["value"]["promises.kept"] == rows["reference"]["promises.kept"] == 3
 
 
 @pytest.mark.slow
