@@ -65,6 +65,10 @@ def identify_command(
     json: Json = None,
     plot: Plot = None,
     window: Window = None,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(metavar="CHECK", help="The logs are right: motion, speed, work, command, pressures; repeatable."),
+    ] = None,
     select: Annotated[
         bool, typer.Option("--select", help="Compare friction models instead, and recommend one.")
     ] = False,
@@ -76,7 +80,8 @@ def identify_command(
         from pneuopt.cli.shared import Outputs
 
         run = run_select if select else run_identify
-        raise typer.Exit(run(drive, _expand_patterns(logs), Outputs(output, json, plot), window, quiet))
+        files = _expand_patterns(logs)
+        raise typer.Exit(run(drive, files, Outputs(output, json, plot), window, quiet, accept or ()))
 
 
 @app.command("tune")

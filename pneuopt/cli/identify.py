@@ -46,12 +46,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool) -> int:
+def run_identify(
+    drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool, accept: Sequence[str] = ()
+) -> int:
     """Identify from logs; returns the exit status."""
     outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation")
     model, parameters = _read_free_drive(drive)
     system = model.system()
-    experiments = _read_experiments(logs, system, parameters)
+    experiments = _read_experiments(logs, system, parameters, accept)
     for sentence in identifiability(system, experiments, parameters).sentences:
         warn(f"before the fit: {sentence}")
     with progress("identifying", quiet=quiet) as report_progress:
@@ -77,7 +79,9 @@ def run_identify(drive: Path, logs: Sequence[Path], outputs: Outputs, window: fl
     return finish(outputs, writers, tables | stats_and_provenance(result), result.status)
 
 
-def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool) -> int:
+def run_select(
+    drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool, accept: Sequence[str] = ()
+) -> int:
     """Choose a friction model by the logs; returns the exit status."""
     remedy = "write the model that is chosen into [friction], and identify again without --select"
     require(outputs.output is None and outputs.plot is None, f"--select writes neither -o nor --plot; {remedy}")
@@ -91,7 +95,7 @@ def run_select(drive: Path, logs: Sequence[Path], outputs: Outputs, window: floa
     with progress("selecting", quiet=quiet) as report_progress:
         chosen = select_model(
             systems,
-            _read_experiments(logs, model.system(), known),
+            _read_experiments(logs, model.system(), known, accept),
             known,
             free=[*free, *usual_unknowns()],
             window=window,
@@ -123,9 +127,11 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs) ->
     return finish(outputs, writers, {"fit": records(table), "provenance": file_hashes(fit, log)}, None)
 
 
-def _read_experiments(logs: Sequence[Path], plant: System, parameters: ParameterSet) -> list[Experiment]:
+def _read_experiments(
+    logs: Sequence[Path], plant: System, parameters: ParameterSet, accept: Sequence[str]
+) -> list[Experiment]:
     zero = ambient_pressure(parameters)
-    return [read_log(path, plant=plant, ambient_pressure=zero) for path in logs]
+    return [read_log(path, plant=plant, ambient_pressure=zero).accepting(*accept) for path in logs]
 
 
 def _input_files(drive: Path, logs: Sequence[Path]) -> list[Path]:

@@ -12,7 +12,7 @@ from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import System, names
 from pneuopt.identification.command_centre import centre_command
 from pneuopt.identification.repairs import repair_log
-from pneuopt.logs.doctor import PISTON_CHANNELS, AxisChannels, Finding, examine
+from pneuopt.logs.doctor import CHECKS, PISTON_CHANNELS, AxisChannels, Finding, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import estimate_noise, noise_level
 from pneuopt.quantities.arguments import as_tuple, check_parameters
@@ -68,16 +68,28 @@ def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> N
         require(not known, message, ModelError)
 
 
-def check_content(system: Fittable, experiments: Sequence[Experiment]) -> None:
-    """Refuse logs of which more than half show the same fault; a window of a good log may well stand still."""
+def check_content(system: Fittable, experiments: Sequence[Experiment]) -> tuple[str, ...]:
+    """Refuse logs of which more than half show the same fault; a window of a good log may well stand still.
+
+    Returns
+    -------
+    tuple of str
+        A sentence for each fault that the logs accept by name.
+    """
     found: dict[str, dict[str, Finding]] = {}
+    accepted: dict[str, str] = {}
     for experiment in experiments:
+        check_names("check", experiment.accept, CHECKS, f"{experiment.name}: accept")
         for finding in examine(experiment, _axis_channels(system.plant)):
-            if finding.fault:
+            if finding.fault and finding.check in experiment.accept:
+                accepted.setdefault(finding.channel, f"{experiment.name}: accepted as right: {finding.message}")
+            elif finding.fault:
                 found.setdefault(finding.channel, {})[experiment.name] = finding
     for faults in found.values():
         name, fault = next(iter(faults.items()))
-        require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}", LogError)
+        remedy = f"if the log is right, accept = [{fault.check!r}] in its sidecar, or --accept {fault.check}"
+        require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}; {remedy}", LogError)
+    return tuple(accepted.values())
 
 
 def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:

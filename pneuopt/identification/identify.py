@@ -77,6 +77,7 @@ def identify(
     loss: Loss | None = None,
     estimate_noise: bool = False,
     window: float | None = None,
+    accept: Sequence[str] = (),
     throw: bool = True,
 ) -> IdentificationResult:
     """Fit the free parameters and every log's start state to the logs; no guess is needed from the user.
@@ -98,6 +99,9 @@ def identify(
     window : float, optional
         Cut the logs into windows of this time [s], each with a start state of its own; by default only where the model
         does not follow whole logs, and of the length that gives the narrowest intervals (`result.window`).
+    accept : sequence of str
+        Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "pressures".
+        What these find stands in the status.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
 
@@ -114,13 +118,13 @@ def identify(
     """
     method, model = method or LeastSquares(), as_estimation_model(system)
     check_smooth(model)
-    experiments = as_experiments(experiments)
+    experiments = tuple(e.accepting(*accept) for e in as_experiments(experiments))
     if estimate_noise:
         experiments = [replace(e, noise={}) for e in experiments]
     given, experiments = experiments, check_logs(model, experiments, parameters)
     check_free(experiments, parameters)
-    check_content(model, experiments)
-    log_warnings = emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
+    accepted = check_content(model, experiments)
+    log_warnings = accepted + emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
     stated = all(channel in e.noise for e in given for channel in outputs_in_log(model, e))
     problem = EstimationProblem(
         model,

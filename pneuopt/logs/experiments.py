@@ -19,6 +19,8 @@ from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value
 
+ACCEPTED_CHECKS = "accept"  # of a sidecar: the checks that its log need not pass
+
 
 class Plant(Protocol):
     """What a log's reader asks of a plant, say a `System`."""
@@ -55,6 +57,9 @@ class Experiment:
     intersample : mapping of str to Intersample
         How channels run between two samples, where that is not the usual: a command is held, what is measured is linear
         (`usual_intersample`).
+    accept : tuple of str
+        The checks that this log need not pass, for it is known to be right: "work", say, of a brake
+        (`logs.doctor.CHECKS`).
     holes : tuple of (int, int)
         Ranges of samples without inputs, empty ones between two rows far apart: the state behind a hole does not follow
         from the state before it. `identify` finds them.
@@ -79,6 +84,7 @@ class Experiment:
     units: Mapping[str, str] = field(default_factory=dict)
     intersample: Mapping[str, Intersample] = field(default_factory=dict)
     holes: tuple[tuple[int, int], ...] = ()
+    accept: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         where = self.name or "experiment"
@@ -112,6 +118,10 @@ class Experiment:
         """Say how the named channels run between two samples, by copy."""
         return replace(self, intersample={**self.intersample, **intersample})
 
+    def accepting(self, *checks: str) -> "Experiment":
+        """Let the log pass the named checks whatever they find, by copy."""
+        return replace(self, accept=tuple(dict.fromkeys((*self.accept, *checks))))
+
     def with_conditions(self, conditions: Mapping[str, float]) -> "Experiment":
         """Override the named parameters [SI] in this log, by copy."""
         return replace(self, conditions={**self.conditions, **conditions})
@@ -139,7 +149,7 @@ def read_log(
         either, the header has to say "position [mm]" or "position_mm".
     sidecar : str or Path, optional
         TOML with [columns], [noise], [conditions], [intersample] (force = "held", or "linear"); by default the file of
-        the same name, if there is one.
+        the same name, if there is one. Before them, accept = ["work"] names checks that the log need not pass.
     plant : System, optional
         Its inputs and outputs, and their references, are channels in its units, beside and before the usual ones:
         torque [N*m] and angle [rad], say.
@@ -168,7 +178,8 @@ def read_log(
     noise = _read_noise(sections.get("noise", {}), trajectory, f"{side}: noise", channels)
     own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
     between = _read_intersample(sections.get("intersample", {}), trajectory, f"{side}: intersample")
-    return Experiment(trajectory, noise, conditions, path.stem, sha256, own, between)
+    accept = tuple(sections.get(ACCEPTED_CHECKS, ()))
+    return Experiment(trajectory, noise, conditions, path.stem, sha256, own, between, accept=accept)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
@@ -321,8 +332,15 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
         raise LogError(f"{side}: not valid TOML: {error}") from None
     other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
     require(sidecar is not None or "drive" not in sections, other, LogError)
-    check_names("key", sections, ("columns", "noise", "conditions", "intersample"), str(side))
-    for key, section in sections.items():
+    check_names("key", sections, (ACCEPTED_CHECKS, "columns", "noise", "conditions", "intersample"), str(side))
+    accept = sections.get(ACCEPTED_CHECKS, [])
+    is_list = isinstance(accept, list) and all(isinstance(name, str) for name in accept)
+    require(
+        is_list,
+        f'{side}: {ACCEPTED_CHECKS} must list checks, as {ACCEPTED_CHECKS} = ["work"]; got {accept!r}',
+        LogError,
+    )
+    for key, section in ((key, section) for key, section in sections.items() if key != ACCEPTED_CHECKS):
         require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
     return side, sections
 

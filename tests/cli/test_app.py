@@ -62,6 +62,21 @@ def test_identify_recovers_what_made_the_logs_and_says_so(folder: Path, axis_tru
     assert said["verdict"]["table"][0]["name"] == "load.mass"
 
 
+def test_a_refused_log_is_accepted_by_the_name_of_its_check(folder: Path) -> None:
+    t = np.arange(1000) * 2e-3
+    force = -(30 * np.sign(np.cos(6 * t)) + 20 * np.cos(6 * t))
+    log = {"time [s]": t, "position [m]": 0.1 * np.sin(6 * t), "force [N]": force}
+    pd.DataFrame(log).to_csv("turned.csv", index=False)
+    refused = run("identify drive.toml turned.csv")
+    assert refused.exit_code == 2
+    assert "change the sign of 'force'" in " ".join(refused.stderr.split())
+    assert "--accept work" in refused.stderr
+    accepted = run("identify drive.toml turned.csv --accept work --json turned.json")
+    assert accepted.exit_code != 2
+    assert "accepted as right" in json.loads(Path("turned.json").read_text(encoding="utf-8"))["status"]["message"]
+    assert run("identify drive.toml turned.csv --accept werk").exit_code == 2
+
+
 def test_a_friction_model_is_chosen_and_explained(folder: Path) -> None:
     Path("short.csv").write_text(
         "\n".join(Path("run_01.csv").read_text(encoding="utf-8").splitlines()[:251]) + "\n", encoding="utf-8"

@@ -1,6 +1,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from pneuopt.dynamics.hooks import Log
 from pneuopt.identification.checks import check_content
 from pneuopt.identification.identify import identify
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiments import Experiment, read_log
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.arrays import Array
@@ -144,3 +145,37 @@ def test_what_a_model_doubts_is_warned_of_and_stands_in_the_status() -> None:
     with pytest.warns(PhysicsWarning, match=r"run: 7 kg\?"):
         fit = identify(system, [log], RIG.parameters.freed("friction.viscous"), throw=False)
     assert fit.status.message.endswith("; run: 7 kg?")
+
+
+def braked(accept: tuple[str, ...] = ()) -> Experiment:
+    """A log whose force brakes; smooth, so that a fit of it is quick."""
+    t = np.linspace(0, 2, 2000, endpoint=False)
+    swing = {"position": 0.1 * np.sin(6 * t), "force": -(30 * np.sign(np.cos(6 * t)) + 20 * np.cos(6 * t))}
+    return Experiment(Trajectory(t, swing), name="run", accept=accept)
+
+
+def test_a_refusal_names_its_check_and_is_overridden_by_that_name() -> None:
+    system = RIG.system()
+    with pytest.raises(LogError, match=r"if the log is right, accept = \['work'\] in its sidecar, or --accept work"):
+        check_content(system, [braked()])
+    (told,) = check_content(system, [braked(("work",))])
+    assert told.startswith("run: accepted as right: the force brakes the motion on balance")
+    with pytest.raises(LogError, match="brakes the motion"):
+        check_content(system, [braked(("speed",))])
+    fit = identify(system, braked(), RIG.parameters.freed("friction.coulomb"), accept=["work"], throw=False)
+    assert "accepted as right" in fit.status.message
+
+
+def test_an_unknown_check_is_named() -> None:
+    with pytest.raises(UnknownNameError, match=r"run: accept: unknown check 'werk'; did you mean 'work'"):
+        check_content(RIG.system(), [braked(("werk",))])
+
+
+def test_a_sidecar_accepts_checks_by_name(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{k * k}\n" for k in range(12))
+    (tmp_path / "run.csv").write_text(f"time [s],position [m]\n{rows}", encoding="utf-8")
+    (tmp_path / "run.toml").write_text('accept = ["work"]\n', encoding="utf-8")
+    assert read_log(tmp_path / "run.csv").accept == ("work",)
+    (tmp_path / "run.toml").write_text('accept = "work"\n', encoding="utf-8")
+    with pytest.raises(LogError, match=r'accept must list checks, as accept = \["work"\]; got \'work\''):
+        read_log(tmp_path / "run.csv")
