@@ -10,6 +10,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.requirements import Overshoot, Ripple, SettlingTime
 from pneuopt.evaluation.specification import specify
 from pneuopt.files.tuning import read_tuning
@@ -64,6 +65,16 @@ def unstable_task() -> TuningTask:
     given = loop.parameters.with_values({"pid.Kp": 50.0, "pid.Ki": -1.0}).with_bounds(wrong).freed(*wrong)
     spec = specify(SettlingTime(band=0.05))
     return TuningTask(loop, (STEP,), {}, search_space(loop, given), spec)
+
+
+@pytest.mark.parametrize(("steps", "chosen"), [(3.4, "TwoPhase"), (3.6, "Racing")])
+def test_a_linear_loop_whose_filter_takes_many_steps_between_two_nodes_is_raced(steps: float, chosen: str) -> None:
+    """A horizon of 1 s has 40 nodes; the pole 1/Tf of the derivative's filter is the fastest of the loop."""
+    loop, given = problem()
+    tf = 1 / (40 * steps * RK4_MAX_H_LAMBDA)
+    given = given.with_values({"pid.Kp": 0.5, "pid.Tf": tf}).fixed("pid.Kp").with_bounds({"pid.Ki": (0.0, 20.0)})
+    task = TuningTask(loop, (STEP,), {}, search_space(loop, given), specify(SettlingTime()))
+    assert type(choose_method(task)).__name__ == chosen
 
 
 @pytest.fixture(params=list(METHODS))
