@@ -1,5 +1,6 @@
 """The samples of a search follow the response, and a claim holds on them before it is certified or refused."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from pneuopt.tuning.method import SearchResult
 from pneuopt.tuning.racing import Racing
 from pneuopt.tuning.search import Search
 from pneuopt.tuning.simulator import Simulator
-from pneuopt.tuning.space import search_space
+from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, search_space
 from pneuopt.tuning.tune import prepare_task, tune
 
 STEP = Step(1.0, horizon=20.0)
@@ -70,6 +71,17 @@ def test_steps_that_change_a_claim_are_halved_and_a_short_search_goes_on_from_it
     assert second.grids is first.grids
     assert second.substeps[0] >= 2 * first.substeps[0]
     assert found.point.tolist() == point.tolist()
+
+
+def test_steps_are_halved_until_there_are_too_many() -> None:
+    simulators = [problem()[1]]
+    for _ in range(20):
+        simulators.append(simulators[-1].shorten_steps())
+    counts = list(dict.fromkeys(max(s.substeps) for s in simulators))
+    assert len(counts) >= 3
+    assert all(fine >= 2 * coarse for coarse, fine in pairwise(counts))
+    assert counts[-1] <= MAX_LOOP_SUBSTEPS < 2 * counts[-1]
+    assert simulators[-1] is simulators[-2]
 
 
 @pytest.mark.parametrize("minimise", [SettlingTime(), ITAE()])
