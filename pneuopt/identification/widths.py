@@ -18,6 +18,7 @@ import numpy as np
 from pneuopt.dynamics.excitation import Width
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.repairs import known_runs
 from pneuopt.identification.result import ChosenWidth
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.parameters import ParameterSet
@@ -250,6 +251,12 @@ def excerpts(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     for e in experiments:
         n = len(e.trajectory)
         size, each = n // EXCERPTS, round(share * n / EXCERPTS)
-        parts = [e.trajectory.rows(k * size, k * size + max(10, each)) for k in range(EXCERPTS)]
-        out += [replace(e, trajectory=part, name=f"{e.name}@{k}") for k, part in enumerate(parts)]
+        parts = [_excerpt(e, k * size, k * size + max(10, each)) for k in range(EXCERPTS)]
+        out += [replace(part, name=f"{e.name}@{k}") for k, part in enumerate(parts) if known_runs(part)]
     return tuple(out)
+
+
+def _excerpt(experiment: Experiment, begin: int, end: int) -> Experiment:
+    """The samples `begin:end` of a log, with the holes among them."""
+    own = [(max(a, begin) - begin, min(b, end) - begin) for a, b in experiment.holes if a < end and b > begin]
+    return replace(experiment, trajectory=experiment.trajectory.rows(begin, end), holes=tuple(own))

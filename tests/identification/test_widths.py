@@ -124,3 +124,13 @@ def test_long_logs_are_tried_in_stretches() -> None:
     assert sum(len(e.trajectory) for e in parts) <= MAX_TRIAL_SAMPLES
     assert [round(e.trajectory.t[0]) for e in parts] == [0, 25, 50, 75]
     assert excerpts(parts) == parts
+
+
+def test_a_stretch_has_the_holes_that_lie_in_it() -> None:
+    """A hole of the whole log at the stretch's own count of samples would let the model stand still there."""
+    t = np.arange(20_000) * 1e-3
+    holes = ((700, 900), (5500, 5500), (6900, 7400), (10_000, 15_000), (15_500, 15_900))
+    log = po.Experiment(po.Trajectory(t, {"force": t, "position": t}), name="long", holes=holes)
+    parts = excerpts([log])
+    assert [round(e.trajectory.t[0]) for e in parts] == [0, 5, 15]  # nothing is known of the third
+    assert [e.holes for e in parts] == [((700, 900),), ((500, 500), (1900, 2000)), ((500, 900),)]
