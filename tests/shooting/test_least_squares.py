@@ -1,7 +1,6 @@
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -16,7 +15,6 @@ from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.full_space import solve_full_space
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.levenberg_marquardt import Descent
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
@@ -273,20 +271,6 @@ def test_what_a_wrong_model_leaves_counts_as_noise_of_its_states() -> None:
     dense = np.linalg.inv(J.T @ J)[:4, :4]
     assert_allclose(np.diag(fit.covariance), np.diag(dense), rtol=1e-3)
     assert np.abs((found(fit) - list(TRUTH.values())) / spread).max() < 4
-
-
-def test_nodes_are_damped_alone_once_gaps_are_noise_and_not_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Far from an optimum it would leave nodes behind that tighter gaps cannot free."""
-    damped = list[bool]()
-
-    def descend(*given: Any, damps_nodes: bool) -> Descent:
-        damped.append(damps_nodes)
-        return Descent(*given, damps_nodes=damps_nodes)
-
-    monkeypatch.setattr("pneuopt.shooting.least_squares.Descent", descend)
-    assert solve_least_squares(shaken(2e-3)).status.converged
-    assert (damped[0], damped[-1]) == (False, True)
-    assert damped == sorted(damped)
 
 
 def test_residuals_beyond_the_noise_are_reported() -> None:

@@ -1,5 +1,7 @@
 """Nodes at which Gauss-Newton's model overshoots are damped alone, so that the rest of a log converges as fast."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,6 +11,7 @@ from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.shooting.equations import missed_curvature, normal_equations
+from pneuopt.shooting.least_squares import LeastSquares, _Search
 from pneuopt.shooting.levenberg_marquardt import Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.segments import segment, start_nodes
@@ -92,3 +95,18 @@ def test_the_missed_curvature_is_that_of_the_nodes_that_overshoot() -> None:
     for at, value in WRONG.items():
         missed = 2 * (0.3**2 - value) / 0.03**2
         assert found[at // 2] * before.arrow.diagonal[at // 2, 0, 0] == pytest.approx(missed, rel=0.02)
+
+
+@pytest.mark.parametrize("is_near", [False, True])
+def test_nodes_are_damped_alone_near_an_optimum_only(is_near: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where gaps stand for noise of the states; before, nodes would be left behind that tighter gaps cannot free."""
+    damped, search = list[bool](), _Search(segment(wrong_squares()), LeastSquares())
+    search.noisy_gaps = is_near
+
+    def descend(*given: Any, damps_nodes: bool) -> Descent:
+        damped.append(damps_nodes)
+        return Descent(*given, damps_nodes=damps_nodes)
+
+    monkeypatch.setattr("pneuopt.shooting.least_squares.Descent", descend)
+    search._run_stage()
+    assert damped == [is_near]
