@@ -24,9 +24,9 @@ from pneuopt.quantities.errors import ConvergenceError, InputError, ModelError, 
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.tuning.space import Space
 
-# Frequency at which the sign of the plant's static gain is read [rad per horizon]. A higher one may meet phase lag that
-# turns the sign; a lower one leaves the response of an integrating plant to rounding errors.
-STATIC_SIGN_FREQUENCY = 1e-3
+# Frequencies at which the sign of the plant's static gain is read [rad per horizon]. A high one may meet phase lag that
+# turns the sign, a low one a drift slower than the horizon, or rounding errors; so they have to agree.
+STATIC_SIGN_FREQUENCIES = (1e-3, 0.1)
 # Bisections for the largest part of a reference that can be held. Fewer make the message's figure coarse; each more
 # costs an equilibrium.
 BISECTION_STEPS = 10
@@ -181,9 +181,16 @@ def _static_sign(loop: ClosedLoop, case: TuningCase, space: Space) -> float:
     try:
         x, command = _find_operating_point(loop, case, space, reference.final)
         plant = linear_plant(loop, own, x, {loop.command.name: command})
-        slow, faster = frequency_response(plant, STATIC_SIGN_FREQUENCY / reference.horizon * np.array([1.0, 2.0]))
+        frequencies = np.array(STATIC_SIGN_FREQUENCIES) / reference.horizon
+        slow, faster = (frequency_response(plant, factor * frequencies) for factor in (1, 2))
     except (ConvergenceError, InputError, ModelError, np.linalg.LinAlgError):
         return 0.0
+    first, *others = [_response_sign(complex(s), complex(f)) for s, f in zip(slow, faster, strict=True)]
+    return first if all(sign == first for sign in others) else 0.0
+
+
+def _response_sign(slow: complex, faster: complex) -> float:
+    """The sign of a plant's response, by those at a frequency and at twice it."""
     if abs(slow.real) >= abs(slow.imag):
         return float(np.sign(slow.real))
     # it integrates, with a lag of 90 degrees, or differentiates, with a lead, as where a drifting position counters

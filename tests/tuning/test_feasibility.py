@@ -1,5 +1,6 @@
 """What no gains can mend is refused before anything is searched for, with the number and the remedy."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -27,7 +28,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.scenarios import NO_SCENARIOS
 from pneuopt.evaluation.specification import specify
-from pneuopt.models.catalog import s32
+from pneuopt.models.catalog import s32, t32
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, Integrator
@@ -137,6 +138,18 @@ def test_a_plant_whose_drift_counters_a_slow_command_keeps_its_sign() -> None:
     turned = turned.with_bounds({"pid.Kp": (-60.0, -0.2), "pid.Ki": (-400.0, -0.5)}).freed("pid.Kp", "pid.Ki")
     with pytest.raises(InputError, match="speed rises with valve_voltage"):
         prepare_task(loop, Step(0.1, horizon=0.8), turned, specify(SettlingTime()))
+
+
+def test_a_drift_slower_than_the_horizon_does_not_turn_the_sign() -> None:
+    """Under this dither the cylinder drifts away at .015 rad/s: slower still, its speed falls with the voltage."""
+    drive, rig = t32()
+    loop = ClosedLoop(drive.system(), PID(), Dither(frequency=1000 / (2 * math.pi)))
+    own = loop.parameters.select(loop.parameters.match_names("pid.*", "dither.*"))
+    start = {"pid.Kp": 2.335, "pid.Ki": 118.7, "dither.amplitude": 2.097, "dither.offset": -0.2097}
+    given = (rig.fixed("*") | own).with_values(start | {"pid.lower": -5.0, "pid.upper": 5.0})
+    gains = given.with_bounds({"pid.Kp": (0.2, 60.0), "pid.Ki": (0.5, 400.0)}).freed("pid.Kp", "pid.Ki")
+    step = Step(0.2, horizon=1.0, start={"position": 0.05, "pressure_b": 3.5e5})
+    prepare_task(loop, step, gains, specify(SettlingTime()))
 
 
 def test_a_dither_above_the_sampling_limit_is_refused_by_its_upper_bound() -> None:
