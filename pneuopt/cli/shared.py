@@ -59,7 +59,7 @@ def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status
     for write in writers.values():
         write()
     show_output_files(make_console(), list(writers))
-    if status is None or status.code is Code.CONVERGED:
+    if status is None or status.code in (Code.CONVERGED, Code.PARTIAL):
         return EXIT_SUCCESS
     return EXIT_INTERRUPTED if status.code is Code.INTERRUPTED else EXIT_FAILURE
 

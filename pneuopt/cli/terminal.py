@@ -49,7 +49,7 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
 def show_status(console: Console, status: Status) -> None:
     """How a computation ended: the verdict in bold, then its details, a line each."""
     verdict, *details = str(status).splitlines()
-    colour = "yellow" if status.code is Code.MISFIT else "green" if status.converged else "red"
+    colour = "yellow" if status.code in (Code.MISFIT, Code.PARTIAL) else "green" if status.converged else "red"
     show_sentence(console, verdict, style=f"bold {colour}")
     for detail in details:
         show_sentence(console, detail.strip(), indent=2)

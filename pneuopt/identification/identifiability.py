@@ -49,6 +49,9 @@ MAX_INVERSE_SINGULAR = 1e9  # inverse singular values, at most: larger are round
 # share of an estimate's variance [1] that the priors may make up: with more, the estimate rests on them and not on the
 # logs; a lower limit marks estimates that the logs do identify
 MAX_PRIOR_VARIANCE_SHARE = 0.1
+# standard deviation over the value [1] up to which such an estimate is identified all the same: a factor of ten in what
+# is held moves it by no more; higher hands out numbers that are the prior's, lower withholds friction known to 1 %
+MAX_PRIOR_DEVIATION = 0.1
 # confidence level [1] of the likelihood-ratio test that rejects held values: higher keeps wrong values, lower rejects
 # right ones by chance
 REJECTION_CONFIDENCE = 0.95
@@ -179,9 +182,15 @@ def rejects_held_values(fit: Fit, first: Fit, held: int) -> bool:
     return not rise <= noise * chi2.ppf(REJECTION_CONFIDENCE, held)
 
 
-def rests_on_prior(covariance: Array, prior_covariance: Array) -> Mask:
+def leans_on_prior(covariance: Array, prior_covariance: Array) -> Mask:
     """The mask of estimates whose variance the priors of held parameters dominate; covariances of shape (k, k)."""
     return np.asarray(np.diag(prior_covariance) > MAX_PRIOR_VARIANCE_SHARE * np.diag(covariance))
+
+
+def rests_on_prior(covariance: Array, prior_covariance: Array, values: Array) -> Mask:
+    """The mask of estimates that the logs do not identify: they lean on priors, and are not known well even so."""
+    is_close = np.sqrt(np.diag(covariance)) <= MAX_PRIOR_DEVIATION * np.abs(values)
+    return leans_on_prior(covariance, prior_covariance) & ~is_close
 
 
 def _make_verdict(

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
@@ -24,7 +23,7 @@ from pneuopt.identification.checks import (
     log_remarks,
     outputs_in_log,
 )
-from pneuopt.identification.identifiability import rests_on_prior
+from pneuopt.identification.identifiability import leans_on_prior, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts
@@ -46,7 +45,7 @@ from pneuopt.identification.widths import choose_widths
 from pneuopt.identification.windows import check_window, fit_in_windows, run_freely
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.provenance import provenance
@@ -266,17 +265,16 @@ def _result(
     variance = squares / dof
     misfit = diagnose_misfit(problem, fit, variance, dof)
     covariance = misfit.covariance
-    prior_dominated = np.zeros(len(free), dtype=bool)
+    leaning = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
-        prior_dominated = rests_on_prior(covariance, fit.prior_covariance)
-    unidentifiable = tuple(
-        n for n, dominated in zip(free, prior_dominated, strict=True) if dominated or n in problem.held
-    )
+        leaning = leans_on_prior(covariance, fit.prior_covariance)
+        resting = rests_on_prior(covariance, fit.prior_covariance, np.array([p.value for p in estimates.values()]))
+    unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.held)
     status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else misfit.assess(fit.status)
     result = IdentificationResult(
         problem.parameters.with_values(values),
-        _estimates(estimates, covariance, fit.at_bound, status, misfit),
+        _estimates(estimates, covariance, fit.at_bound, leaning, status, misfit),
         _covariance_frame(free, covariance),
         _fit_table(problem, fit),
         runs,
@@ -327,7 +325,8 @@ def _residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajector
 def _estimates(
     parameters: ParameterSet,
     covariance: Array | None,
-    at_bound: NDArray[np.bool_],
+    at_bound: Mask,
+    leaning: Mask,
     status: Status,
     misfit: Misfit,
 ) -> "pd.DataFrame":
@@ -340,7 +339,7 @@ def _estimates(
         deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
         ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
-        mark = misfit.mark(is_optimum=status.converged and not at_bound[i])
+        mark = misfit.mark(is_optimum=status.converged and not at_bound[i] and not leaning[i])
         rows[name] = [
             p.value,
             deviation,

@@ -74,6 +74,8 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
             raise
         interrupted = True
     held, fit, label = fits[0]
+    if not interrupted:
+        held, fit = fit_a_part(held, fit, label)
     return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
 
 
@@ -173,6 +175,37 @@ def _hold_unidentifiable(
         if fit.status.code in (Code.INTERRUPTED, Code.DIVERGED):
             break
     return held, fit
+
+
+def fit_a_part(problem: EstimationProblem, fit: Fit, label: str) -> tuple[EstimationProblem, Fit]:
+    """Where a search did not settle in a parameter, the fit of the others with that one held where it had come to.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    fit : Fit
+        The best of all starts.
+    label : str
+
+    Returns
+    -------
+    problem : EstimationProblem
+        With what is held.
+    fit : Fit
+        The given one, where nothing was unsettled, or the rest does not converge either.
+    """
+    held, part = problem, fit
+    warm = replace(problem.method, stages=problem.method.stages[-REFIT_STAGES:])
+    while not part.status.converged:
+        names = part.unidentifiable or part.unsettled
+        if not names or len(held.held) + len(names) >= len(part.parameters.free_names):
+            return problem, fit
+        held = replace(held, held={**held.held, **{n: part.parameters.value(n) for n in names}})
+        before, part = part, solve_least_squares(held.transcription(held.start_from(part, label)), warm)
+        part = part.with_effort_of(before)
+        if part.status.code in (Code.INTERRUPTED, Code.DIVERGED):
+            return problem, fit
+    return held, part
 
 
 def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:

@@ -31,7 +31,8 @@ class Mark(StrEnum):
     WIDENED
         The residuals exceed the noise, are correlated, or differ from log to log; the interval counts that.
     BIAS_POSSIBLE
-        The model misses a part of the motion, or the estimate is at its bound; no interval holds the error of that.
+        The model misses a part of the motion, or the estimate is at its bound; no interval holds the error of that. Or
+        most of the interval is what a factor of ten in an unidentifiable parameter does, to first order.
     UNIDENTIFIABLE
         The logs do not determine the parameter.
     """

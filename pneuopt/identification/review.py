@@ -28,6 +28,7 @@ from pneuopt.identification.result import (
 )
 from pneuopt.identification.widths import advise_widths
 from pneuopt.quantities.status import Code, Status
+from pneuopt.quantities.units import write_value
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.equations import segment_gaps
 from pneuopt.shooting.segments import segment, start_nodes
@@ -94,7 +95,7 @@ def review_fit(
         verdict = add_unidentifiable(verdict, unidentifiable, local, _names_at_given_value(problem))
     estimates = _add_notes(_replace_intervals(result.estimates, profiles, verdict), verdict)
     covariance = _blank_covariance(result.covariance, estimates.index[estimates["stderr"].isna()])
-    status = _name_interruption(result.status, waiting).with_details(_name_unidentifiable(verdict))
+    status = _name_part(problem, _name_interruption(result.status, waiting), verdict)
     return replace(result, estimates=estimates, covariance=covariance, status=status, verdict=verdict)
 
 
@@ -196,6 +197,17 @@ def _locate_failure(problem: EstimationProblem, start: Start, status: Status, ve
             _name_unidentifiable(verdict), "fix what is unidentifiable, or log a run that shows it"
         )
     return status.with_remedies(*advise_widths(problem))
+
+
+def _name_part(problem: EstimationProblem, status: Status, verdict: Verdict) -> Status:
+    """The status of a fit with what its logs do not identify, and where that is held; first where it is good."""
+    unknowns = problem.unknowns()
+    held = [f"{n} at {write_value(problem.held[n], p.unit, 3)}" for n, p in unknowns.items() if n in problem.held]
+    words = f"held: {join_names(held)}; the intervals of the others allow for a factor of ten" if held else ""
+    said = tuple(filter(None, (_name_unidentifiable(verdict), words)))
+    if not said or status.code is not Code.CONVERGED:
+        return status.with_details(*said)
+    return Status(Code.PARTIAL, (*said, *status.sentences))
 
 
 def _name_unidentifiable(verdict: Verdict) -> str:

@@ -11,6 +11,7 @@ class Code(Enum):
     """Why a solver stopped."""
 
     CONVERGED = "converged"
+    PARTIAL = "converged for a part of the parameters"
     MISFIT = "converged, but the model misses the logs"
     NOT_CONVERGED = "not converged"
     ITERATION_LIMIT = "iteration limit reached"
@@ -36,8 +37,12 @@ class Status:
 
     @property
     def converged(self) -> bool:
-        """Whether the search ended at an optimum; the answer may be trusted unless the code is `Code.MISFIT`."""
-        return self.code in (Code.CONVERGED, Code.MISFIT)
+        """Whether the search ended at an optimum.
+
+        The answer may be trusted unless the code is `Code.MISFIT`; that of `Code.PARTIAL` holds no value of what it
+        names as unidentifiable.
+        """
+        return self.code in (Code.CONVERGED, Code.PARTIAL, Code.MISFIT)
 
     @property
     def verdict(self) -> str:

@@ -20,10 +20,14 @@ NO_POSITIONS = np.zeros(0, dtype=np.intp)
 
 
 class ConvergenceTest(NamedTuple):
-    """The status of an iterate, and the positions of free parameters that the data do not determine there."""
+    """The status of an iterate, and the positions of free parameters that the data do not determine there.
+
+    `unsettled` is the one that would still move most where nothing else is wrong.
+    """
 
     status: Status
     unidentifiable: Indices = NO_POSITIONS
+    unsettled: Indices = NO_POSITIONS
 
 
 def assess_convergence(
@@ -75,7 +79,7 @@ def assess_convergence(
         verdict = f"{names[keep][worst]} would still move by {step[worst] / noise:.2g} standard deviations"
         remedy = "try more iterations, other start values, or fix a parameter"
         status = Status(Code.NOT_CONVERGED, (verdict, remedy))
-        return ConvergenceTest(status, _least_certain(own, noise * spread, space))
+        return ConvergenceTest(status, _least_certain(own, noise * spread, space), own[[worst]])
     bounded = np.flatnonzero(space.at_bound(z) & ~space.held)
     return ConvergenceTest(
         _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(bounded, space, reduced, noise)

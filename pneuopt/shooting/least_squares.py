@@ -334,11 +334,11 @@ class _Search:
         }
         at_bound, held = self.scaling.at_bound(current.z) & ~self.scaling.held, self.scaling.held
         keep = self.scaling.has_effect(equations) & ~at_bound & ~held
-        covariance, prior, optimum, unidentifiable = None, None, None, tuple[str, ...]()
+        covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
         if math.isfinite(equations.cost):
             covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
             prior = equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
-            unidentifiable = self._unidentifiable()
+            names = self._doubtful_parameters()
         if covariance is not None:
             gaps = self.stage.gap * self.gap_scales
             optimum = Optimum(equations, run, current.nodes, q, keep, gaps, self.substeps)
@@ -352,17 +352,17 @@ class _Search:
             equations.count,
             at_bound,
             equations.gaps[self.segments.linked] if self.noisy_gaps else None,
-            unidentifiable,
+            *names,
             prior,
             optimum=optimum,
         )
 
-    def _unidentifiable(self) -> tuple[str, ...]:
-        """The parameters that the data do not determine; none where the search refused its start, which shows none."""
+    def _doubtful_parameters(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
         if self._is_too_stiff:
-            return ()
-        free = self.segments.transcription.parameters.free_names
-        return tuple(free[i] for i in self._assess(self.current).unidentifiable)
+            return (), ()
+        free, found = self.segments.transcription.parameters.free_names, self._assess(self.current)
+        return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
 
     def _integration_error(self, run: RolloutResult) -> float:
         """Largest change of an output when the steps are halved [noise standard deviations]."""

@@ -89,6 +89,8 @@ class Fit:
         The gap behind each linked segment, in nominal sizes, if the gaps stand for noise of the states.
     unidentifiable : tuple of str
         The parameters that the data do not determine here; a caller holds them, and fits again.
+    unsettled : tuple of str
+        The parameter along which the search was still moving when it gave up; empty where it ended otherwise.
     prior_covariance : ndarray, shape (k, k), or None
         The covariance due to a weak prior of held parameters (`NormalEquations.prior_covariance`); None where nothing
         is held.
@@ -108,6 +110,7 @@ class Fit:
     at_bound: Mask
     jumps: Array | None = None
     unidentifiable: tuple[str, ...] = ()
+    unsettled: tuple[str, ...] = ()
     prior_covariance: Array | None = None
     variance_inflation: float = 1.0
     optimum: Optimum | None = None

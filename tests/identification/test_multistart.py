@@ -158,3 +158,20 @@ def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pyt
     held, fit = starting.fit_holding_unidentifiable(problem, stiff)
     assert "so stiff that a sample takes" in fit.status.verdict
     assert (dict(held.held), fit.unidentifiable, calls) == ({}, (), 1)
+
+
+def test_a_parameter_that_did_not_settle_is_held_and_the_others_are_fitted() -> None:
+    problem = posed(Stribeck())
+    start = problem.candidates()[0]
+    far = replace(start, parameters={**start.parameters, "friction.static": 90.0, VELOCITY: 0.004})
+    few = replace(problem.method, stages=(Stage(1e-3, 1), Stage(1e-5, 2)))
+    unsettled = solve_least_squares(problem.transcription(far), few)
+    assert not unsettled.status.converged
+    assert len(unsettled.unsettled) == 1
+    assert unsettled.unsettled[0] in unsettled.status.verdict
+    held, part = starting.fit_a_part(problem, unsettled, "start")
+    assert part.status.converged
+    assert 0 < len(held.held) < len(TRUTH)
+    assert {n: part.parameters.value(n) for n in held.held} == dict(held.held)
+    done = solve_least_squares(problem.transcription(start), problem.method)
+    assert starting.fit_a_part(problem, done, "start") == (problem, done)
