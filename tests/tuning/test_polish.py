@@ -1,6 +1,7 @@
 """Gradients of a search: exact slopes, known optima, and every limit certified in every scenario."""
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -220,24 +221,21 @@ def test_a_tolerance_spreads_the_candidate(sample_time: float | None) -> None:
     assert best.certified["0 to 1 [pid.Kp low]"]["SettlingTime"] == pytest.approx(math.log(50) / 9.0, rel=0.015)
 
 
-def on_corners(limits: list[Requirement], method: Racing | None = None) -> TuningResult:
+IN_CORNERS = (Overshoot(0.05), MaxSensitivity(1.5), SteadyStateError(0.02))
+
+
+@cache
+def on_corners(*limits: Requirement) -> TuningResult:
     loop, given = friction_loop(Dither(80.0))
     spreads: dict[str | tuple[str, ...], float] = {"load.mass": 0.3, ("friction.coulomb", "friction.static"): 0.2}
-    scenarios = corners(given, spreads)
+    scenarios, step = corners(given, spreads), Step(0.1, horizon=0.3)
     return tune(
-        loop,
-        Step(0.1, horizon=0.3),
-        given,
-        minimise=SettlingTime(),
-        subject_to=limits,
-        scenarios=scenarios,
-        method=method,
-        plants={},
+        loop, step, given, minimise=SettlingTime(), subject_to=limits, scenarios=scenarios, method=QUICK, plants={}
     )
 
 
 def test_limits_are_kept_in_every_corner() -> None:
-    best = on_corners([Overshoot(0.05), MaxSensitivity(1.5), SteadyStateError(0.02)], QUICK)
+    best = on_corners(*IN_CORNERS)
     assert best.status.converged
     assert best.certified.shape[1] == 5
     assert bool((best.certified.loc["Overshoot"] <= 5.0).all())
@@ -247,9 +245,9 @@ def test_limits_are_kept_in_every_corner() -> None:
 
 
 def test_a_limit_holds_the_answer_back() -> None:
-    free = on_corners([Overshoot(0.05)], QUICK).certified
+    free = on_corners(*IN_CORNERS).certified
     most = 0.85 * free.loc["PeakControl"].to_numpy(dtype=float).max()
-    held = on_corners([Overshoot(0.05), PeakControl(most)], QUICK)
+    held = on_corners(*IN_CORNERS, PeakControl(most))
     assert held.certified.loc["PeakControl"].max() <= most
     assert held.certified.loc["SettlingTime"].max() > 1.02 * free.loc["SettlingTime"].max()
     assert "PeakControl" in held.active

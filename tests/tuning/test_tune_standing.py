@@ -15,8 +15,8 @@ from pneuopt.tuning.tune import tune
 
 def test_limits_that_only_a_standing_drive_keeps() -> None:
     """A command that rises by 1 N/s takes 45 s to overcome the static friction of 45 N; the record ends after 0.5 s."""
-    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=2e-3))
-    gains, bounds = {"pid.Kp": 300.0, "pid.Ki": 4000.0}, {"pid.Kp": (0.0, 900.0), "pid.Ki": (0.0, 20000.0)}
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(sample_time=5e-3))
+    gains, bounds = {"pid.Kp": 0.0, "pid.Ki": 4000.0}, {"pid.Ki": (0.0, 20000.0)}
     given = loop.parameters.with_values(gains).with_bounds(bounds).freed(*bounds)
     limits = [ControlRate(1.0), PeakControl(100.0)]
     quick = Racing(members=10, trials=40)
