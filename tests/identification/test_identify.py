@@ -158,7 +158,7 @@ def test_conditions_and_own_values_of_each_log() -> None:
     off = deviations(result, truth)
     assert max(off.values()) < 4, off
     assert result.parameters.value("load.force") == free.value("load.force")
-    wrong = identify(ForceDrive(Coulomb()).system(), [a, b.with_conditions({"load.mass": 2.0})], free, throw=False)
+    wrong = identify(ForceDrive(Coulomb()).system(), [b.with_conditions({"load.mass": 2.0})], free, throw=False)
     assert wrong.stats["chi_square_ratio"] > 100
 
 
