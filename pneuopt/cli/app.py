@@ -67,7 +67,9 @@ def identify_command(
     window: Window = None,
     accept: Annotated[
         list[str] | None,
-        typer.Option(metavar="CHECK", help="The logs are right: motion, speed, work, command, pressures; repeatable."),
+        typer.Option(
+            metavar="CHECK", help="Logs are right: motion, speed, work, command, scale, pressures; repeatable."
+        ),
     ] = None,
     select: Annotated[
         bool, typer.Option("--select", help="Compare friction models instead, and recommend one.")

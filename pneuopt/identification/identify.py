@@ -99,8 +99,8 @@ def identify(
         Cut the logs into windows of this time [s], each with a start state of its own; by default only where the model
         does not follow whole logs, and of the length that gives the narrowest intervals (`result.window`).
     accept : sequence of str
-        Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "pressures".
-        What these find stands in the status.
+        Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "scale",
+        "pressures". What these find stands in the status.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
 

@@ -36,14 +36,17 @@ MAX_SLOPE_NOISE_SHARE = 0.1
 MAX_WHITE_LAG = 20
 """Lags [samples] that white noise leaves uncorrelated: with one, motion at a quarter of the rate looks white."""
 STILL_STEPS = 2.0
-"""Range of a channel that rests, in steps of its resolution [1]: more takes small motion for rest, fewer flicker for
-motion."""
+"""Range at rest in steps of the resolution [1]: more takes small motion for rest, fewer flicker for motion."""
 MAX_COMMAND_LAG = 0.1
 """Time [s] within which a drive's speed follows its valve: longer finds chance correlations, shorter misses drives."""
 WRONG_SIGN_CORRELATIONS = (-0.6, 0.3)
 """The sign is wrong if the least correlation of command and speed is below the first, the largest below the second."""
 RECIPROCATING_TRAVEL_RATIO = 1.9
 """Travel over range [1]: at 2 a piston has come back, so it is commanded; a lower bound blames overshoot."""
+MAX_PISTON_SPEED = 50.0
+"""Speed [m/s] that no piston or linear servo has; lower blames fast ones, higher misses slow ones in mm."""
+MAX_PRESSURE = 1e7
+"""Pressure [Pa] that no pneumatic drive has, 100 bar; lower blames blow moulding, higher misses units."""
 CLIPPED_SHARE = 0.02
 """Share of samples at the largest value [1] that looks clipped: lower blames rest, higher misses short clipping."""
 
@@ -257,9 +260,8 @@ def _check_command(experiment: Experiment, axis: AxisChannels) -> Iterator[Findi
     if len(t) < 2 * MEAN_BLOCKS:
         return
     if not np.any(np.diff(command)):
-        travel = np.cumsum(motion[1:] * np.diff(t))[
-            :: max(1, len(t) // (5 * MEAN_BLOCKS))
-        ]  # coarse: noise is no travel
+        every = max(1, len(t) // (5 * MEAN_BLOCKS))  # coarse: noise is no travel
+        travel = np.cumsum(motion[1:] * np.diff(t))[::every]
         if float(np.abs(np.diff(travel)).sum()) > RECIPROCATING_TRAVEL_RATIO * float(np.ptp(travel)) > 0:
             message = "'valve_voltage' is constant while the piston goes to and fro: log the command that moves it"
             yield Finding("valve_voltage", message, True)
@@ -310,6 +312,10 @@ def _check_pressures(experiment: Experiment, _: AxisChannels) -> Iterator[Findin
         if low < MIN_PRESSURE_RATIO * ATMOSPHERE:
             message = f"{name!r} falls to {low / 1e5:.2f} bar(a), a vacuum; a gauge sensor's unit is written bar(g)"
             yield Finding(name, message, True)
+        elif high > MAX_PRESSURE:
+            yield Finding(
+                name, f"{name!r} rises to {high / 1e5:.3g} bar(a), more than air drives have: its unit?", True
+            )
         elif supply is not None and high > 1.1 * supply and name != "supply_pressure":
             message = f"{name!r} rises to {high / 1e5:.2f} bar(a), above the supply of {supply / 1e5:.2f} bar(a)"
             yield Finding(name, f"{message}; is an absolute sensor read as bar(g)?", True)
@@ -329,9 +335,7 @@ def _check_sampling(experiment: Experiment, axis: AxisChannels) -> Iterator[Find
         for end, which in ((y.max(initial=-np.inf), "largest"), (y.min(initial=np.inf), "smallest")):
             share = float(np.mean(y == end)) if y.size else 0.0
             if name.startswith("pressure") and levels > 50 and share > CLIPPED_SHARE:
-                message = (
-                    f"{share:.0%} of the samples of {name!r} have exactly its {which} value: is the sensor clipped?"
-                )
+                message = f"{share:.0%} of {name!r} are exactly its {which} value: is the sensor clipped?"
                 yield Finding(name, message, False)
         if name in (axis.position, axis.speed) and 2 < levels < min(50, y.size // 4):
             message = f"{name!r} has only {levels} levels, the resolution is coarse for the motion"
@@ -375,11 +379,21 @@ def _slope(t: Array, y: Array, half: int) -> Array:
     return slope
 
 
+def _check_scale(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+    """Find motion of a size that no drive has, as millimetres that are read as metres."""
+    log, motion = experiment.trajectory, _motion_speed(experiment, axis)
+    fastest = 0.0 if motion is None else float(np.nanpercentile(np.abs(motion), 99))
+    if axis.position == PISTON_CHANNELS.position and fastest > MAX_PISTON_SPEED:
+        name = axis.speed if axis.speed in log else axis.position
+        yield Finding(name, f"{name!r} moves at {fastest:.3g} m/s: is its unit mm, and read as m?", True)
+
+
 CHECKS: dict[str, Callable[[Experiment, AxisChannels], Iterator[Finding]]] = {
     "motion": _check_has_motion,
     "speed": _check_position_speed,
     "work": _check_work_sign,
     "command": _check_command,
+    "scale": _check_scale,
     "pressures": _check_pressures,
     "sampling": _check_sampling,
 }

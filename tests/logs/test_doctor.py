@@ -208,3 +208,15 @@ def test_a_fault_shows_the_signals_that_contradict_each_other() -> None:
     true = 0.3 * np.cos(2 * np.pi * at)
     assert slope == pytest.approx(-true, rel=0.1)
     assert speed == pytest.approx(true, rel=0.1)
+
+
+def test_millimetres_read_as_metres_are_named_before_a_fit() -> None:
+    """Speed and force agree with the position then, but for a factor; the fit used to end in a stiff model."""
+    run = hunting(1.0, 500.0, 10.0)
+    t = run.pop("time")
+    (told,) = faults(Experiment(Trajectory(t, {"position": 1e3 * run["position"], "force": run["force"]})))
+    assert re.fullmatch(r"'position' moves at (19\d|20\d|2e\+02) m/s: is its unit mm, and read as m\?", told)
+    both = {"position": 1e3 * run["position"], "speed": 1e3 * run["speed"], "force": run["force"]}
+    assert [f.check for f in examine(Experiment(Trajectory(t, both))) if f.fault] == ["scale"]
+    high = {n: 1e3 * swing().trajectory[n] for n in ("pressure_a", "pressure_b")}
+    assert any("more than air drives have: its unit?" in message for message in faults(swing(**high)))
