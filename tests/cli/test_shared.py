@@ -1,0 +1,33 @@
+"""What every command does at its end, and says of the files that it is given."""
+
+from pathlib import Path
+
+import pytest
+
+from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
+from pneuopt.cli.shared import Outputs, finish, warn_of_status
+from pneuopt.quantities.status import Code, Status
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        (None, EXIT_SUCCESS),
+        (Code.CONVERGED, EXIT_SUCCESS),
+        (Code.MISFIT, EXIT_FAILURE),
+        (Code.NOT_CERTIFIED, EXIT_FAILURE),
+        (Code.INTERRUPTED, EXIT_INTERRUPTED),
+    ],
+)
+def test_a_fit_far_beyond_its_noise_is_no_success(code: Code | None, expected: int) -> None:
+    assert finish(Outputs(None, None, None), {}, {}, code and Status(code, ("said",))) == expected
+
+
+@pytest.mark.parametrize(("mark", "warns"), [("exact", False), ("widened", False), ("bias possible", True)])
+def test_estimates_that_may_be_biased_are_named_by_later_commands(
+    mark: str, warns: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "fit.toml"
+    path.write_text(f'[estimates]\n"friction.coulomb" = {{ mark = "{mark}" }}\n', encoding="utf-8")
+    warn_of_status(path)
+    assert ("may be biased by a model error: friction.coulomb" in capsys.readouterr().err) is warns
