@@ -81,7 +81,7 @@ from .models.friction import (
     Stribeck,
     Viscous,
 )
-from .models.friction_laws import friction_ladder
+from .models.friction_laws import friction_ladder, friction_order
 from .models.karnopp import Karnopp
 from .models.linear import FirstOrder, Integrator, SecondOrder
 from .models.load import Load
@@ -91,6 +91,7 @@ from .models.pneumatic.cylinder import Cylinder
 from .models.pneumatic.drive import PneumaticDrive
 from .models.pneumatic.gas import IsentropicNozzle, Iso6358
 from .models.pneumatic.valve import ProportionalValve, Spool
+from .models.presliding import Presliding
 from .models.rotary import RotaryDrive
 from .models.sensing import coarse_delay, with_sensors
 from .plotting import (
@@ -196,6 +197,7 @@ __all__ = [
     "PneumaticDrive",
     "PneuoptError",
     "Polytropic",
+    "Presliding",
     "PressureDependent",
     "Profile",
     "PropagatedValue",
@@ -249,6 +251,7 @@ __all__ = [
     "find_limit_cycle",
     "frequency_response",
     "friction_ladder",
+    "friction_order",
     "grid",
     "identifiability",
     "identify",

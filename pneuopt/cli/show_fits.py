@@ -63,7 +63,8 @@ def show_selection(console: Console, chosen: ModelSelection) -> None:
         unidentifiable = row["unidentifiable"]
         missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
         note = "" if row["converged"] else "not converged"
-        table.add_row(str(row["model"]), *figures, note or missing)
+        bound = f"{AT_BOUND_NOTE}: {row['at_bound']}" if row["at_bound"] else ""
+        table.add_row(str(row["model"]), *figures, note or row["unphysical"] or bound or missing)
     console.print(table)
 
 

@@ -26,7 +26,7 @@ from pneuopt.identification.checks import (
 from pneuopt.identification.identifiability import leans_on_prior, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
-from pneuopt.identification.multistart import fit_from_starts
+from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
 from pneuopt.identification.problem import (
     EstimationProblem,
     apply_conditions,
@@ -77,6 +77,7 @@ def identify(
     estimate_noise: bool = False,
     window: float | None = None,
     accept: Sequence[str] = (),
+    start: IdentificationResult | None = None,
     throw: bool = True,
 ) -> IdentificationResult:
     """Fit the free parameters and every log's start state to the logs; no guess is needed from the user.
@@ -101,6 +102,9 @@ def identify(
     accept : sequence of str
         Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "scale",
         "pressures". What these find stands in the status.
+    start : IdentificationResult, optional
+        A fit of these logs with a model that has the same states, from which the search begins; by default the model's
+        own starts.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
 
@@ -136,7 +140,10 @@ def identify(
     if window is not None:
         check_window(problem)
     problem, widths = choose_widths(problem)
-    held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
+    if start is None:
+        held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
+    else:
+        (held, fit), label = fit_holding_unidentifiable(problem, problem.start_from(start)), "a given fit"
     chosen = None if window is None else ChosenWindow(window, window, window, fit.stats["gap_share"])
     if windowed := fit_in_windows(held, fit):
         held, fit, chosen = windowed

@@ -4,12 +4,15 @@ import fnmatch
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.runnable import HasSystem, as_system
 from pneuopt.dynamics.system import System, names
+from pneuopt.identification.candidates import Candidate, fit_candidates
 from pneuopt.identification.checks import as_experiments
-from pneuopt.identification.identify import identify, validate
+from pneuopt.identification.excitation import remedy
+from pneuopt.identification.identify import validate
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
@@ -24,6 +27,9 @@ if TYPE_CHECKING:
 # probability [1] below which a likelihood-ratio test rejects the simpler model: higher keeps terms that are chance,
 # lower drops weak true ones
 NESTED_TEST_LEVEL = 0.01
+# difference of the BIC [1] below which held-out runs, or simplicity, decide: a ratio of the likelihoods of 20 (Kass and
+# Raftery 1995); higher lets few samples decide, lower takes chance for evidence
+TIE = 6.0
 # held-out NRMSE over a simpler model's [1] above which the richer one is not recommended: higher recommends models that
 # predict worse, lower lets noise decide
 MAX_HELD_OUT_RATIO = 1.02
@@ -38,7 +44,7 @@ class ModelSelection:
     table : DataFrame
         A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's),
         contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
-        unidentifiable and at_bound (names of parameters), message.
+        unidentifiable and at_bound (names of parameters), unphysical (which of `at_least` it breaks), message.
     recommended : str
         A candidate's name.
     reason : str
@@ -65,8 +71,9 @@ def select_model(
     held_out: Experiment | Sequence[Experiment] = (),
     method: LeastSquares | None = None,
     window: float | None = None,
+    at_least: Mapping[str, str] = MappingProxyType({}),
 ) -> ModelSelection:
-    """Fit every candidate and recommend one.
+    """Fit every candidate alike and recommend one.
 
     Parameters
     ----------
@@ -81,7 +88,10 @@ def select_model(
         Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
     method : LeastSquares, optional
     window : float, optional
-        As of `identify`.
+        As of `identify`; by default the longest that a candidate needs.
+    at_least : mapping of str to str, optional
+        Parameters that no drive has below another one: `friction_order()`, static friction below
+        Coulomb friction.
 
     Returns
     -------
@@ -96,11 +106,13 @@ def select_model(
 
     Notes
     -----
-    The deviance is the squared residuals over their variance in the best candidate, and over the factor by which that
-    candidate's variances exceed those of white residuals: as if only independent samples counted. Between nested
-    candidates it falls as chi-square with the extra parameters
-    (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable parameters count among the k, so
-    that a candidate with such parameters gives way to a simpler one that fits as well.
+    All are fitted in the same windows and at the same widths (`fit_candidates` says why). The deviance is the squared
+    residuals over their variance in the best candidate, and over the factor by which that candidate's variances exceed
+    those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
+    with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
+    parameters count among the k, so that a candidate with such parameters gives way to a simpler one that fits as well.
+    A candidate that did not converge, ends at a bound or breaks `at_least` is not recommended while there is another.
+    Among those within `TIE` of the lowest BIC the held-out runs decide, and without any the fewer parameters.
     """
     check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
     require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
@@ -109,17 +121,16 @@ def select_model(
     check_parameters(parameters)
     given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
     _check_names(given, parameters, free)
-    fits = {
-        n: identify(s, experiments, given[n], method=method, window=window, throw=False) for n, s in systems.items()
-    }
+    fits = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
     converged = [n for n, fit in fits.items() if fit.status.converged]
     if not converged:
         message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
         raise ConvergenceError(f"none of the candidates converged: {message}", fits)
     predicted = {n: _mean_nrmse(systems[n], held_out, fits[n]) for n in converged}
-    rows = _candidate_rows(systems, fits, predicted)
-    chosen, passed_over = _choose(rows)
-    return ModelSelection(_selection_table(rows), chosen, _selection_reason(rows, chosen, passed_over), fits)
+    rows = _candidate_rows(systems, fits, predicted, at_least)
+    chosen, why = _choose(rows)
+    reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
+    return ModelSelection(_selection_table(rows), chosen, reason, fits)
 
 
 @dataclass(frozen=True)
@@ -135,7 +146,20 @@ class _CandidateRow:
     held_out_nrmse: float
     unidentifiable: str
     at_bound: str
+    unphysical: str
     message: str
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether it converged to values that a drive may have."""
+        return self.converged and not (self.at_bound or self.unphysical)
+
+    @property
+    def defect(self) -> str:
+        """Why it is not recommended, in a few words."""
+        if not self.converged:
+            return self.message.partition(";")[0]
+        return f"{self.at_bound} at a bound" if self.at_bound else self.unphysical
 
 
 def _candidate_parameters(system: System, parameters: ParameterSet, free: Sequence[str]) -> ParameterSet:
@@ -170,7 +194,10 @@ def _mean_nrmse(system: System, held_out: Sequence[Experiment], fit: Identificat
 
 
 def _candidate_rows(
-    candidates: Mapping[str, System], fits: Mapping[str, IdentificationResult], predicted: Mapping[str, float]
+    candidates: Mapping[str, System],
+    fits: Mapping[str, IdentificationResult],
+    predicted: Mapping[str, float],
+    at_least: Mapping[str, str],
 ) -> dict[str, _CandidateRow]:
     """A row for each candidate, the lowest BIC first, those that did not converge last."""
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
@@ -185,9 +212,16 @@ def _candidate_rows(
         if inside:
             p = likelihood_ratio_p(_chi_square(fits[inside]) / scale - deviance, k - len(fits[inside].estimates))
         held_out = predicted.get(name, math.nan)
-        notes = _names_with_note(fit, UNIDENTIFIABLE_NOTE), _names_with_note(fit, AT_BOUND_NOTE), fit.status.message
-        rows[name] = _CandidateRow(fit.status.converged, k, deviance, bic, inside, p, held_out, *notes)
+        notes = _names_with_note(fit, UNIDENTIFIABLE_NOTE), _names_with_note(fit, AT_BOUND_NOTE)
+        said = _unphysical(fit.parameters, at_least), fit.status.message
+        rows[name] = _CandidateRow(fit.status.converged, k, deviance, bic, inside, p, held_out, *notes, *said)
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
+
+
+def _unphysical(found: ParameterSet, at_least: Mapping[str, str]) -> str:
+    """Which parameters are below those that no drive has them below; empty if none is."""
+    below = [(n, m) for n, m in at_least.items() if n in found and m in found and found.value(n) < found.value(m)]
+    return ", ".join(f"{n} ({found.value(n):.4g}) below {m} ({found.value(m):.4g})" for n, m in below)
 
 
 def _names_with_note(fit: IdentificationResult, note: str) -> str:
@@ -223,36 +257,78 @@ def _residual_count(fit: IdentificationResult) -> float:
 
 
 def _choose(rows: Mapping[str, _CandidateRow]) -> tuple[str, str]:
-    """The candidate of lowest BIC that passes its nested test and predicts held-out runs; the first that failed."""
-    passed_over, name = "", next(iter(rows))
-    while inside := rows[name].contains:
-        row = rows[name]
-        if (
-            row.p_value <= NESTED_TEST_LEVEL
-            and not row.held_out_nrmse > MAX_HELD_OUT_RATIO * rows[inside].held_out_nrmse
+    """The recommended candidate, and why it comes before that of the lowest BIC; "" where it is that one."""
+    sound = {n: row for n, row in rows.items() if row.is_sound} or {n: row for n, row in rows.items() if row.converged}
+    lowest = next(iter(sound))
+    tied = [n for n, row in sound.items() if row.bic - sound[lowest].bic < TIE]
+    name, why = _break_tie(sound, tied)
+    while inside := sound[name].contains:
+        row = sound[name]
+        by_chance = row.p_value > NESTED_TEST_LEVEL
+        if inside not in sound or not (
+            by_chance or row.held_out_nrmse > MAX_HELD_OUT_RATIO * sound[inside].held_out_nrmse
         ):
             break
-        passed_over, name = passed_over or name, inside
-    return name, passed_over
+        how = f"may be chance (p = {row.p_value:.2g})" if by_chance else "predict the held-out runs worse"
+        why, name = why or f"for {name}'s extra terms {how}", inside
+    return name, why
 
 
-def _selection_reason(rows: Mapping[str, _CandidateRow], chosen: str, passed_over: str) -> str:
+def _break_tie(rows: Mapping[str, _CandidateRow], tied: Sequence[str]) -> tuple[str, str]:
+    """Of candidates with about the same BIC the one that predicts held-out runs best, or the one with fewest terms."""
+    lowest = tied[0]
+    best = min(tied, key=lambda n: rows[n].held_out_nrmse)
+    if rows[best].held_out_nrmse * MAX_HELD_OUT_RATIO < rows[lowest].held_out_nrmse:
+        return best, f"as held-out runs decide between it and {lowest}, whose BIC is within {TIE:g}"
+    level = [n for n in tied if not rows[n].held_out_nrmse > MAX_HELD_OUT_RATIO * rows[best].held_out_nrmse]
+    simplest = min(level, key=lambda n: rows[n].free)
+    if rows[simplest].free < rows[lowest].free:
+        return simplest, f"as {lowest}, whose BIC is within {TIE:g}, has more parameters and predicts no better"
+    return lowest, ""
+
+
+def _separate(
+    rows: Mapping[str, _CandidateRow],
+    chosen: str,
+    fits: Mapping[str, IdentificationResult],
+    systems: Mapping[str, System],
+) -> str:
+    """What separates the chosen candidate from the next sound one, or would; "" where there is no other."""
+    others = [n for n, row in rows.items() if row.is_sound and n != chosen]
+    if not others:
+        return ""
+    other = min(others, key=lambda n: abs(rows[n].bic - rows[chosen].bic))
+    fall, extra = abs(rows[other].deviance - rows[chosen].deviance), abs(rows[other].free - rows[chosen].free)
+    if abs(rows[other].bic - rows[chosen].bic) >= TIE:
+        return f"{other} is next"
+    terms = sorted(set(fits[other].estimates.index) ^ set(fits[chosen].estimates.index))
+    if not terms:
+        return ""
+    run = remedy(systems[max(other, chosen, key=lambda n: rows[n].free)].excitation, terms)
+    if fall <= 2 * max(1, extra):
+        return f"these logs do not tell it from {other}, nor would more of the same: {run}"
+    times = max(2.0, (TIE + extra * math.log(_residual_count(fits[chosen]))) / fall)
+    return f"to tell it from {other}, log about {times:.0f} times as much; or {run}"
+
+
+def _selection_reason(rows: Mapping[str, _CandidateRow], chosen: str, why: str, separation: str) -> str:
     """The sentence that justifies the choice."""
     row, good = rows[chosen], [n for n, r in rows.items() if r.converged]
     message = f"{chosen}, of {len(good)} converged candidates"
-    if passed_over:
-        p = rows[passed_over].p_value
-        why = f"may be chance (p = {p:.2g})" if p > NESTED_TEST_LEVEL else "predict the held-out runs worse"
-        message += f", for {passed_over}'s extra terms {why}"
-    elif len(good) > 1:
-        message += f", has the lowest BIC, {rows[good[1]].bic - row.bic:.4g} below {good[1]}"
+    behind = [n for n in good if n != chosen and rows[n].bic >= row.bic]
+    if why:
+        message += f", {why}"
+    elif behind:
+        message += f", has the lowest BIC, {rows[behind[0]].bic - row.bic:.4g} below {behind[0]}"
     if row.contains:
         message += f"; the simpler {row.contains} is rejected (p = {row.p_value:.2g})"
     if math.isfinite(row.held_out_nrmse):
         message += f"; it predicts held-out runs with an NRMSE of {row.held_out_nrmse:.2%}"
     if row.unidentifiable:
         message += f"; the logs do not identify its {row.unidentifiable}"
-    if row.at_bound:
-        message += f"; at a bound: {row.at_bound}"
-    failed = [n for n in rows if n not in good]
-    return message + (f"; not converged: {', '.join(failed)}" if failed else "")
+    if row.is_sound:
+        message += f"; {separation}" if separation else ""
+    else:
+        message += f"; no candidate is without a defect, nor is this one: {row.defect}"
+    refuted = [f"{n} ({r.defect})" for n, r in rows.items() if n != chosen and not r.is_sound]
+    return message + (f"; refuted: {', '.join(refuted)}" if refuted else "")

@@ -17,6 +17,7 @@ from pneuopt.models.friction import (
     Viscous,
 )
 from pneuopt.models.load_dependent import LoadDependent
+from pneuopt.models.presliding import Presliding
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Wrapper:
 FRICTION_LAWS: Mapping[str, Callable[[], FrictionModel]] = {
     "viscous": Viscous,
     "coulomb": Coulomb,
+    "presliding": Presliding,
     "stribeck": Stribeck,
     "lugre": LuGre,
 }
@@ -66,6 +68,11 @@ def friction_ladder() -> dict[str, FrictionModel]:
             wrapped = {f"{how} {name}": wrapper.wrap(law()) for how, wrapper in FRICTION_WRAPPERS.items()}
             ladder |= {n: model for n, model in wrapped.items() if not model.inputs}
     return ladder
+
+
+def friction_order() -> dict[str, str]:
+    """Parameters that no drive has below another one, as a drive names them: static friction below Coulomb friction."""
+    return {f"friction.{n}": f"friction.{m}" for law in friction_ladder().values() for n, m in law.start.above.items()}
 
 
 def usual_unknowns() -> tuple[str, ...]:

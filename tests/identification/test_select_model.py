@@ -1,14 +1,16 @@
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pneuopt.dynamics.system import System
-from pneuopt.identification.select_model import ModelSelection, select_model
+from pneuopt.identification.select_model import ModelSelection, _CandidateRow, _choose, select_model
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import MotionDrive
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.friction_laws import friction_ladder
+from pneuopt.models.friction_laws import friction_ladder, friction_order
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
@@ -88,6 +90,73 @@ def test_a_richer_model_that_predicts_worse_is_passed_over() -> None:
     found = select_model(pair, [run], ParameterSet(), free=PAIR, held_out=[moved(made, 2, values=other)])
     assert found.recommended == "coulomb"
     assert "predict the held-out runs worse" in found.reason
+
+
+ANTI = {"friction.static": 20.0, "friction.coulomb": 30.0}
+
+
+def test_static_friction_below_coulomb_friction_is_not_recommended() -> None:
+    """Friction that rises with the speed at first, as presliding does: an anti-Stribeck curve fits it best."""
+    run = moved(STATIC["stribeck"], 1, values=ANTI)
+    pair = {n: systems()[n] for n in ("coulomb", "stribeck")}
+    assert select_model(pair, run, ParameterSet(), free=FREE[:4]).recommended == "stribeck"
+    found = select_model(pair, run, ParameterSet(), free=FREE[:4], at_least=friction_order())
+    assert found.recommended == "coulomb"
+    said = found.table["unphysical"]["stribeck"]
+    assert said.startswith("friction.static (2")
+    assert "below friction.coulomb (" in said
+    assert f"refuted: stribeck ({said})" in found.reason
+
+
+def test_presliding_stands_in_the_ladder_and_is_found() -> None:
+    """Friction that builds up over 4 mm/s; the Stribeck law can follow it with static friction below Coulomb only."""
+    run = moved(STATIC["presliding"], 1, values={"friction.presliding_speed": 4e-3, "friction.coulomb": 30.0})
+    free = (*FREE, "friction.presliding_speed")
+    found = select_model(systems(), run, ParameterSet(), free=free, at_least=friction_order())
+    assert found.recommended == "presliding", found
+    assert found.fits["presliding"].parameters.value("friction.presliding_speed") == pytest.approx(4e-3, rel=0.1)
+
+
+def test_a_candidate_at_its_bound_is_not_recommended() -> None:
+    pair = {n: systems()[n] for n in ("viscous", "coulomb")}
+    own = pair["coulomb"].parameters.select(FREE[:2])
+    own = own.with_values({"friction.coulomb": 20.0}).with_bounds({"friction.coulomb": (0.0, 25.0)})
+    found = select_model(pair, moved(STATIC["coulomb"], 1), own, free=FREE[:2])
+    assert found.table["at_bound"]["coulomb"] == "friction.coulomb"
+    assert found.recommended == "viscous"
+    assert "refuted: coulomb (friction.coulomb at a bound)" in found.reason
+    twice = dict.fromkeys(("coulomb", "again"), pair["coulomb"])
+    only = select_model(twice, moved(STATIC["coulomb"], 1), own, free=FREE[:2])
+    assert "no candidate is without a defect, nor is this one: friction.coulomb at a bound" in only.reason
+
+
+def test_all_candidates_have_the_same_widths() -> None:
+    """Coulomb friction alone would take a wide one, and so imitate what the Stribeck curve is for."""
+    found = chosen(STATIC["stribeck"])
+    fits = [fit.parameters for fit in found.fits.values() if "friction.smoothing" in fit.parameters]
+    widths = {parameters.value("friction.smoothing") for parameters in fits}
+    assert len(fits) == 4
+    assert len(widths) == 1
+
+
+def test_a_tie_is_decided_by_held_out_runs_and_the_reason_says_what_would_separate_the_two() -> None:
+    rows = {
+        "rich": row(free=4, deviance=1000.0, bic=1030.0, held_out=0.20),
+        "simple": row(free=3, deviance=1010.0, bic=1033.0, held_out=0.10),
+    }
+    assert _choose(rows) == ("simple", "as held-out runs decide between it and rich, whose BIC is within 6")
+    level = {n: replace(r, held_out_nrmse=0.1) for n, r in rows.items()}
+    assert _choose(level) == ("simple", "as rich, whose BIC is within 6, has more parameters and predicts no better")
+    apart = {**level, "simple": replace(level["simple"], bic=1040.0)}
+    assert _choose(apart) == ("rich", "")
+    run = moved(STATIC["coulomb"], 1, 300)
+    pair = {n: systems()[n] for n in ("coulomb", "presliding")}
+    found = select_model(pair, run, ParameterSet(), free=(*FREE[:2], "friction.presliding_speed"))
+    assert found.recommended == "coulomb"
+
+
+def row(*, free: int, deviance: float, bic: float, held_out: float) -> _CandidateRow:
+    return _CandidateRow(True, free, deviance, bic, "", math.nan, held_out, "", "", "", "")
 
 
 def test_bad_input_is_named() -> None:

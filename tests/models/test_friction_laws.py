@@ -33,6 +33,7 @@ CURVE = {"coulomb": 30.0, "viscous": 60.0, "static": 42.0, "stribeck_velocity": 
 TRUTH: Mapping[str, Mapping[str, float]] = {
     "viscous": {"viscous": 60.0},
     "coulomb": {"coulomb": 30.0, "viscous": 60.0},
+    "presliding": {"coulomb": 30.0, "viscous": 60.0, "presliding_speed": 4e-3},
     "stribeck": CURVE,
     "lugre": {**CURVE, "bristle_stiffness": 6e4},
     "asymmetric": {"coulomb_asymmetry": 0.2, "viscous_asymmetry": -0.1},
