@@ -143,7 +143,8 @@ def identify(
     if start is None:
         held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
     else:
-        (held, fit), label = fit_holding_unidentifiable(problem, problem.start_from(start)), "a given fit"
+        began = fit_holding_unidentifiable(problem, problem.start_from(start))
+        (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
     chosen = None if window is None else ChosenWindow(window, window, window, fit.stats["gap_share"])
     if windowed := fit_in_windows(held, fit):
         held, fit, chosen = windowed
