@@ -14,8 +14,10 @@ from typer.testing import CliRunner, Result
 
 from pneuopt.cli import study as study_module
 from pneuopt.cli.app import app
+from pneuopt.cli.shared import Outputs, finish
 from pneuopt.cli.study import tune_cell
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code, Status
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.pareto import pareto_front
@@ -389,3 +391,10 @@ def test_a_ripple_beyond_the_band_is_said_beside_the_settling_of_the_mean(
     assert rows["SettlingTimeRaw"][1] == "never"
     assert "ripple" in result.output
     assert "takes the signal itself out of the band of +-5 %" in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(
+    ("code", "status"), [(Code.CONVERGED, 0), (Code.PARTIAL, 0), (Code.MISFIT, 1), (Code.NOT_CONVERGED, 1)]
+)
+def test_a_part_of_an_answer_ends_as_an_answer(code: Code, status: int) -> None:
+    assert finish(Outputs(None, None, None), {}, {}, Status(code, ("said",))) == status
