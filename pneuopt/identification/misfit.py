@@ -121,7 +121,7 @@ class Misfit:
         if self.is_slow:
             found.append("the misfit is as slow as the logs, or different from log to log: log more or longer runs")
         if self.lone:
-            found.append(f"one log alone tells {join_names(self.lone)}: log more runs like it")
+            found.append(f"one log alone determines {join_names(self.lone)}: log more runs like it")
         return tuple(found)
 
 

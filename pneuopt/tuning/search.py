@@ -42,9 +42,9 @@ MAX_CERTIFIED_POINTS = 5
 # nothing; more move the design away from the one that was found.
 ROUNDING_ROUNDS = 3
 # Horizons over which a design is sought whose rival hunted or crept after one, the first that the stroke allows: fewer
-# do not show it; more cost time in proportion. And the defects of responses that a longer horizon, over which they have
-# to settle, shows to a search.
+# do not show it; more cost time in proportion.
 HORIZON_FACTORS = (4.0, 2.8, 2.0, 1.4)
+# Defects of responses that a longer horizon, over which they have to settle, shows to a search.
 LATE_DEFECTS = (Defect.GROWS, Defect.HUNTS, Defect.CREEPS, Defect.NEVER_SETTLES, Defect.UNDECIDED)
 # Searches on closer samples or with shorter steps, at most: fewer claim figures of responses that are not resolved;
 # more cost a search each.

@@ -71,7 +71,7 @@ class Simulator:
 
     Attributes
     ----------
-    cases : tuple of Case
+    cases : tuple of TuningCase
     response_metrics, margin_metrics : tuple of str
         The metrics read off the responses, and off the loop linearised at their operating points.
     meter_channels : tuple of str

@@ -1,7 +1,8 @@
 """`tune`: find PID gains and dither together, and certify them by a simulation that shares no step with the search.
 
-A linear loop is tuned exactly (`TwoPhase`); any other, with friction, clip or sampling, by compiled simulation
-(`Racing`). The gains are rounded first and certified then, so that the printed numbers are proven.
+A linear loop whose response shooting nodes follow closely is tuned by them (`TwoPhase`); any other, with friction, clip
+or sampling, by compiled simulation (`Racing`). The gains are rounded first and certified then, so that the printed
+numbers are proven.
 """
 
 import time
@@ -94,7 +95,8 @@ def tune(
         Steps of one certificate's simulations together that are refused as too many; the search takes about as long.
     method : TwoPhase, Racing or another Method, optional
         By default the first that suits: `TwoPhase` for one linear plant with a continuous controller that no clip can
-        hold back, if it has equations for all that is asked for; else, or where `TwoPhase` fails, `Racing`.
+        hold back, if it has equations for all that is asked for and its nodes follow the response closely, for between
+        them nothing holds it in the band; else, or where `TwoPhase` fails, `Racing`.
     throw : bool
         Raise an error if no design is certified; otherwise the result's status says so.
     progress : callable, optional

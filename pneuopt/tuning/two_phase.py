@@ -52,6 +52,9 @@ MIN_STARTS = 3
 class TwoPhase:
     """Tune a linear, continuous loop exactly: solve the two-phase problem by multiple shooting from several starts.
 
+    The response is exact at every node, and lies in the band there; a fast one that leaves it between two nodes is left
+    to `Racing`.
+
     Parameters
     ----------
     nodes : tuple of int

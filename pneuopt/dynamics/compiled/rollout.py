@@ -54,8 +54,8 @@ class RolloutResult:
     y : ndarray, shape (m, n, n_outputs)
     x_end : ndarray, shape (m, n_states)
         State after the last sample's step.
-    x : ndarray, shape (m, n, n_states), or None
-        State at each sample, before the controller's update.
+    x : ndarray, shape (m, ceil(n / states), n_states), or None
+        State at each so many samples, before the controller's update.
     dy : ndarray, shape (m, n, n_outputs, n_columns), or None
     dx_end : ndarray, shape (m, n_states, n_columns), or None
         Sensitivities; the columns are the start state, then the chosen parameters.
