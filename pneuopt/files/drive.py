@@ -214,6 +214,8 @@ def _write_absolute(document: tomlkit.TOMLDocument, given: ParameterSet) -> None
 
 def _agreement_rows(fit: "pd.DataFrame") -> dict[str, Any]:
     """A table a log with a row a channel: how far the fit, and a simulation from end to end, are from it."""
+    if fit.empty:  # no channel was compared
+        return {}
     figures = fit[["rmse", "nrmse", "free_run_rmse", "free_run_nrmse", "unit"]]
     logs = {str(log): rows.droplevel("log") for log, rows in figures.groupby(level="log", sort=False)}
     return {

@@ -5,7 +5,7 @@ parameters its data do not determine (`shooting.convergence`, thresholds in `sho
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -187,9 +187,13 @@ def leans_on_prior(covariance: Array, prior_covariance: Array) -> Mask:
     return np.asarray(np.diag(prior_covariance) > MAX_PRIOR_VARIANCE_SHARE * np.diag(covariance))
 
 
-def rests_on_prior(covariance: Array, prior_covariance: Array, values: Array) -> Mask:
-    """The mask of estimates that the logs do not identify: they lean on priors, and are not known well even so."""
+def rests_on_prior(covariance: Array, prior_covariance: Array, values: Array, held: Iterable[float]) -> Mask:
+    """The mask of estimates that the logs do not identify: they lean on priors, and are not known well even so.
+
+    A factor of ten says nothing of what is held at zero, so nothing that leans on it is known.
+    """
     is_close = np.sqrt(np.diag(covariance)) <= MAX_PRIOR_DEVIATION * np.abs(values)
+    is_close &= all(held)
     return leans_on_prior(covariance, prior_covariance) & ~is_close
 
 

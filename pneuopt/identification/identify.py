@@ -277,7 +277,8 @@ def _result(
     if covariance is not None and fit.prior_covariance is not None:
         covariance = covariance + fit.prior_covariance
         leaning = leans_on_prior(covariance, fit.prior_covariance)
-        resting = rests_on_prior(covariance, fit.prior_covariance, np.array([p.value for p in estimates.values()]))
+        found = np.array([p.value for p in estimates.values()])
+        resting = rests_on_prior(covariance, fit.prior_covariance, found, problem.held.values())
     unidentifiable = tuple(n for n, rests in zip(free, resting, strict=True) if rests or n in problem.held)
     status = NOTHING_IDENTIFIABLE if free and set(unidentifiable) == set(free) else misfit.assess(fit.status)
     result = IdentificationResult(

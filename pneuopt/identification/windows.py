@@ -19,6 +19,7 @@ from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_holding_unidentifiable
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.result import ChosenWindow
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
@@ -30,6 +31,10 @@ from pneuopt.shooting.solution import Fit
 # more a plant that runs away quickly is not followed
 MIN_WINDOW_SAMPLES = 20
 MIN_WINDOWS = 12  # windows of all logs: with fewer the scatter between parts is a guess, more leave out long ones
+# share of the parameters that windows must determine to better than their own size [1]: short windows with starts of
+# their own follow any smooth log, also one of another plant, and a lower share takes that for an answer; with a higher
+# one an offset that is zero forbids windows
+MIN_KNOWN_SHARE = 0.5
 WINDOW_FACTOR = 2.0  # from one length to the next [1]: lower takes more fits, higher may pass over the best
 
 Windowed = tuple[EstimationProblem, Fit, ChosenWindow]
@@ -48,10 +53,25 @@ class _Trial(NamedTuple):
         """Parameters without a variance, whether residuals are too large for intervals, and the mean log of these."""
         if self.misfit.covariance is None:
             return len(self.fit.parameters.free_names), True, math.inf
+        half_widths = self.half_widths[np.isfinite(self.half_widths)]
+        unknown = len(self.half_widths) - len(half_widths)
+        return unknown, self.misfit.is_excessive, float(np.log(half_widths).sum())
+
+    @property
+    def half_widths(self) -> Array:
+        """Half of each interval, infinite where a parameter has no variance, shape (k,)."""
+        if self.misfit.covariance is None:
+            return np.full(len(self.fit.parameters.free_names), np.inf)
         variances = np.diag(self.misfit.covariance)
-        known = variances > 0
-        half_widths = t_quantile(self.misfit.dof)[known] * np.sqrt(variances[known])
-        return int((~known).sum()), self.misfit.is_excessive, float(np.log(half_widths).sum())
+        widths = t_quantile(self.misfit.dof) * np.sqrt(np.maximum(variances, 0.0))
+        return np.where(variances > 0, widths, np.inf)
+
+    @property
+    def is_answer(self) -> bool:
+        """Whether it is an optimum that tells most parameters better than their own size."""
+        sizes = np.abs([self.fit.parameters.value(n) for n in self.fit.parameters.free_names])
+        known = float(np.mean(self.half_widths < sizes)) if sizes.size else 1.0
+        return self.fit.status.converged and known > MIN_KNOWN_SHARE
 
 
 def check_window(problem: EstimationProblem) -> None:
@@ -89,12 +109,12 @@ def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
         With one segment a window.
     fit : Fit
     window : ChosenWindow
-        None in place of all three where the fit has not failed by its gaps, and where no window gives an optimum.
+        None in place of all three where the fit has not failed by its gaps, and where no window gives an answer.
     """
     if not _has_failed_by_gaps(problem, fit):
         return None
     lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
-    found = [trial for length in lengths if (trial := _try_length(problem, fit, length)).fit.status.converged]
+    found = [trial for length in lengths if (trial := _try_length(problem, fit, length)).is_answer]
     if not found:
         return None
     best = min(found, key=lambda trial: trial.rank)

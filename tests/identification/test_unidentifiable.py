@@ -152,7 +152,8 @@ def test_what_leans_on_a_held_parameter_and_is_known_well_even_so_is_handed_out(
     values, deviations = np.array([30.0, 97.0, 80.0]), np.array([0.17, 209.0, 0.01])
     prior = np.diag(np.array([0.99, 0.99, 0.05]) * deviations**2)
     assert leans_on_prior(np.diag(deviations**2), prior).tolist() == [True, True, False]
-    assert rests_on_prior(np.diag(deviations**2), prior, values).tolist() == [False, True, False]
+    assert rests_on_prior(np.diag(deviations**2), prior, values, [0.01]).tolist() == [False, True, False]
+    assert rests_on_prior(np.diag(deviations**2), prior, values, [0.0]).tolist() == [True, True, False]
 
 
 def test_a_log_that_identifies_nothing_does_not_converge() -> None:
