@@ -16,12 +16,14 @@ and Kp + Kd/Tf, the gain from noise to command, 100 V s/m: beyond it the encoder
 
 Rows <task>.<rival>.*: error integral, settling time of the signal as it is, error in the end, overshoot, hunting; the
 price in ripple, air and valve travel; and gain, how often the error integral is smaller than that of the PID alone.
-What they say: at 10 mm/s the dead-zone inverse gives most and costs nothing, the dither as much on average, for
-dozens of times the air and hundreds of times the travel, and the search finds no use for pulses or feedforward: behind
-a valve, which sets a speed, Coulomb friction is no voltage. At 50 mm/s dither and pulses help, feedforward little, the
-inverse not at all. Row bare_sensitivity: of the knocker's gains without its pulses, beyond the limit of 2 that it keeps
-only because it is read in the middle of them. Rows verdict: of `judge_dither` and `judge_compensators` against the PID
-alone, 1 useful, 0 useless, -1 harmful: both count the ripple, with which the dither never settles.
+What they say: at 10 mm/s the dead-zone inverse gives most and costs nothing, the dither nearly as much on average, for
+dozens of times the air and hundreds of times the travel; feedforward by the reference's direction takes a quarter off
+the error integral; and the search finds no use for pulses or feedforward by the measured direction: behind a valve,
+which sets a speed, Coulomb friction is no voltage. At 50 mm/s dither and pulses help, feedforward little, the inverse
+not at all. Row bare_sensitivity: of the knocker's gains without its pulses, beyond the limit of 2 that it keeps only
+because it is read in the middle of them. Rows verdict: of `judge_dither` and `judge_compensators` against the PID
+alone, 1 useful, 0 useless, -1 harmful: both count the ripple, with which the dither never settles, and follow the
+response beyond the step's second, where the pulses at 50 mm/s leave a larger error of the mean in the end.
 """
 
 import sys
@@ -111,7 +113,7 @@ SHOWN = {  # row: metric, factor, unit
 }
 BOUNDS = {
     "crawl.dither.gain": ">= 2", "crawl.inverse.gain": ">= 2", "crawl.knocker.gain": "<= 1.2",
-    "crawl.reference.gain": "<= 1.2", "crawl.measured.gain": "<= 1.3",
+    "crawl.reference.gain": "<= 1.6", "crawl.measured.gain": "<= 1.3",
     "crawl.dither.air": ">= 2", "crawl.dither.ripple": ">= 1", "crawl.dither.travel": ">= 50",
     "crawl.inverse.air": "<= 0.25", "crawl.inverse.ripple": "<= 0.2",
     "step.dither.gain": ">= 1.5", "step.knocker.gain": ">= 1.1", "step.reference.gain": "<= 1.4",
@@ -119,7 +121,8 @@ BOUNDS = {
     "step.dither.air": ">= 1", "step.dither.ripple": ">= 5", "step.knocker.air": "<= 0.3",
     "step.knocker.bare_sensitivity": ">= 2", "none_worse": ">= 0.99",
     "crawl.dither.verdict": "-1 +- 0", "crawl.inverse.verdict": "1 +- 0", "crawl.knocker.verdict": "0 +- 0",
-    "step.dither.verdict": "-1 +- 0", "step.knocker.verdict": "1 +- 0",
+    "crawl.reference.verdict": "1 +- 0",
+    "step.dither.verdict": "-1 +- 0", "step.knocker.verdict": "-1 +- 0",
 }  # fmt: skip
 
 
