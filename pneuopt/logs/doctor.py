@@ -175,9 +175,10 @@ def _check_position_speed(experiment: Experiment, axis: AxisChannels) -> Iterato
     best = max(found, key=found.__getitem__)
     if found[best] < -MIN_SPEED_CORRELATION / 2 and min(found.values()) < -MIN_SPEED_CORRELATION:
         at = int(np.nanargmax(np.abs(slope)))
-        seen = f"at {t[at]:.4g} s the {axis.position} changes by {slope[at]:.3g} a second"
-        beside = f"the speed says {means[0][at]:.3g}"
-        message = f"{axis.position} and {axis.speed} run against each other ({seen}, {beside}): change the sign of one"
+        seen = (
+            f"at {t[at]:.4g} s {axis.position} changes by {slope[at]:.3g} a second, {axis.speed} is {means[0][at]:.3g}"
+        )
+        message = f"{axis.position} and {axis.speed} run against each other ({seen}): change the sign of one"
         yield Finding(axis.speed, message, True)
     elif found[best] > MIN_SPEED_CORRELATION:
         ratios = [_lagged_ratio(slope, mean, best) for mean in means]

@@ -133,7 +133,7 @@ def test_the_log_of_a_shaft_is_checked_in_its_own_channels(servo: tuple[RotaryDr
     against = Experiment(Trajectory(run.t, {"torque": torque, "angle": -run["angle"], "speed": run["speed"]}))
     with pytest.raises(
         LogError,
-        match=r"angle and speed run against each other \(at .* the angle changes by .*\): change the sign of one",
+        match=r"angle and speed run against each other \(at .* angle changes by .*\): change the sign of one",
     ):
         identify(drive.system(), [against], fit.parameters)
 
