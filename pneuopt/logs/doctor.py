@@ -174,10 +174,8 @@ def _check_position_speed(experiment: Experiment, axis: AxisChannels) -> Iterato
     found = {lag: _lagged_correlation(slope, means[0], lag) for lag in _lags(t)}
     best = max(found, key=found.__getitem__)
     if found[best] < -MIN_SPEED_CORRELATION / 2 and min(found.values()) < -MIN_SPEED_CORRELATION:
-        at = int(np.nanargmax(np.abs(slope)))
-        seen = (
-            f"at {t[at]:.4g} s {axis.position} changes by {slope[at]:.3g} a second, {axis.speed} is {means[0][at]:.3g}"
-        )
+        i = int(np.nanargmax(np.abs(slope)))
+        seen = f"at {t[i]:.4g} s {axis.position} changes by {slope[i]:.3g}/s, {axis.speed} is {means[0][i]:.3g}"
         message = f"{axis.position} and {axis.speed} run against each other ({seen}): change the sign of one"
         yield Finding(axis.speed, message, True)
     elif found[best] > MIN_SPEED_CORRELATION:

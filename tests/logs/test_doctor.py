@@ -202,7 +202,7 @@ def test_a_fault_shows_the_signals_that_contradict_each_other() -> None:
             pressure_b=np.full(T.size, 4e5),
         )
     )
-    found = re.search(r"at (\S+) s position changes by (\S+) a second, speed is ([^)]+)\)", told)
+    found = re.search(r"at (\S+) s position changes by (\S+)/s, speed is ([^)]+)\)", told)
     assert found is not None
     at, slope, speed = map(float, found.groups())
     true = 0.3 * np.cos(2 * np.pi * at)
