@@ -113,7 +113,7 @@ SHOWN = {  # row: metric, factor, unit
 }
 BOUNDS = {
     "crawl.dither.gain": ">= 2", "crawl.inverse.gain": ">= 2", "crawl.knocker.gain": "<= 1.2",
-    "crawl.reference.gain": "<= 1.6", "crawl.measured.gain": "<= 1.3",
+    "crawl.reference.gain": ">= 1.2", "crawl.measured.gain": "<= 1.3",
     "crawl.dither.air": ">= 2", "crawl.dither.ripple": ">= 1", "crawl.dither.travel": ">= 50",
     "crawl.inverse.air": "<= 0.25", "crawl.inverse.ripple": "<= 0.2",
     "step.dither.gain": ">= 1.5", "step.knocker.gain": ">= 1.1", "step.reference.gain": "<= 1.4",
