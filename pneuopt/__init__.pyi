@@ -81,7 +81,7 @@ from .models.friction import (
     Stribeck,
     Viscous,
 )
-from .models.friction_laws import friction_ladder, friction_order
+from .models.friction_laws import friction_ladder
 from .models.karnopp import Karnopp
 from .models.linear import FirstOrder, Integrator, SecondOrder
 from .models.load import Load
@@ -251,7 +251,6 @@ __all__ = [
     "find_limit_cycle",
     "frequency_response",
     "friction_ladder",
-    "friction_order",
     "grid",
     "identifiability",
     "identify",

@@ -66,7 +66,6 @@ PUBLIC_NAMES = [
     "Form",
     "frequency_response",
     "friction_ladder",
-    "friction_order",
     "FrictionFeedforward",
     "FullSpace",
     "GainMargin",

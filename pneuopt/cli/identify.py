@@ -28,7 +28,7 @@ from pneuopt.identification.select_model import select_model
 from pneuopt.logs.experiments import Experiment, read_log
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS
-from pneuopt.models.friction_laws import friction_ladder, friction_order, usual_unknowns
+from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,
@@ -99,7 +99,6 @@ def run_select(
             known,
             free=[*free, *usual_unknowns()],
             window=window,
-            at_least=friction_order(),
             method=LeastSquares(progress=report_progress),
         )
     show_selection(make_console(), chosen)

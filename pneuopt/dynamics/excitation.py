@@ -118,16 +118,20 @@ class Excitation:
     runs : tuple of SeparatingRun
         The first that suits a group counts.
     widths : tuple of Width
+    at_least : mapping of str to str
+        Parameters that no plant has below another one: static friction below Coulomb friction.
     """
 
     needs: Mapping[str, Need] = field(default_factory=dict)
     runs: tuple[SeparatingRun, ...] = ()
     widths: tuple[Width, ...] = ()
+    at_least: Mapping[str, str] = field(default_factory=dict)
 
     def __or__(self, other: "Excitation") -> "Excitation":
         known = {w.name for w in self.widths}
         widths = self.widths + tuple(w for w in other.widths if w.name not in known)
-        return Excitation({**self.needs, **other.needs}, self.runs + other.runs, widths)
+        at_least = {**self.at_least, **other.at_least}
+        return Excitation({**self.needs, **other.needs}, self.runs + other.runs, widths, at_least)
 
     def with_prefix(self, prefix: str) -> "Excitation":
         """Put `prefix.` before the names of a part's own parameters: "viscous" becomes "friction.viscous"."""
@@ -141,4 +145,4 @@ class Excitation:
         needs = {f"{prefix}.{n}": replace(e, confused_with=whole(e.confused_with)) for n, e in self.needs.items()}
         runs = tuple(replace(r, some=whole(r.some), others=whole(r.others)) for r in self.runs)
         widths = tuple(Width(own(w.name), w.factor, tuple(map(own, w.follows)), own(w.hides)) for w in self.widths)
-        return Excitation(needs, runs, widths)
+        return Excitation(needs, runs, widths, {own(n): own(m) for n, m in self.at_least.items()})

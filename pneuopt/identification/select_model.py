@@ -4,7 +4,6 @@ import fnmatch
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.runnable import HasSystem, as_system
@@ -44,7 +43,8 @@ class ModelSelection:
     table : DataFrame
         A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's),
         contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
-        unidentifiable and at_bound (names of parameters), unphysical (which of `at_least` it breaks), message.
+        unidentifiable and at_bound (names of parameters), unphysical (which order of
+        `Excitation.at_least` it breaks), message.
     recommended : str
         A candidate's name.
     reason : str
@@ -71,7 +71,6 @@ def select_model(
     held_out: Experiment | Sequence[Experiment] = (),
     method: LeastSquares | None = None,
     window: float | None = None,
-    at_least: Mapping[str, str] = MappingProxyType({}),
 ) -> ModelSelection:
     """Fit every candidate alike and recommend one.
 
@@ -89,9 +88,6 @@ def select_model(
     method : LeastSquares, optional
     window : float, optional
         As of `identify`; by default the longest that a candidate needs.
-    at_least : mapping of str to str, optional
-        Parameters that no drive has below another one: `friction_order()`, static friction below
-        Coulomb friction.
 
     Returns
     -------
@@ -111,8 +107,9 @@ def select_model(
     those of white residuals: as if only independent samples counted. Between nested candidates it falls as chi-square
     with the extra parameters (Wilks 1938); over all, ``bic = deviance + k ln n`` (Schwarz 1978). Unidentifiable
     parameters count among the k, so that a candidate with such parameters gives way to a simpler one that fits as well.
-    A candidate that did not converge, ends at a bound or breaks `at_least` is not recommended while there is another.
-    Among those within `TIE` of the lowest BIC the held-out runs decide, and without any the fewer parameters.
+    A candidate that did not converge, ends at a bound or breaks its model's `Excitation.at_least` is not recommended
+    while there is another. Among those within `TIE` of the lowest BIC the held-out runs decide, and without any the
+    fewer parameters.
     """
     check_argument("candidates", candidates, Mapping, "a mapping of names to drives or their systems")
     require(len(candidates) >= 2, f"{len(candidates)} candidate leaves nothing to select; give at least two")
@@ -127,7 +124,7 @@ def select_model(
         message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
         raise ConvergenceError(f"none of the candidates converged: {message}", fits)
     predicted = {n: _mean_nrmse(systems[n], held_out, fits[n]) for n in converged}
-    rows = _candidate_rows(systems, fits, predicted, at_least)
+    rows = _candidate_rows(systems, fits, predicted)
     chosen, why = _choose(rows)
     reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
     return ModelSelection(_selection_table(rows), chosen, reason, fits)
@@ -197,7 +194,6 @@ def _candidate_rows(
     candidates: Mapping[str, System],
     fits: Mapping[str, IdentificationResult],
     predicted: Mapping[str, float],
-    at_least: Mapping[str, str],
 ) -> dict[str, _CandidateRow]:
     """A row for each candidate, the lowest BIC first, those that did not converge last."""
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
@@ -212,21 +208,22 @@ def _candidate_rows(
         if inside:
             p = likelihood_ratio_p(_chi_square(fits[inside]) / scale - deviance, k - len(fits[inside].estimates))
         held_out = predicted.get(name, math.nan)
-        notes = _names_with_note(fit, UNIDENTIFIABLE_NOTE), _names_with_note(fit, AT_BOUND_NOTE)
-        said = _unphysical(fit.parameters, at_least), fit.status.message
+        notes = ", ".join(_names_noted(fit, UNIDENTIFIABLE_NOTE)), ", ".join(_names_noted(fit, AT_BOUND_NOTE))
+        said = _unphysical(fit, candidates[name].excitation.at_least), fit.status.message
         rows[name] = _CandidateRow(fit.status.converged, k, deviance, bic, inside, p, held_out, *notes, *said)
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
 
 
-def _unphysical(found: ParameterSet, at_least: Mapping[str, str]) -> str:
-    """Which parameters are below those that no drive has them below; empty if none is."""
+def _unphysical(fit: IdentificationResult, at_least: Mapping[str, str]) -> str:
+    """Which parameters are below those that no plant has them below, where the logs identify them; empty if none is."""
+    found = fit.parameters.select(n for n in fit.parameters if n not in _names_noted(fit, UNIDENTIFIABLE_NOTE))
     below = [(n, m) for n, m in at_least.items() if n in found and m in found and found.value(n) < found.value(m)]
     return ", ".join(f"{n} ({found.value(n):.4g}) below {m} ({found.value(m):.4g})" for n, m in below)
 
 
-def _names_with_note(fit: IdentificationResult, note: str) -> str:
-    """The names of the parameters with a note, in a sentence."""
-    return ", ".join(str(n) for n, own in fit.estimates["note"].items() if own == note)
+def _names_noted(fit: IdentificationResult, note: str) -> list[str]:
+    """The names of the parameters with a note."""
+    return [str(n) for n, own in fit.estimates["note"].items() if own == note]
 
 
 def _largest_submodel(

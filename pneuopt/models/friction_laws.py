@@ -70,11 +70,6 @@ def friction_ladder() -> dict[str, FrictionModel]:
     return ladder
 
 
-def friction_order() -> dict[str, str]:
-    """Parameters that no drive has below another one, as a drive names them: static friction below Coulomb friction."""
-    return {f"friction.{n}": f"friction.{m}" for law in friction_ladder().values() for n, m in law.start.above.items()}
-
-
 def usual_unknowns() -> tuple[str, ...]:
     """Parameters that a comparison of these laws estimates, as a drive names them."""
     unknowns = (f"friction.{n}" for law in friction_ladder().values() for n in law.start.unknowns)

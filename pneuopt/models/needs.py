@@ -111,6 +111,7 @@ STRIBECK_EXCITATION = COULOMB_EXCITATION | Excitation(
             "log speeds below the Stribeck velocity: slow ramps through zero",
         ),
     ),
+    at_least={"static": "coulomb"},
 )
 BRISTLE_EXCITATION = STRIBECK_EXCITATION | Excitation(
     dict.fromkeys(sorted(BRISTLES), Need(lacks_presliding)),
