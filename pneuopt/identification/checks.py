@@ -12,7 +12,8 @@ from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import System, names
 from pneuopt.identification.command_centre import centre_command
 from pneuopt.identification.repairs import repair_log
-from pneuopt.logs.doctor import CHECKS, PISTON_CHANNELS, AxisChannels, Finding, examine
+from pneuopt.logs.checks.findings import PISTON_CHANNELS, AxisChannels, Finding
+from pneuopt.logs.doctor import CHECKS, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import estimate_noise, noise_level
 from pneuopt.quantities.arguments import as_tuple, check_parameters

@@ -23,7 +23,8 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.logs.doctor import Finding, examine
+from pneuopt.logs.checks.findings import Finding
+from pneuopt.logs.doctor import examine
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame
 

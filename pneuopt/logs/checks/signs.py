@@ -1,0 +1,138 @@
+"""Signs and units: position and speed, what drives the motion and its work, the command and what follows it."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from pneuopt.logs.checks.findings import AxisChannels, Finding
+from pneuopt.logs.checks.motion import (
+    MEAN_BLOCKS,
+    lagged_correlation,
+    lagged_ratio,
+    motion_speed,
+    position_slope,
+    sensor_lags,
+    shift,
+    slope_half_width,
+    window_mean,
+)
+from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array
+
+MAX_NET_TRAVEL_SHARE = 0.3
+"""Net travel over path [1] up to which a log counts as one that returns: higher blames lifts, lower skips most logs."""
+MIN_WORK_SHARE = -0.2
+"""Work over the integral of the absolute power [1] below which the sign is wrong: nearer to zero, noise is blamed."""
+ROD_AREA_RATIOS = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0)
+"""Areas of the rod's side over the other's [1]: one of these is near for real cylinders; more hide wrong signs."""
+SPEED_SLOPE_RATIOS = (0.5, 2.0)
+"""Speed over the position's slope [1] that passes: wider lets wrong units pass, inches for centimetres say; narrower
+refuses filtered speeds of fast motion."""
+MIN_SPEED_CORRELATION = 0.7
+"""Correlation [1] of speed and slope from which they are compared: lower compares noise, higher misses short motion."""
+MAX_COMMAND_LAG = 0.1
+"""Time [s] within which a drive's speed follows its valve: longer finds chance correlations, shorter misses drives."""
+WRONG_SIGN_CORRELATIONS = (-0.6, 0.3)
+"""The sign is wrong if the least correlation of command and speed is below the first, the largest below the second."""
+RECIPROCATING_TRAVEL_RATIO = 1.9
+"""Travel over range [1]: at 2 a piston has come back, so it is commanded; a lower bound blames overshoot."""
+
+
+def check_position_speed(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+    """Find a speed that is not the slope of the position, in sign or in unit."""
+    log = experiment.trajectory
+    if axis.position not in log or axis.speed not in log:
+        return
+    known = np.isfinite(log[axis.position]) & np.isfinite(log[axis.speed])
+    t, x, v = log.t[known], log[axis.position][known], log[axis.speed][known]
+    half = slope_half_width(t, x, experiment.noise.get(axis.position))
+    if half is None:
+        return
+    slope, means = position_slope(t, x, half), [window_mean(v, half, simpson) for simpson in (False, True)]
+    found = {lag: lagged_correlation(slope, means[0], lag) for lag in sensor_lags(t)}
+    best = max(found, key=found.__getitem__)
+    if found[best] < -MIN_SPEED_CORRELATION / 2 and min(found.values()) < -MIN_SPEED_CORRELATION:
+        i = int(np.nanargmax(np.abs(slope)))
+        seen = f"at {t[i]:.4g} s {axis.position} changes by {slope[i]:.3g}/s, {axis.speed} is {means[0][i]:.3g}"
+        message = f"{axis.position} and {axis.speed} run against each other ({seen}): change the sign of one"
+        yield Finding(axis.speed, message, True)
+    elif found[best] > MIN_SPEED_CORRELATION:
+        ratios = [lagged_ratio(slope, mean, best) for mean in means]
+        # trapezoids and parabolas through the speed err in opposite directions where its samples are far apart
+        if max(ratios) < SPEED_SLOPE_RATIOS[0] or min(ratios) > SPEED_SLOPE_RATIOS[1]:
+            message = f"{axis.speed} is {ratios[0]:.3g} times the slope of the {axis.position}: check both units"
+            yield Finding(axis.speed, message, True)
+
+
+def check_work_sign(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+    """Find a force, torque or pressures of the wrong sign: a drive does net work on a load that comes back."""
+    log, motion = experiment.trajectory, motion_speed(experiment, axis)
+    if motion is None:
+        return
+    drives = {axis.push: (f"the {axis.push} brakes", f"'{axis.push}'")}
+    if "pressure_a" in log and "pressure_b" in log:
+        drives["pressures"] = ("the pressures brake", "the position, or exchange pressure_a and pressure_b")
+    for name, (message, remedy) in drives.items():
+        if name == axis.push and name not in log:
+            continue
+        if name == axis.push:
+            pushes = [log[name]]
+        else:
+            pushes = [log["pressure_a"] - ratio * log["pressure_b"] for ratio in ROD_AREA_RATIOS]
+            pushes = [push - np.nanmean(push) for push in pushes]
+        share = max(_work_share(log.t, push, motion, lag) for push in pushes for lag in sensor_lags(log.t))
+        if share < MIN_WORK_SHARE:
+            at = int(np.nanargmin(pushes[-1] * motion))
+            seen = f"most at {log.t[at]:.4g} s, where {pushes[-1][at]:.3g} pushes and the speed is {motion[at]:.3g} m/s"
+            why = f"{message} the motion on balance ({100 * share:.0f} % of its power, {seen}), which no drive does"
+            yield Finding(name, f"{why}: change the sign of {remedy}", True)
+
+
+def check_command(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+    """Find a piston that runs against its valve's command, or without one."""
+    log, motion = experiment.trajectory, motion_speed(experiment, axis)
+    if motion is None or "valve_voltage" not in log:
+        return
+    known = np.isfinite(motion) & np.isfinite(log["valve_voltage"])
+    t, command, motion = log.t[known], log["valve_voltage"][known], motion[known]
+    if len(t) < 2 * MEAN_BLOCKS:
+        return
+    if not np.any(np.diff(command)):
+        every = max(1, len(t) // (5 * MEAN_BLOCKS))  # coarse: noise is no travel
+        travel = np.cumsum(motion[1:] * np.diff(t))[::every]
+        if float(np.abs(np.diff(travel)).sum()) > RECIPROCATING_TRAVEL_RATIO * float(np.ptp(travel)) > 0:
+            message = "'valve_voltage' is constant while the piston goes to and fro: log the command that moves it"
+            yield Finding("valve_voltage", message, True)
+        return
+    lowest, highest = _command_correlations(t, command, motion)
+    if lowest < WRONG_SIGN_CORRELATIONS[0] and highest < WRONG_SIGN_CORRELATIONS[1]:
+        at = int(np.argmax(np.abs(motion)))
+        seen = f"correlation {lowest:.2f}; {motion[at]:.3g} m/s at {t[at]:.4g} s under {command[at]:.3g} V"
+        message = f"the piston runs against the valve's command ({seen}): change the sign of "
+        yield Finding("valve_voltage", message + "'valve_voltage', or of the motion", True)
+
+
+def _work_share(t: Array, push: Array, motion: Array, lag: int) -> float:
+    """Work over the integral of the power's absolute value; NaN where the log does not return to its beginning."""
+    t = np.where(np.isfinite(push), t, np.nan)
+    (t, _), (push, motion) = shift(t, motion, lag), shift(push, motion, lag)
+    if t.size < 10:
+        return math.nan
+    path = float(np.trapezoid(np.abs(motion), t))
+    if path == 0 or abs(float(np.trapezoid(motion, t))) > MAX_NET_TRAVEL_SHARE * path:
+        return math.nan
+    total = float(np.trapezoid(np.abs(push * motion), t))
+    return float(np.trapezoid(push * motion, t)) / total if total > 0 else math.nan
+
+
+def _command_correlations(t: Array, command: Array, motion: Array) -> tuple[float, float]:
+    """Least and largest correlation of a speed with the command up to `MAX_COMMAND_LAG` before; NaN at rest."""
+    grid = np.linspace(t[0], t[-1], t.size)
+    u, v = np.interp(grid, t, command), np.interp(grid, t, motion)
+    most = min(round(MAX_COMMAND_LAG / float(grid[1] - grid[0])), t.size // 4)
+    lags = range(0, most + 1, max(1, most // MEAN_BLOCKS))
+    if np.ptp(v) == 0 or any(np.ptp(u[: u.size - k]) == 0 for k in lags):
+        return math.nan, math.nan
+    found = [float(np.corrcoef(u[: u.size - k], v[k:])[0, 1]) for k in lags]
+    return min(found), max(found)
