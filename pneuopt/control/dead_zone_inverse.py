@@ -38,8 +38,15 @@ class DeadZoneInverse:
 
     def parameters(self, _on: SensedSignal, unit: str) -> ParameterSet:
         """Half the dead zone's width, zero by default, and the command within which the sign turns over [unit]."""
-        within = Parameter(COMMAND_SMOOTHING, unit, lower=LEAST_SMOOTHING)
-        return ParameterSet({"width": Parameter(0.0, unit, lower=0.0), "smoothing": within})
+        within = Parameter(
+            COMMAND_SMOOTHING, unit, lower=LEAST_SMOOTHING, meaning="command within which what is added turns its sign"
+        )
+        return ParameterSet(
+            {
+                "width": Parameter(0.0, unit, lower=0.0, meaning="half the valve's dead zone, added to the command"),
+                "smoothing": within,
+            }
+        )
 
     def states(self, _command: Quantity) -> tuple[Quantity, ...]:
         """None."""

@@ -77,9 +77,11 @@ class Dither:
         upper = inf if sample_time is None or self.analogue else nextafter(0.5 / sample_time, 0.0)
         return ParameterSet(
             {
-                "amplitude": Parameter(0.0, unit, lower=0.0),
-                "offset": Parameter(0.0, unit),
-                "frequency": Parameter(self.frequency, "Hz", lower=0.0, upper=upper),
+                "amplitude": Parameter(0.0, unit, lower=0.0, meaning="peak of the oscillation"),
+                "offset": Parameter(0.0, unit, meaning="constant added with it"),
+                "frequency": Parameter(
+                    self.frequency, "Hz", lower=0.0, upper=upper, meaning="frequency of the oscillation"
+                ),
             }
         )
 

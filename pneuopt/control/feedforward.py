@@ -45,8 +45,15 @@ class Feedforward:
         >>> [(n, p.unit) for n, p in Feedforward().parameters("m/s", "V").items()]
         [('gain', 'V*s/m'), ('time', 's')]
         """
-        gain = Parameter(0.0, unit_ratio(output_unit, input_unit))
-        return ParameterSet({"gain": gain, "time": Parameter(self.time, "s", lower=MIN_FEEDFORWARD_TIME)})
+        gain = Parameter(
+            0.0, unit_ratio(output_unit, input_unit), meaning="command per jump of the reference, which decays again"
+        )
+        return ParameterSet(
+            {
+                "gain": gain,
+                "time": Parameter(self.time, "s", lower=MIN_FEEDFORWARD_TIME, meaning="time constant of that decay"),
+            }
+        )
 
     def states(self, measured: Quantity) -> tuple[Quantity, ...]:
         """The filtered reference r_f, as "filter"."""

@@ -69,8 +69,18 @@ class FrictionFeedforward:
         >>> [(n, p.unit) for n, p in FrictionFeedforward().parameters(on, "V").items()]
         [('level', 'V'), ('smoothing', 'm/s')]
         """
-        within = Parameter(DIRECTION_SMOOTHING, difference_unit(on.measured.unit), lower=LEAST_SMOOTHING)
-        return ParameterSet({"level": Parameter(0.0, unit, lower=0.0), "smoothing": within})
+        within = Parameter(
+            DIRECTION_SMOOTHING,
+            difference_unit(on.measured.unit),
+            lower=LEAST_SMOOTHING,
+            meaning="speed within which the added command turns its sign",
+        )
+        return ParameterSet(
+            {
+                "level": Parameter(0.0, unit, lower=0.0, meaning="command that Coulomb friction takes"),
+                "smoothing": within,
+            }
+        )
 
     def states(self, _command: Quantity) -> tuple[Quantity, ...]:
         """None."""

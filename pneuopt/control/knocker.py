@@ -53,10 +53,15 @@ class Knocker:
         """
         return ParameterSet(
             {
-                "amplitude": Parameter(0.0, unit, lower=0.0),
-                "width": Parameter(PULSE_SAMPLES * on.h, "s", lower=on.h),
-                "period": Parameter(PERIOD_SAMPLES * on.h, "s", lower=on.h),
-                "smoothing": Parameter(CHANGE_SMOOTHING, unit, lower=LEAST_SMOOTHING),
+                "amplitude": Parameter(0.0, unit, lower=0.0, meaning="height of the pulses"),
+                "width": Parameter(PULSE_SAMPLES * on.h, "s", lower=on.h, meaning="length of a pulse"),
+                "period": Parameter(PERIOD_SAMPLES * on.h, "s", lower=on.h, meaning="time from pulse to pulse"),
+                "smoothing": Parameter(
+                    CHANGE_SMOOTHING,
+                    unit,
+                    lower=LEAST_SMOOTHING,
+                    meaning="change of the command that decides a pulse's direction",
+                ),
             }
         )
 

@@ -97,22 +97,36 @@ class PID:
         h, gain = self.sample_time or 0.0, unit_ratio(output_unit, input_unit)
         shortest = h or 1e-6
         known = {
-            "Kp": Parameter(1.0, gain),
-            "K": Parameter(1.0, gain),
-            "Ki": Parameter(0.0, unit_ratio(output_unit, f"{difference_unit(input_unit)}*s")),
-            "Kd": Parameter(0.0, unit_ratio(f"{difference_unit(output_unit)}*s", input_unit)),
-            "Tf": Parameter(0.01, "s", lower=0.0 if h else shortest),
-            "Ti": Parameter(inf, "s", lower=0.0),
-            "Td": Parameter(0.0, "s", lower=0.0),
-            "N": Parameter(10.0, "1", lower=0.0),
+            "Kp": Parameter(1.0, gain, meaning="proportional gain"),
+            "K": Parameter(1.0, gain, meaning="gain of the series form"),
+            "Ki": Parameter(0.0, unit_ratio(output_unit, f"{difference_unit(input_unit)}*s"), meaning="integral gain"),
+            "Kd": Parameter(
+                0.0, unit_ratio(f"{difference_unit(output_unit)}*s", input_unit), meaning="derivative gain"
+            ),
+            "Tf": Parameter(
+                0.01, "s", lower=0.0 if h else shortest, meaning="time constant of the derivative's filter"
+            ),
+            "Ti": Parameter(inf, "s", lower=0.0, meaning="integral time; inf: no integral action"),
+            "Td": Parameter(0.0, "s", lower=0.0, meaning="derivative time"),
+            "N": Parameter(
+                10.0, "1", lower=0.0, meaning="derivative filter as the ISA ratio, Tf = Td/N; inf: no filter"
+            ),
         }
         core = {n: known[n] for n in self.form.gains}
-        core |= {n: Parameter(1.0, "1", lower=0.0) for n in ("b", "c")}
-        core |= {"dead_band": Parameter(0.0, difference_unit(input_unit), lower=0.0)} if self.dead_band else {}
+        weights = {
+            "b": "weight of the reference in the proportional term",
+            "c": "weight of the reference in the derivative",
+        }
+        core |= {n: Parameter(1.0, "1", lower=0.0, meaning=what) for n, what in weights.items()}
+        band = "half width of the error within which nothing is integrated"
+        if self.dead_band:
+            core["dead_band"] = Parameter(0.0, difference_unit(input_unit), lower=0.0, meaning=band)
         saturation = {
-            "Tt": Parameter(max(0.1, 10 * h), "s", lower=shortest),
-            "lower": Parameter(-inf, output_unit),
-            "upper": Parameter(inf, output_unit),
+            "Tt": Parameter(
+                max(0.1, 10 * h), "s", lower=shortest, meaning="time in which the integral unwinds at a limit"
+            ),
+            "lower": Parameter(-inf, output_unit, meaning="least command"),
+            "upper": Parameter(inf, output_unit, meaning="largest command"),
         }
         return ParameterSet(core | saturation if self.limits else core)
 

@@ -65,7 +65,13 @@ class SensorLag:
 
     def parameters(self, _on: SensedSignal) -> ParameterSet:
         """The lag [s]."""
-        return ParameterSet({"lag": Parameter(self.lag, "s", lower=MIN_SENSOR_LAG)})
+        return ParameterSet(
+            {
+                "lag": Parameter(
+                    self.lag, "s", lower=MIN_SENSOR_LAG, meaning="lag with which the controller sees the signal"
+                )
+            }
+        )
 
     def states(self, on: SensedSignal) -> tuple[Quantity, ...]:
         """The reading."""
@@ -143,10 +149,16 @@ class Encoder:
 
     def parameters(self, on: SensedSignal) -> ParameterSet:
         """The filter's time constant [s] where there is a speed, and the resolution [the position's unit]."""
-        found = {"filter": Parameter(self.filter, "s", lower=0.0)} if self.differentiates(on) else {}
+        found = (
+            {"filter": Parameter(self.filter, "s", lower=0.0, meaning="time constant of the encoder's low-pass")}
+            if self.differentiates(on)
+            else {}
+        )
         if self.resolution:
             unit = on.outputs[self.position].unit
-            found["resolution"] = Parameter(self.resolution, unit, lower=1e-9 * self.resolution)
+            found["resolution"] = Parameter(
+                self.resolution, unit, lower=1e-9 * self.resolution, meaning="one count of the encoder"
+            )
         return ParameterSet(found)
 
     def states(self, on: SensedSignal) -> tuple[Quantity, ...]:

@@ -90,10 +90,24 @@ class MotionDrive:
     @property
     def parameters(self) -> ParameterSet:
         """rig.*, friction.*, and ambient.pressure where a pressure acts."""
-        area = Parameter(4.908738521e-4, "m^2", lower=1e-7, upper=10.0, source="bore 25 mm")
-        bias = Parameter(0.0, "1", lower=-0.5, upper=0.5)
+        area = Parameter(
+            4.908738521e-4,
+            "m^2",
+            lower=1e-7,
+            upper=10.0,
+            source="bore 25 mm",
+            meaning="piston area on which the chamber's pressure acts",
+        )
+        bias = Parameter(0.0, "1", lower=-0.5, upper=0.5, meaning="error of the area, a fraction of it")
         rig = {"rig.area": area, "rig.area_bias": bias} if self.chamber else {}
-        offset = ParameterSet({**rig, "rig.force_offset": Parameter(0.0, "N", lower=-1e4, upper=1e4)})
+        offset = ParameterSet(
+            {
+                **rig,
+                "rig.force_offset": Parameter(
+                    0.0, "N", lower=-1e4, upper=1e4, meaning="reading of the force sensor without force"
+                ),
+            }
+        )
         ambient = AMBIENT_PARAMETERS if self.chamber else _ambient_parameters(self.friction)
         return offset | self.friction.parameters.with_prefix("friction") | ambient
 
@@ -133,7 +147,16 @@ MOTION_KIND = DriveKind(
 )
 
 AMBIENT_PARAMETERS = ParameterSet(
-    {"ambient.pressure": Parameter(ATMOSPHERE, "Pa(a)", lower=1e4, upper=2e5, source="ISO 2533 standard atmosphere")}
+    {
+        "ambient.pressure": Parameter(
+            ATMOSPHERE,
+            "Pa(a)",
+            lower=1e4,
+            upper=2e5,
+            source="ISO 2533 standard atmosphere",
+            meaning="pressure of the surroundings, from which gauge pressures count",
+        )
+    }
 )
 _PRESSURE_A = Quantity("pressure_a", "Pa(a)", nominal=5e5)
 

@@ -178,9 +178,15 @@ class LuGre:
     def parameters(self) -> ParameterSet:
         """Parameters of the Stribeck curve, viscous friction, and the bristles' stiffness and damping."""
         bristles = {
-            "bristle_stiffness": Parameter(5e4, "N/m", lower=1e3, upper=1e7, log=True),
-            "bristle_damping": Parameter(300.0, "N*s/m", lower=1.0, upper=1e4, log=True),
-            "damping_velocity": Parameter(0.05, "m/s", lower=1e-4, upper=1e3, log=True),
+            "bristle_stiffness": Parameter(
+                5e4, "N/m", lower=1e3, upper=1e7, log=True, meaning="stiffness of the bristles: force per presliding"
+            ),
+            "bristle_damping": Parameter(
+                300.0, "N*s/m", lower=1.0, upper=1e4, log=True, meaning="damping of the bristles at rest"
+            ),
+            "damping_velocity": Parameter(
+                0.05, "m/s", lower=1e-4, upper=1e3, log=True, meaning="speed beyond which bristles are no longer damped"
+            ),
         }
         return ParameterSet({**_STRIBECK_PARAMETERS, "viscous": _VISCOUS_PARAMETER, **bristles})
 
@@ -222,9 +228,13 @@ class Asymmetric:
     @property
     def parameters(self) -> ParameterSet:
         """Parameters of the base, coulomb_asymmetry (also of static), viscous_asymmetry [1], asymmetry_width [m/s]."""
-        ratio = Parameter(0.0, "1", lower=-0.95, upper=0.95)
-        added = {"viscous_asymmetry": ratio, "asymmetry_width": _SMOOTHING_PARAMETER}
-        coulomb = {"coulomb_asymmetry": ratio} if "coulomb" in self.base.parameters else {}
+        levels, slope = (
+            Parameter(0.0, "1", lower=-0.95, upper=0.95, meaning=f"{what} more forwards, less backwards, a fraction")
+            for what in ("Coulomb and static friction", "viscous friction")
+        )
+        width = replace(_SMOOTHING_PARAMETER, meaning="speed over which one direction's levels become the other's")
+        added = {"viscous_asymmetry": slope, "asymmetry_width": width}
+        coulomb = {"coulomb_asymmetry": levels} if "coulomb" in self.base.parameters else {}
         return self.base.parameters | ParameterSet({**coulomb, **added})
 
     @property
@@ -273,7 +283,9 @@ class PressureDependent:
     @property
     def parameters(self) -> ParameterSet:
         """Parameters of the base model, and a coefficient [N/Pa] for each chamber."""
-        slope = Parameter(0.0, "N/Pa", lower=-1e-3, upper=1e-3)
+        slope = Parameter(
+            0.0, "N/Pa", lower=-1e-3, upper=1e-3, meaning="Coulomb friction per gauge pressure in that chamber"
+        )
         return self.base.parameters | ParameterSet({f"coulomb_{name}": slope for name in self.chambers})
 
     @property
@@ -363,11 +375,21 @@ def _bristle_deflection(force: Array, speed: Array, values: Mapping[str, float])
 
 _FLOORS = {"coulomb": MIN_COULOMB_SHARE, "viscous": 0.0}
 _STRIBECK_SCAN = {"stribeck_velocity": STRIBECK_VELOCITIES}
-_VISCOUS_PARAMETER = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5)
-_COULOMB_PARAMETER = Parameter(30.0, "N", lower=0.0, upper=1e5)
-_SMOOTHING_PARAMETER = Parameter(1e-3, "m/s", lower=1e-6, upper=1.0, log=True, source=DEFAULT_WIDTH)
+_VISCOUS_PARAMETER = Parameter(70.0, "N*s/m", lower=0.0, upper=1e5, meaning="friction per speed")
+_COULOMB_PARAMETER = Parameter(30.0, "N", lower=0.0, upper=1e5, meaning="Coulomb friction: the level while sliding")
+_SMOOTHING_PARAMETER = Parameter(
+    1e-3,
+    "m/s",
+    lower=1e-6,
+    upper=1.0,
+    log=True,
+    source=DEFAULT_WIDTH,
+    meaning="speed over which friction turns its sign",
+)
 _STRIBECK_PARAMETERS = {
     "coulomb": _COULOMB_PARAMETER,
-    "static": Parameter(45.0, "N", lower=0.0, upper=1e5),
-    "stribeck_velocity": Parameter(0.02, "m/s", lower=1e-4, upper=1.0, log=True),
+    "static": Parameter(45.0, "N", lower=0.0, upper=1e5, meaning="static friction: the level at break-away"),
+    "stribeck_velocity": Parameter(
+        0.02, "m/s", lower=1e-4, upper=1.0, log=True, meaning="speed over which friction falls from static to Coulomb"
+    ),
 }

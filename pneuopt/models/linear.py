@@ -61,7 +61,7 @@ class FirstOrder:
         def dynamics(u: ca.SX, x: Symbols, p: Symbols) -> dict[str, ca.SX]:
             return {y: (p["plant.gain"] * u - x[y]) / p["plant.time_constant"]}
 
-        shaping = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True)}
+        shaping = {"plant.time_constant": Parameter(0.1, "s", 1e-5, 1e4, log=True, meaning="time constant")}
         shape = ResponseShape(("plant.time_constant",), _first_order_polynomials)
         return _assemble_plant(
             self, (self.output,), _gain_parameter(self.input, self.output, ""), ParameterSet(shaping), dynamics, shape
@@ -126,8 +126,10 @@ class SecondOrder:
 
         shaping = ParameterSet(
             {
-                "plant.natural_frequency": Parameter(10.0, "rad/s", 1e-3, 1e5, log=True),
-                "plant.damping": Parameter(0.7, "1", 1e-3, 1e3, log=True),
+                "plant.natural_frequency": Parameter(
+                    10.0, "rad/s", 1e-3, 1e5, log=True, meaning="natural frequency without damping"
+                ),
+                "plant.damping": Parameter(0.7, "1", 1e-3, 1e3, log=True, meaning="damping ratio"),
             }
         )
         if friction is not None:
@@ -236,7 +238,13 @@ def _assemble_plant(
     line = _delay_line(source, order)
     parameters = ParameterSet({"plant.gain": gain}) | shaping
     if order:
-        parameters = parameters | ParameterSet({"plant.dead_time": Parameter(0.01, "s", 1e-3, 10.0, log=True)})
+        parameters = parameters | ParameterSet(
+            {
+                "plant.dead_time": Parameter(
+                    0.01, "s", 1e-3, 10.0, log=True, meaning="delay from the input to its effect"
+                )
+            }
+        )
 
     def rhs(_: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
         late, rates = _pade_delay(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
@@ -291,7 +299,7 @@ def _pade_delay(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list
 
 def _gain_parameter(source: Quantity, output: Quantity, per: str) -> Parameter:
     unit = _quotient_unit(output, f"({difference_unit(source.unit)}{per})" if per else difference_unit(source.unit))
-    return Parameter(1.0, unit)
+    return Parameter(1.0, unit, meaning="steady output, or of an integrator its rate, per input")
 
 
 def _quotient_unit(output: Quantity, unit: str) -> str:

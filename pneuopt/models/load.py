@@ -35,14 +35,20 @@ class Load:
     def parameters(self) -> ParameterSet:
         """Mass [kg], force [N]; with a spring stiffness [N/m], rest_position [m]; inclined: inclination [rad]."""
         always = {
-            "mass": Parameter(5.0, "kg", lower=1e-3, upper=1e5, log=True),
-            "force": Parameter(0.0, "N", lower=-1e5, upper=1e5),
+            "mass": Parameter(
+                5.0, "kg", lower=1e-3, upper=1e5, log=True, meaning="mass that moves, piston and rod included"
+            ),
+            "force": Parameter(0.0, "N", lower=-1e5, upper=1e5, meaning="constant force against positive motion"),
         }
         spring = {
-            "stiffness": Parameter(0.0, "N/m", lower=0.0, upper=1e8),
-            "rest_position": Parameter(0.0, "m"),
+            "stiffness": Parameter(0.0, "N/m", lower=0.0, upper=1e8, meaning="stiffness of the spring on the load"),
+            "rest_position": Parameter(0.0, "m", meaning="position at which the spring is relaxed"),
         }
-        incline = {"inclination": Parameter(pi / 2, "rad", lower=-pi / 2, upper=pi / 2)}
+        incline = {
+            "inclination": Parameter(
+                pi / 2, "rad", lower=-pi / 2, upper=pi / 2, meaning="angle by which positive motion goes up"
+            )
+        }
         return ParameterSet({**always, **(spring if self.spring else {}), **(incline if self.inclined else {})})
 
     def acceleration(self, driving: ca.SX, position: ca.SX, p: Symbols) -> ca.SX:

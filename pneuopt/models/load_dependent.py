@@ -45,8 +45,15 @@ class LoadDependent:
     def parameters(self) -> ParameterSet:
         """Parameters of the base model, coulomb_load [1] and load_rounding [N]."""
         added = {
-            "coulomb_load": Parameter(0.0, "1", lower=0.0, upper=0.9),
-            "load_rounding": Parameter(1.0, "N", lower=1e-3, upper=1e3, log=True),
+            "coulomb_load": Parameter(0.0, "1", lower=0.0, upper=0.9, meaning="Coulomb friction per transmitted force"),
+            "load_rounding": Parameter(
+                1.0,
+                "N",
+                lower=1e-3,
+                upper=1e3,
+                log=True,
+                meaning="force over which the transmitted force's size is rounded",
+            ),
         }
         return self.base.parameters | ParameterSet(added)
 

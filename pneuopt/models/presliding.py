@@ -39,7 +39,9 @@ class Presliding:
     def parameters(self) -> ParameterSet:
         """Parameters: coulomb [N], viscous [N*s/m], presliding_speed [m/s]."""
         base = Coulomb().parameters
-        speed = Parameter(3e-3, "m/s", lower=MIN_PRESLIDING_SPEED, upper=0.1, log=True)
+        speed = Parameter(
+            3e-3, "m/s", lower=MIN_PRESLIDING_SPEED, upper=0.1, log=True, meaning="speed over which friction builds up"
+        )
         return base.select(n for n in base if n != "smoothing") | ParameterSet({"presliding_speed": speed})
 
     @property

@@ -25,8 +25,15 @@ RADIUS = 0.01
 ANGLE = Quantity("angle", "rad", nominal=0.1 / RADIUS)
 ANGULAR_SPEED = Quantity("speed", "rad/s", nominal=0.5 / RADIUS)
 TORQUE = Quantity("torque", "N*m", nominal=100.0 * RADIUS)
-INERTIA = Parameter(5.0 * RADIUS**2, "kg*m^2", lower=1e-9, upper=1e5, log=True)
-LOAD_TORQUE = Parameter(0.0, "N*m", lower=-1e5, upper=1e5)
+INERTIA = Parameter(
+    5.0 * RADIUS**2,
+    "kg*m^2",
+    lower=1e-9,
+    upper=1e5,
+    log=True,
+    meaning="moment of inertia that turns, the motor's included",
+)
+LOAD_TORQUE = Parameter(0.0, "N*m", lower=-1e5, upper=1e5, meaning="constant torque against positive motion")
 _LOAD_EXCITATION = load_excitation(
     "load.inertia", "load.torque", "torque", "take the inertia from drawings or data sheets and fix it"
 )

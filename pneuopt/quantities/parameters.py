@@ -3,7 +3,7 @@
 import fnmatch
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeVar
 
 from pneuopt.quantities.errors import InputError, UnknownNameError, check_names, require
@@ -59,6 +59,8 @@ class Parameter:
         Each experiment has a value of its own (a sensor offset, say).
     source : str
         Where the number comes from.
+    meaning : str
+        What the number is, for lists of keys; two parameters that differ in it alone are equal.
     """
 
     value: float
@@ -69,6 +71,7 @@ class Parameter:
     free: bool = False
     per_log: bool = False
     source: str = ""
+    meaning: str = field(default="", compare=False, repr=False)
 
     def __post_init__(self) -> None:
         require(not math.isnan(self.value), f"a parameter's value is NaN [{self.unit}]; give a number")

@@ -77,6 +77,10 @@ def test_every_signal_and_parameter_has_a_unit_that_reads(system: System) -> Non
         assert si_conversion(unit, unit) == (1.0, 0.0), f"{name} [{unit}] is not in SI units"
 
 
+def test_every_parameter_says_what_it_is(system: System) -> None:
+    assert [n for n, p in system.parameters.items() if not p.meaning] == []
+
+
 def test_derivatives_are_finite_and_equal_the_central_differences(system: System) -> None:
     rng = np.random.default_rng(1)
     sizes = [system.ode.size1_in(i) for i in range(4)]

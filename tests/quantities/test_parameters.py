@@ -96,3 +96,9 @@ def test_it_travels_between_processes() -> None:
 def test_selecting_keeps_the_order_asked_for(names: list[str]) -> None:
     assert list(RIG.select(names)) == names
     assert list(RIG.select(names).with_prefix("rig")) == [f"rig.{n}" for n in names]
+
+
+def test_a_meaning_does_not_tell_parameters_apart_and_stays_with_a_copy() -> None:
+    mass = Parameter(5.0, "kg", meaning="mass that moves")
+    assert mass == Parameter(5.0, "kg")
+    assert ParameterSet({"load.mass": mass}).with_values({"load.mass": 6.0})["load.mass"].meaning == "mass that moves"

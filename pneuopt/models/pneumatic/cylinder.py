@@ -34,17 +34,21 @@ class Cylinder:
     def parameters(self) -> ParameterSet:
         """Parameters: geometry, leak, the rest position `start`, and with stops their stiffness and damping."""
         always = {
-            "bore": Parameter(0.032, "m", 1e-3, 1.0),
-            "rod": Parameter(0.012, "m", 0.0, 1.0),
-            "stroke": Parameter(0.2, "m", 1e-3, 20.0),
-            "dead_volume_a": Parameter(8e-6, "m^3", 1e-9, 1.0, log=True),
-            "dead_volume_b": Parameter(8e-6, "m^3", 1e-9, 1.0, log=True),
-            "leak": Parameter(0.0, "kg/(s*Pa)", 0.0, 1e-6),
-            "start": Parameter(0.5, "1", 0.0, 1.0),
+            "bore": Parameter(0.032, "m", 1e-3, 1.0, meaning="diameter of the piston"),
+            "rod": Parameter(0.012, "m", 0.0, 1.0, meaning="diameter of the rod, on side b; 0: rodless"),
+            "stroke": Parameter(0.2, "m", 1e-3, 20.0, meaning="travel from cover to cover"),
+            "dead_volume_a": Parameter(
+                8e-6, "m^3", 1e-9, 1.0, log=True, meaning="volume of chamber a, hose and port at position 0"
+            ),
+            "dead_volume_b": Parameter(
+                8e-6, "m^3", 1e-9, 1.0, log=True, meaning="volume of chamber b, hose and port at the stroke's end"
+            ),
+            "leak": Parameter(0.0, "kg/(s*Pa)", 0.0, 1e-6, meaning="laminar leakage past the piston, at 100 kPa"),
+            "start": Parameter(0.5, "1", 0.0, 1.0, meaning="where a step starts, as a fraction of the stroke"),
         }
         stops = {
-            "stop_stiffness": Parameter(1e6, "N/m", 0.0, 1e9),
-            "stop_damping": Parameter(1.0, "s/m", 0.0, 100.0),
+            "stop_stiffness": Parameter(1e6, "N/m", 0.0, 1e9, meaning="stiffness of the covers"),
+            "stop_damping": Parameter(1.0, "s/m", 0.0, 100.0, meaning="damping of the covers, per speed"),
         }
         return ParameterSet({**always, **(stops if self.stops else {})})
 

@@ -71,7 +71,9 @@ class PneumaticDrive:
         parts = {
             "cylinder": self.cylinder.parameters,
             "valve": self.valve.parameters,
-            "supply": ParameterSet({"pressure": Parameter(7.01325e5, "Pa(a)", 1e4, 2.1e6)}),
+            "supply": ParameterSet(
+                {"pressure": Parameter(7.01325e5, "Pa(a)", 1e4, 2.1e6, meaning="pressure before the valve")}
+            ),
             "chamber": self.chamber.parameters,
             "load": self.load.parameters,
             "friction": self.friction.parameters,
@@ -305,8 +307,17 @@ _FLOW_EXCITATION = Excitation(
 )
 _AIR_PARAMETERS = ParameterSet(
     {
-        "ambient.temperature": Parameter(293.15, "K", 200.0, 400.0, source="ISO 8778 standard atmosphere (ANR)"),
-        "gas.constant": Parameter(GAS_CONSTANT, "J/(kg*K)", 250.0, 320.0, source="dry air"),
+        "ambient.temperature": Parameter(
+            293.15,
+            "K",
+            200.0,
+            400.0,
+            source="ISO 8778 standard atmosphere (ANR)",
+            meaning="temperature of the supply and the surroundings",
+        ),
+        "gas.constant": Parameter(
+            GAS_CONSTANT, "J/(kg*K)", 250.0, 320.0, source="dry air", meaning="specific gas constant"
+        ),
     }
 )
 

@@ -69,16 +69,32 @@ class ProportionalValve:
     def parameters(self) -> ParameterSet:
         """Parameters: conductance of an open edge, flow law, geometry and lag of the spool, span of the command."""
         lag = {
-            "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True),
-            "damping": Parameter(0.7, "1", 0.1, 5.0, log=True),
+            "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True, meaning="corner frequency of the spool's lag"),
+            "damping": Parameter(0.7, "1", 0.1, 5.0, log=True, meaning="damping ratio of the spool's lag"),
         }
         geometry = {
-            "dead_zone": Parameter(0.0, "1", -0.5, 0.5),
-            "rounding": Parameter(0.04, "1", 1e-6, 0.5, log=True, source=DEFAULT_WIDTH),
-            "leak": Parameter(0.0, "1", 0.0, 0.2),
-            "span": Parameter(5.0, "V", 0.1, 100.0),
+            "dead_zone": Parameter(
+                0.0, "1", -0.5, 0.5, meaning="overlap of the edges, a fraction of half the spool's travel"
+            ),
+            "rounding": Parameter(
+                0.04,
+                "1",
+                1e-6,
+                0.5,
+                log=True,
+                source=DEFAULT_WIDTH,
+                meaning="rounding of the edges, a fraction of half the travel",
+            ),
+            "leak": Parameter(0.0, "1", 0.0, 0.2, meaning="opening of a closed edge, a fraction of the full one"),
+            "span": Parameter(5.0, "V", 0.1, 100.0, meaning="command from the centre to full opening"),
         }
-        conductance = ParameterSet({"conductance": Parameter(2e-8, "m^3/(s*Pa)", 1e-12, 1e-4, log=True)})
+        conductance = ParameterSet(
+            {
+                "conductance": Parameter(
+                    2e-8, "m^3/(s*Pa)", 1e-12, 1e-4, log=True, meaning="ISO 6358 sonic conductance C of an open edge"
+                )
+            }
+        )
         moving = dict(list(lag.items())[: self.spool.value])
         return conductance | self.law.parameters | ParameterSet({**geometry, **moving})
 
