@@ -70,7 +70,8 @@ from .identification.profiles import Profile, profile
 from .identification.propagation import PropagatedValue, propagate_error
 from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
-from .logs.experiments import Experiment, differentiate, read_log, resample, split
+from .logs.experiments import Experiment, differentiate, resample, split
+from .logs.read_log import read_log
 from .models import catalog
 from .models.drive import ForceDrive, MotionDrive
 from .models.friction import (

@@ -25,7 +25,8 @@ from pneuopt.identification.identifiability import identifiability
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.identification.select_model import select_model
-from pneuopt.logs.experiments import Experiment, read_log
+from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.read_log import read_log
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.models.friction_laws import friction_ladder, usual_unknowns

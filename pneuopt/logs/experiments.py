@@ -1,39 +1,16 @@
-"""`Experiment`: a measured `Trajectory` with its noise and conditions; reading logs, cutting and resampling them."""
+"""`Experiment`: a measured `Trajectory` with its noise and conditions; cutting and resampling it."""
 
-import hashlib
 import math
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 
-from pneuopt.logs.columns import CHANNELS, read_channels
-from pneuopt.logs.readers import read_table
+from pneuopt.logs.columns import CHANNELS
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import LogError, check_names, require
+from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.intersample import Intersample, usual_intersample
-from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
-from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value
-
-ACCEPTED_CHECKS = "accept"  # of a sidecar: the checks that its log need not pass
-
-
-class Plant(Protocol):
-    """What a log's reader asks of a plant, say a `System`."""
-
-    @property
-    def inputs(self) -> tuple[Quantity, ...]:
-        """Signals that drive it."""
-        ...
-
-    @property
-    def outputs(self) -> tuple[Quantity, ...]:
-        """Signals that sensors show."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,61 +102,6 @@ class Experiment:
     def with_conditions(self, conditions: Mapping[str, float]) -> "Experiment":
         """Override the named parameters [SI] in this log, by copy."""
         return replace(self, conditions={**self.conditions, **conditions})
-
-
-def read_log(
-    path: str | Path,
-    *,
-    columns: Mapping[str, str | Mapping[str, str | float]] | None = None,
-    sidecar: str | Path | None = None,
-    plant: Plant | None = None,
-    ambient_pressure: float = ATMOSPHERE,
-) -> Experiment:
-    """Read a log, and what its sidecar says about it.
-
-    Parameters
-    ----------
-    path : str or Path
-        Its suffix says the format: text (.csv, .txt, .tsv, .dat), .parquet or .mat (up to version 7). In a text, the
-        first row names the columns; a comma, semicolon or tab separates them; the decimal mark is a point or a comma;
-        an empty cell is a missing sample.
-    columns : mapping, optional
-        Channel to column, in place of the sidecar's [columns]: "t [ms]", or a mapping with `column`, `unit`,
-        `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied, or an encoder's "8192 count/rev"). Without
-        either, the header has to say "position [mm]" or "position_mm".
-    sidecar : str or Path, optional
-        TOML with [columns], [noise], [conditions], [intersample] (force = "held", or "linear"); by default the file of
-        the same name, if there is one. Before them, accept = ["work"] names checks that the log need not pass.
-    plant : System, optional
-        Its inputs and outputs, and their references, are channels in its units, beside and before the usual ones:
-        torque [N*m] and angle [rad], say.
-    ambient_pressure : float
-        What gauge pressures, bar(g), count from [Pa]: the drive's "ambient.pressure".
-
-    Returns
-    -------
-    Experiment
-
-    Raises
-    ------
-    LogError, UnitError, UnknownNameError
-        If anything in the files is missing, ambiguous or not a number; the message names file, row, column, remedy.
-    """
-    path = Path(path)
-    sha256 = hashlib.sha256(_read_bytes(path)).hexdigest()
-    side, sections = _read_sidecar(path, sidecar)
-    entries, where = (columns, "columns") if columns is not None else (sections.get("columns"), f"{side}: columns")
-    units = {} if plant is None else _plant_channels(plant)
-    channels = {**CHANNELS, **units}
-    with count_gauge_from(ambient_pressure):
-        values = read_channels(read_table(path), entries, where, channels)
-        conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
-    trajectory = Trajectory(values.pop("time"), values)
-    noise = _read_noise(sections.get("noise", {}), trajectory, f"{side}: noise", channels)
-    own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
-    between = _read_intersample(sections.get("intersample", {}), trajectory, f"{side}: intersample")
-    accept = tuple(sections.get(ACCEPTED_CHECKS, ()))
-    return Experiment(trajectory, noise, conditions, path.stem, sha256, own, between, accept=accept)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
@@ -312,60 +234,3 @@ def _local_slope(t: Array, x: Array, reach: float) -> Array:
 def _median_step(trajectory: Trajectory) -> float:
     require(len(trajectory) > 1, "a log of one sample has no time step")
     return float(np.median(np.diff(trajectory.t)))
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
-
-
-def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping[str, Any]]:
-    side = path.with_suffix(".toml") if sidecar is None else Path(sidecar)
-    if sidecar is None and not side.exists():
-        return side, {}
-    raw = _read_bytes(side)
-    try:
-        sections = tomllib.loads(raw.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise LogError(f"{side}: not valid TOML: {error}") from None
-    other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
-    require(sidecar is not None or "drive" not in sections, other, LogError)
-    check_names("key", sections, (ACCEPTED_CHECKS, "columns", "noise", "conditions", "intersample"), str(side))
-    accept = sections.get(ACCEPTED_CHECKS, [])
-    is_list = isinstance(accept, list) and all(isinstance(name, str) for name in accept)
-    require(
-        is_list,
-        f'{side}: {ACCEPTED_CHECKS} must list checks, as {ACCEPTED_CHECKS} = ["work"]; got {accept!r}',
-        LogError,
-    )
-    for key, section in ((key, section) for key, section in sections.items() if key != ACCEPTED_CHECKS):
-        require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
-    return side, sections
-
-
-def _plant_channels(plant: Plant) -> dict[str, str]:
-    """The channels that a plant's log may hold: its signals, and the references of its outputs."""
-    references = {f"{q.name}_reference": q.unit for q in plant.outputs}
-    return {**{q.name: q.unit for q in (*plant.inputs, *plant.outputs)}, **references}
-
-
-def _read_noise(
-    entries: Mapping[str, Any], trajectory: Trajectory, where: str, channels: Mapping[str, str]
-) -> dict[str, float]:
-    check_names("channel", entries, trajectory, where)
-    # A noise is a difference, so a pressure's takes no (a) or (g).
-    return {c: read_value(v, channels[c].partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}
-
-
-def _read_intersample(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, Intersample]:
-    check_names("channel", entries, trajectory, where)
-    known = {kind.value: kind for kind in Intersample}
-    for channel, word in entries.items():
-        require(
-            isinstance(word, str) and word in known,
-            f"{where}.{channel} is {word!r}; it must be " + " or ".join(map(repr, known)),
-            LogError,
-        )
-    return {channel: known[word] for channel, word in entries.items()}

@@ -19,7 +19,7 @@ from pneuopt.cli.terminal import make_console
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
-from pneuopt.logs.experiments import read_log
+from pneuopt.logs.read_log import read_log
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.status import Code, Status

@@ -9,7 +9,8 @@ import pytest
 from pneuopt.dynamics.hooks import Log
 from pneuopt.identification.checks import check_content
 from pneuopt.identification.identify import identify
-from pneuopt.logs.experiments import Experiment, read_log
+from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.read_log import read_log
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.arrays import Array

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from pneuopt.logs.experiments import read_log
+from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import UnitError
 from pneuopt.quantities.parameters import Quantity
 

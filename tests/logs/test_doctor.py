@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pneuopt.logs.doctor import examine
-from pneuopt.logs.experiments import Experiment, read_log
+from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
 

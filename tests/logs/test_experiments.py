@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.logs.experiments import Experiment, differentiate, read_log, resample, split
+from pneuopt.logs.experiments import Experiment, differentiate, resample, split
+from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import InputError, LogError, UnitError, UnknownNameError
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.trajectories import Trajectory

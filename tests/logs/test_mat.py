@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from pneuopt.logs.experiments import read_log
+from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.errors import LogError
 
 TIME = 0.1 * np.arange(12)

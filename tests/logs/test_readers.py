@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from pneuopt.logs.experiments import Experiment, read_log
+from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.read_log import read_log
 from pneuopt.logs.readers import READERS
 from pneuopt.quantities.errors import LogError, UnknownNameError
 

@@ -12,7 +12,8 @@ from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime
 from pneuopt.files.drive import read_drive
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.logs.experiments import Experiment, read_log
+from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.read_log import read_log
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent
 from pneuopt.models.load_dependent import LoadDependent
 from pneuopt.models.rotary import RotaryDrive
