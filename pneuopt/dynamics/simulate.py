@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.ramps import slopes
 from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable

@@ -12,7 +12,7 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 from scipy import integrate
 
-from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.system import System, names

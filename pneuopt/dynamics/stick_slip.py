@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from scipy import integrate, optimize
 
-from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.smooth import Recorder
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names

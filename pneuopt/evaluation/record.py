@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.compiled.rollout import compile_function
+from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.simulate import contacts, initial_state, input_rows, new_integration, warn_contacts
 from pneuopt.dynamics.smooth import Integration
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration

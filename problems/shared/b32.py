@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy import integrate
 
 import pneuopt as po
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compile_function
+from pneuopt.dynamics.compiled.functions import compile_function
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from problems.shared.arrays import names, parameter_vector
 
 if TYPE_CHECKING:

@@ -1,8 +1,8 @@
-"""CasADi Functions as cached machine code; the CasADi VM where there is no compiler. Both give the same answers.
+"""`Rollout`: a sampled system over many segments at once, each in a SIMD lane, with forward sensitivities.
 
-`compile_function` makes one Function callable; `Rollout` runs a sampled system over many segments at once, each in a
-SIMD lane, with forward sensitivities. Binaries are cached by content (source, flags, compiler, CPU); logs, values and
-step sizes are arguments, so one binary serves every log and every continuation step.
+It is cached machine code, or runs in the CasADi VM where there is no compiler. Both give the same answers. Binaries
+are cached by content (source, flags, compiler, CPU); logs, values and step sizes are arguments, so one binary serves
+every log and every continuation step.
 """
 
 import ctypes
@@ -317,53 +317,6 @@ def _call_part(function: Callable[..., None], call: tuple[object, ...], kept: tu
     function(*call)
 
 
-def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
-    """Make an SX Function callable on arrays, as machine code where a compiler is found.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Inputs and outputs dense vectors, scalars or matrices.
-
-    Returns
-    -------
-    callable
-        ``f(*inputs) -> tuple of ndarray``: vectors flat, matrices of shape (rows, columns). Not thread-safe.
-    """
-    function = _with_dense_outputs(function, "system_function")
-    shapes = [function.size_out(i) for i in range(function.n_out())]
-    library = compile_library(_casadi_source(function))
-    if library is None:
-        return lambda *inputs: tuple(map(_reshape, map(np.array, function.call(list(inputs))), shapes))
-    buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
-    results = [_buffer(shape) for shape in shapes]
-    work = np.zeros(max(1, function.sz_w()))
-    sz_arg, sz_res = max(1, function.sz_arg()), max(1, function.sz_res())
-    arg = (ctypes.c_void_p * sz_arg)(*(b.ctypes.data for b in buffers))
-    res = (ctypes.c_void_p * sz_res)(*(r.ctypes.data for r in results))
-    call = library.system_function
-    call.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int]
-    pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
-
-    def call_machine_code(*inputs: ArrayLike) -> tuple[Array, ...]:
-        for i, (buffer, value) in enumerate(zip(buffers, inputs, strict=True)):
-            size = value.size if isinstance(value, np.ndarray) else 1 if isinstance(value, float) else np.size(value)
-            if size != buffer.size:
-                raise ModelError(f"argument {i} has {size} numbers, expected {buffer.size}")
-            buffer[...] = value
-        call(*pointers)
-        return tuple([result.copy() for result in results])
-
-    call_machine_code.keep_alive = (library, arg, res, work)  # type: ignore[attr-defined]
-    return call_machine_code
-
-
-def _casadi_source(function: ca.Function) -> str:
-    generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
-    generator.add(function)
-    return str(generator.dump())
-
-
 def _processor_count() -> int:
     """Processors that this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)  # Linux only
@@ -375,12 +328,6 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="pneuopt")
 
 
-def _with_dense_outputs(function: ca.Function, name: str) -> ca.Function:
-    inputs = [ca.SX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
-    outputs = function.call(inputs)
-    return ca.Function(name, inputs, [ca.densify(o) for o in outputs], {"cse": True})
-
-
 def _unstack(block: ca.DM, rows: int, m: int, columns: int) -> Array:
     """(rows, m * columns) as CasADi's map stacks it -> (m, rows, columns)."""
     return np.ascontiguousarray(np.array(block).reshape(rows, m, columns).transpose(1, 0, 2))
@@ -388,13 +335,3 @@ def _unstack(block: ca.DM, rows: int, m: int, columns: int) -> Array:
 
 def _swap_last_axes(array: Array | None) -> Array | None:
     return None if array is None else np.swapaxes(array, -1, -2)
-
-
-def _buffer(shape: tuple[int, int]) -> Array:
-    """Vectors flat, matrices in CasADi's column order."""
-    return np.zeros(shape[0] * shape[1]) if 1 in shape else np.zeros(shape, order="F")
-
-
-def _reshape(array: Array, shape: tuple[int, int]) -> Array:
-    rows, columns = shape
-    return array.ravel(order="F") if 1 in (rows, columns) else array.reshape(rows, columns, order="F")

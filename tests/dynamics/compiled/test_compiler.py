@@ -15,7 +15,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pneuopt.dynamics.compiled import compiler
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compile_function
+from pneuopt.dynamics.compiled.functions import compile_function
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 
 Forget = Callable[[], None]
 needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")

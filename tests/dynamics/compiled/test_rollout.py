@@ -1,6 +1,5 @@
 from collections.abc import Callable
 
-import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -10,7 +9,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.compiled import compiler
 from pneuopt.dynamics.compiled import rollout as codegen
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout, compile_function
+from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
@@ -249,40 +248,6 @@ def test_no_substeps_are_refused() -> None:
     case = Case("stribeck")
     with pytest.raises(ModelError, match="substeps must be at least 1, got 0"):
         case.rollout().run(case.x0, case.u, case.p, case.t, case.h, substeps=0)
-
-
-def mixed() -> ca.Function:
-    a, B, c = ca.SX.sym("a"), ca.SX.sym("B", 2, 3), ca.SX.sym("c", 3)
-    sparse = ca.SX(2, 2)
-    sparse[0, 1] = a
-    return ca.Function("f", [a, B, c], [a * B @ c, B.T * a, sparse, ca.SX(0, 1)])
-
-
-@pytest.mark.parametrize("cc", [None, ""])
-def test_compiled_takes_scalars_vectors_and_matrices(
-    cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
-) -> None:
-    if cc is not None:
-        monkeypatch.setenv("PNEUOPT_CC", cc)
-    B, c = np.arange(6.0).reshape(2, 3), np.array([1.0, -1.0, 2.0])
-    product, turned, sparse, nothing = compile_function(mixed())(2.0, B, c)
-    assert_allclose(product, 2 * B @ c)
-    assert_allclose(turned, 2 * B.T)
-    assert_allclose(sparse, [[0, 2], [0, 0]])
-    assert nothing.shape == (0,)
-
-
-def test_results_are_the_callers_own() -> None:
-    f = compile_function(mixed())
-    first = f(1.0, np.ones((2, 3)), np.ones(3))[0]
-    f(5.0, np.ones((2, 3)), np.ones(3))
-    assert_array_equal(first, [3.0, 3.0])
-
-
-@needs_compiler
-def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers() -> None:
-    with pytest.raises(ModelError, match="argument 2 has 2 numbers, expected 3"):
-        compile_function(mixed())(1.0, np.ones((2, 3)), np.ones(2))
 
 
 @pytest.mark.parametrize("lanes", [pytest.param(None, marks=needs_compiler), 0])

@@ -1,0 +1,75 @@
+"""`compile_function`: a CasADi Function that is called on arrays, as machine code where a compiler is found."""
+
+import ctypes
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pneuopt.dynamics.compiled.compiler import compile_library
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import ModelError
+
+
+def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
+    """Make an SX Function callable on arrays, as machine code where a compiler is found.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Inputs and outputs dense vectors, scalars or matrices.
+
+    Returns
+    -------
+    callable
+        ``f(*inputs) -> tuple of ndarray``: vectors flat, matrices of shape (rows, columns). Not thread-safe.
+    """
+    function = _with_dense_outputs(function, "system_function")
+    shapes = [function.size_out(i) for i in range(function.n_out())]
+    library = compile_library(_casadi_source(function))
+    if library is None:
+        return lambda *inputs: tuple(map(_reshape, map(np.array, function.call(list(inputs))), shapes))
+    buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
+    results = [_buffer(shape) for shape in shapes]
+    work = np.zeros(max(1, function.sz_w()))
+    sz_arg, sz_res = max(1, function.sz_arg()), max(1, function.sz_res())
+    arg = (ctypes.c_void_p * sz_arg)(*(b.ctypes.data for b in buffers))
+    res = (ctypes.c_void_p * sz_res)(*(r.ctypes.data for r in results))
+    call = library.system_function
+    call.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int]
+    pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
+
+    def call_machine_code(*inputs: ArrayLike) -> tuple[Array, ...]:
+        for i, (buffer, value) in enumerate(zip(buffers, inputs, strict=True)):
+            size = value.size if isinstance(value, np.ndarray) else 1 if isinstance(value, float) else np.size(value)
+            if size != buffer.size:
+                raise ModelError(f"argument {i} has {size} numbers, expected {buffer.size}")
+            buffer[...] = value
+        call(*pointers)
+        return tuple([result.copy() for result in results])
+
+    call_machine_code.keep_alive = (library, arg, res, work)  # type: ignore[attr-defined]
+    return call_machine_code
+
+
+def _casadi_source(function: ca.Function) -> str:
+    generator = ca.CodeGenerator("generated.c", {"with_header": False, "verbose": False})
+    generator.add(function)
+    return str(generator.dump())
+
+
+def _with_dense_outputs(function: ca.Function, name: str) -> ca.Function:
+    inputs = [ca.SX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
+    outputs = function.call(inputs)
+    return ca.Function(name, inputs, [ca.densify(o) for o in outputs], {"cse": True})
+
+
+def _buffer(shape: tuple[int, int]) -> Array:
+    """Vectors flat, matrices in CasADi's column order."""
+    return np.zeros(shape[0] * shape[1]) if 1 in shape else np.zeros(shape, order="F")
+
+
+def _reshape(array: Array, shape: tuple[int, int]) -> Array:
+    rows, columns = shape
+    return array.ravel(order="F") if 1 in (rows, columns) else array.reshape(rows, columns, order="F")

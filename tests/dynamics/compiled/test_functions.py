@@ -1,0 +1,49 @@
+"""`compile_function`."""
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled.functions import compile_function
+from pneuopt.quantities.errors import ModelError
+
+Forget = Callable[[], None]
+needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
+
+
+def mixed() -> ca.Function:
+    a, B, c = ca.SX.sym("a"), ca.SX.sym("B", 2, 3), ca.SX.sym("c", 3)
+    sparse = ca.SX(2, 2)
+    sparse[0, 1] = a
+    return ca.Function("f", [a, B, c], [a * B @ c, B.T * a, sparse, ca.SX(0, 1)])
+
+
+@pytest.mark.parametrize("cc", [None, ""])
+def test_compiled_takes_scalars_vectors_and_matrices(
+    cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    if cc is not None:
+        monkeypatch.setenv("PNEUOPT_CC", cc)
+    B, c = np.arange(6.0).reshape(2, 3), np.array([1.0, -1.0, 2.0])
+    product, turned, sparse, nothing = compile_function(mixed())(2.0, B, c)
+    assert_allclose(product, 2 * B @ c)
+    assert_allclose(turned, 2 * B.T)
+    assert_allclose(sparse, [[0, 2], [0, 0]])
+    assert nothing.shape == (0,)
+
+
+def test_results_are_the_callers_own() -> None:
+    f = compile_function(mixed())
+    first = f(1.0, np.ones((2, 3)), np.ones(3))[0]
+    f(5.0, np.ones((2, 3)), np.ones(3))
+    assert_array_equal(first, [3.0, 3.0])
+
+
+@needs_compiler
+def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers() -> None:
+    with pytest.raises(ModelError, match="argument 2 has 2 numbers, expected 3"):
+        compile_function(mixed())(1.0, np.ones((2, 3)), np.ones(2))
