@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -82,12 +83,12 @@ def forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
 
 @pytest.fixture
 def count_calls(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[int]]:
-    """Patch a module's `compile_function`; the list grows by a 1 at each call of what it makes."""
+    """Patch a module's `compile_function` and `compile_rate`; the list grows by a 1 at each call of what they make."""
 
     def patch(module: ModuleType) -> list[int]:
-        calls, compiled = list[int](), module.compile_function
+        calls = list[int]()
 
-        def counted(function: ca.Function) -> Callable[..., Any]:
+        def counted(compiled: Callable[[ca.Function], Any], function: ca.Function) -> Callable[..., Any]:
             call = compiled(function)
 
             def run(*inputs: Any) -> Any:
@@ -96,7 +97,8 @@ def count_calls(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[
 
             return run
 
-        monkeypatch.setattr(module, "compile_function", counted)
+        for name in ("compile_function", "compile_rate"):
+            monkeypatch.setattr(module, name, partial(counted, getattr(module, name)))
         return calls
 
     return patch

@@ -17,7 +17,7 @@ from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.ramps import slopes
 from pneuopt.dynamics.runnable import HasSystem, Runnable, as_runnable
-from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration
+from pneuopt.dynamics.smooth import Integration, LimitMonitor, SmoothIntegration, without_solver_warnings
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names, parameter_vector
 from pneuopt.quantities.arguments import check_argument, check_parameters
@@ -266,7 +266,7 @@ def _integrate(
     rising = slope[at_sample] if linear.any() else [None] * len(breaks)
     run, done = new_integration(system, p, grid, *tolerances), 0
     watch = LimitMonitor(model.plant, parameters, inputs.t[0], x)
-    with watch.report_contacts():
+    with watch.report_contacts(), without_solver_warnings():
         for at, end, row, rise, acts in zip(breaks, [*breaks[1:], np.inf], rows, rising, is_sample, strict=True):
             run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row, rise)
             until = int(np.searchsorted(grid, end - slack))

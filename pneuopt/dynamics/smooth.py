@@ -12,7 +12,7 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 from scipy import integrate
 
-from pneuopt.dynamics.compiled.functions import compile_function
+from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
 from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.system import System, names
@@ -51,6 +51,14 @@ class Integration(Protocol):
         ...
 
 
+@contextmanager
+def without_solver_warnings() -> Iterator[None]:
+    """Mute LSODA while an integration is under way: why it stops is told by an error of ours."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
 class LimitMonitor:
     """Checks the plant's validity limits along a run, also between the instants that are recorded.
 
@@ -65,6 +73,7 @@ class LimitMonitor:
         self._limits = np.array([limit.limit(full) for limit in self._limited])
         self._sides = np.array([limit.side for limit in self._limited])
         self._t, self._values = t, x[self._indices]
+        self._room = self._sides * (self._limits - self._values)
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -96,9 +105,9 @@ class LimitMonitor:
 
     def observe(self, t: float, x: Array) -> None:
         """Note each limit that was crossed since the last call."""
-        before, values = self._values, x[self._indices]
-        crossed = (self._sides * (self._limits - before) > 0) & (self._sides * (self._limits - values) <= 0)
-        for k in np.flatnonzero(crossed) if crossed.any() else ():
+        before, values, room_before = self._values, x[self._indices], self._room
+        self._room = self._sides * (self._limits - values)
+        for k in np.flatnonzero((room_before > 0) & (self._room <= 0)) if self._room.min(initial=1.0) <= 0 else ():
             part = (self._limits[k] - before[k]) / (values[k] - before[k])
             at, rate = self._t + part * (t - self._t), (values[k] - before[k]) / (t - self._t)
             found = Contact(float(at), float(self._limits[k]), float(rate), self._states[k], self._limited[k])
@@ -137,7 +146,8 @@ class SmoothIntegration:
     """An integration of a smooth plant by SciPy's LSODA on the compiled right-hand side; restarts take microseconds."""
 
     def __init__(self, system: System, p: Array, grid: Array, rtol: float, atol: float) -> None:
-        self._system, self._p, self._ode = system, p, compile_function(system.ode)
+        self._system, self._p = system, p
+        self._ode, self._state_rate = compile_function(system.ode), compile_rate(system.ode)
         self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
         self._inputs = Ramp(0.0, np.zeros(len(system.inputs)))
         self._record = Recorder(system, grid)
@@ -146,7 +156,7 @@ class SmoothIntegration:
         self._integrator = integrate.ode(self._rate).set_integrator(**options)
 
     def _rate(self, t: float, x: Array) -> Array:
-        return self._ode(self._origin + t, x, self._inputs.at(t), self._p)[0]
+        return self._state_rate(self._origin + t, x, self._inputs.at(t), self._p)
 
     def restart(self, t: float, x: Array, u: Array, slope: Array | None = None) -> None:
         """See `Integration`."""
@@ -158,9 +168,7 @@ class SmoothIntegration:
         before, start = self._integrator.t, np.array(self._integrator.y)
         if t - self._origin - before <= 8 * np.spacing(abs(t)) or not self._system.states:
             return start  # LSODA refuses a step of rounding's size
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            x = np.array(self._integrator.integrate(t - self._origin))
+        x = np.array(self._integrator.integrate(t - self._origin))
         if not (self._integrator.successful() and np.all(np.isfinite(x))):
             self._record.fail(self._origin + before, start)
         return x

@@ -6,7 +6,6 @@ It stays stuck while the acceleration that it would have if it slid is <= 0 forw
 needs neither the masses nor the forces of the plant. An end stop is a force of the plant.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -17,7 +16,7 @@ import casadi as ca
 import numpy as np
 from scipy import integrate, optimize
 
-from pneuopt.dynamics.compiled.functions import compile_function
+from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
 from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.smooth import Recorder
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
@@ -68,10 +67,8 @@ class StickSlipIntegration:
         self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
         self._end = 1.001 * (grid[-1] - grid[0]) + 1e-3  # LSODA derives its first step from it
         self._p = {d: self._with_direction(p, d) for d in (-1, 0, 1)}
-        self._ode, self._accelerations = (
-            compile_function(system.ode),
-            compile_function(_acceleration_function(system, self._speed, self._direction)),
-        )
+        self._ode, self._state_rate = compile_function(system.ode), compile_rate(system.ode)
+        self._accelerations = compile_function(_acceleration_function(system, self._speed, self._direction))
         atols = atol * np.array([q.nominal for q in system.states])
         self._options: dict[str, Any] = {"rtol": rtol, "atol": atols}
         self._standstill_speed = 10 * atols[self._speed]  # rounding must not end a motion that has just begun
@@ -99,13 +96,11 @@ class StickSlipIntegration:
     def advance(self, t: float) -> Array:
         """See `Integration`."""
         until = t - self._origin
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            while self._event_time <= until or self._solver.t < until:
-                if self._event_time <= until:
-                    self._switch_mode()
-                else:
-                    self._step()
+        while self._event_time <= until or self._solver.t < until:
+            if self._event_time <= until:
+                self._switch_mode()
+            else:
+                self._step()
         self._now, self._x = until, self._state_at(until)
         return self._x
 
@@ -147,7 +142,7 @@ class StickSlipIntegration:
     def _rate(self, t: float, x: Array) -> Array:
         """Rate of the state; while stuck, the speed's entry is its rate without friction, for the step size to heed."""
         at_rest = x if self._mode else self._with_zero_speed(x)
-        return self._ode(self._origin + t, at_rest, self._inputs.at(t), self._p[self._mode or 0])[0]
+        return self._state_rate(self._origin + t, at_rest, self._inputs.at(t), self._p[self._mode or 0])
 
     def _step(self) -> None:
         t, x = self._solver.t, np.array(self._solver.y)
@@ -205,7 +200,7 @@ class StickSlipIntegration:
 
         def acceleration(direction: float) -> float:
             p = self._with_direction(self._p[0], direction)
-            return float(self._ode(self._origin + t, x, self._inputs.at(t), p)[0][self._speed])
+            return float(self._state_rate(self._origin + t, x, self._inputs.at(t), p)[self._speed])
 
         return float(optimize.brentq(acceleration, -1.0, 1.0))
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.simulate import contacts, initial_state, input_rows, new_integration, warn_contacts
-from pneuopt.dynamics.smooth import Integration
+from pneuopt.dynamics.smooth import Integration, without_solver_warnings
 from pneuopt.dynamics.stick_slip import Event, StickSlipIntegration
 from pneuopt.dynamics.system import Symbols, define, names, parameter_vector
 from pneuopt.evaluation.rig import Rig, Sensor
@@ -111,9 +111,10 @@ def record(
         else _CommandPlayer(rig, log_inputs)
     )
     run = new_integration(rig.sensor_system, p, log_inputs.t, rtol, 1e-2 * rtol)
-    readings, control = _run_samples(
-        rig, run, source, log_inputs, x[: len(rig.plant.states)], p, np.random.default_rng(seed)
-    )
+    with without_solver_warnings():
+        readings, control = _run_samples(
+            rig, run, source, log_inputs, x[: len(rig.plant.states)], p, np.random.default_rng(seed)
+        )
     logged = {n: log_inputs[n] for n in names(rig.plant.inputs) if n != rig.command.name} | source.columns()
     logged |= dict(zip(rig.channels, readings.T, strict=True))
     truth = run.trajectory().with_columns({"control": control})

@@ -2,6 +2,7 @@
 
 import ctypes
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -27,18 +28,10 @@ def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     """
     function = _with_dense_outputs(function, "system_function")
     shapes = [function.size_out(i) for i in range(function.n_out())]
-    library = compile_library(_casadi_source(function))
-    if library is None:
+    code = _MachineCode.of(function)
+    if code is None:
         return lambda *inputs: tuple(map(_reshape, map(np.array, function.call(list(inputs))), shapes))
-    buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
-    results = [_buffer(shape) for shape in shapes]
-    work = np.zeros(max(1, function.sz_w()))
-    sz_arg, sz_res = max(1, function.sz_arg()), max(1, function.sz_res())
-    arg = (ctypes.c_void_p * sz_arg)(*(b.ctypes.data for b in buffers))
-    res = (ctypes.c_void_p * sz_res)(*(r.ctypes.data for r in results))
-    call = library.system_function
-    call.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int]
-    pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
+    buffers, results, call, pointers = code.buffers, code.results, code.call, code.pointers
 
     def call_machine_code(*inputs: ArrayLike) -> tuple[Array, ...]:
         for i, (buffer, value) in enumerate(zip(buffers, inputs, strict=True)):
@@ -49,8 +42,63 @@ def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
         call(*pointers)
         return tuple([result.copy() for result in results])
 
-    call_machine_code.keep_alive = (library, arg, res, work)  # type: ignore[attr-defined]
+    call_machine_code.keep_alive = code  # type: ignore[attr-defined]
     return call_machine_code
+
+
+def compile_rate(ode: ca.Function) -> Callable[[float, Array, Array, Array], Array]:
+    """The first output of a right-hand side, in a fifth of the time of `compile_function`: an integrator's inner loop.
+
+    Parameters
+    ----------
+    ode : casadi.Function
+        ``(t, x, u, p) -> (xdot, ...)``.
+
+    Returns
+    -------
+    callable
+        ``f(t, x, u, p) -> xdot`` on arrays of these lengths, which are not checked. Not thread-safe.
+    """
+    function = _with_dense_outputs(ode, "system_function")
+    code = _MachineCode.of(function, wanted=1)
+    if code is None:
+        return lambda t, x, u, p: np.array(function.call([t, x, u, p])[0]).ravel()
+    (at, states, inputs, parameters), (rate,), call, pointers = code.buffers, code.results, code.call, code.pointers
+
+    def call_machine_code(t: float, x: Array, u: Array, p: Array) -> Array:
+        at[0], states[:], inputs[:], parameters[:] = t, x, u, p
+        call(*pointers)
+        return rate.copy()
+
+    call_machine_code.keep_alive = code  # type: ignore[attr-defined]
+    return call_machine_code
+
+
+@dataclass(frozen=True, eq=False)
+class _MachineCode:
+    """A Function's machine code with the memory that it reads and writes."""
+
+    call: Callable[..., object]
+    pointers: tuple[object, ...]
+    buffers: list[Array]
+    results: list[Array]
+    keep_alive: tuple[object, ...]
+
+    @classmethod
+    def of(cls, function: ca.Function, wanted: int | None = None) -> "_MachineCode | None":
+        """Of a Function of which only the first `wanted` results are kept; None where there is no compiler."""
+        library = compile_library(_casadi_source(function))
+        if library is None:
+            return None
+        buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
+        results = [_buffer(function.size_out(i)) for i in range(function.n_out())][:wanted]
+        work = np.zeros(max(1, function.sz_w()))
+        arg = (ctypes.c_void_p * max(1, function.sz_arg()))(*(b.ctypes.data for b in buffers))
+        res = (ctypes.c_void_p * max(1, function.sz_res()))(*(r.ctypes.data for r in results))
+        call = library.system_function
+        call.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int]
+        pointers = (ctypes.addressof(arg), ctypes.addressof(res), None, work.ctypes.data, 0)
+        return cls(call, pointers, buffers, results, (library, arg, res, work))
 
 
 def _casadi_source(function: ca.Function) -> str:

@@ -8,7 +8,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pneuopt.dynamics.compiled import compiler
-from pneuopt.dynamics.compiled.functions import compile_function
+from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
+from pneuopt.dynamics.system import parameter_vector
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import ModelError
 
 Forget = Callable[[], None]
@@ -41,6 +44,22 @@ def test_results_are_the_callers_own() -> None:
     first = f(1.0, np.ones((2, 3)), np.ones(3))[0]
     f(5.0, np.ones((2, 3)), np.ones(3))
     assert_array_equal(first, [3.0, 3.0])
+
+
+@pytest.mark.parametrize("cc", [None, ""])
+def test_a_rate_is_the_first_result_of_a_right_hand_side(
+    cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    if cc is not None:
+        monkeypatch.setenv("PNEUOPT_CC", cc)
+    system = ForceDrive(Stribeck()).system()
+    x, u = np.array([0.02, 0.3]), np.array([40.0])
+    p = parameter_vector(system.parameters, system.parameters)
+    rate = compile_rate(system.ode)
+    first = rate(0.5, x, u, p)
+    assert_array_equal(first, compile_function(system.ode)(0.5, x, u, p)[0])
+    rate(0.5, -x, u, p)
+    assert_array_equal(first[0], 0.3)  # the caller's own
 
 
 @needs_compiler
