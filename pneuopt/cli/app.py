@@ -186,14 +186,21 @@ def _report_errors() -> Iterator[None]:
             warnings.showwarning = _warning_printer()
             yield
     except InputError as error:
-        typer.echo(f"error: {error}", err=True)
+        _say(f"error: {error}")
         raise typer.Exit(EXIT_BAD_INPUT) from None
     except ConvergenceError as error:
-        typer.echo(f"NOT converged: {error}", err=True)
+        _say(f"NOT converged: {error}")
         raise typer.Exit(EXIT_FAILURE) from None
     except KeyboardInterrupt:
-        typer.echo("interrupted: no file was left half-written", err=True)
+        _say("interrupted: no file was left half-written")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _say(sentence: str) -> None:
+    """Say a sentence on standard error, on a terminal in lines that end between words."""
+    from pneuopt.cli.terminal import make_console, show_sentence
+
+    show_sentence(make_console(error=True), sentence)
 
 
 def _warning_printer() -> Callable[..., None]:
@@ -204,7 +211,7 @@ def _warning_printer() -> Callable[..., None]:
         line = f"warning: {message}"
         if line not in printed:
             printed.add(line)
-            typer.echo(line, err=True)
+            _say(line)
 
     return print_warning
 

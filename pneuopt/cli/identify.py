@@ -1,6 +1,7 @@
 """`pneuopt identify` and `pneuopt simulate --log`: from logs to parameters, and back to logs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -33,12 +34,13 @@ from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
 from pneuopt.plotting import (
     has_friction_map,
     plot_correlation,
+    plot_finding,
     plot_fit,
     plot_friction,
     plot_prediction,
     plot_residuals,
 )
-from pneuopt.quantities.errors import require
+from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import LeastSquares
@@ -46,18 +48,23 @@ from pneuopt.shooting.least_squares import LeastSquares
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+REFUSAL_FIGURE = "refused"
+"""What the name of a refusal's figure ends in: fit.png and fit_refused.png."""
+
 
 def run_identify(
     drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool, accept: Sequence[str] = ()
 ) -> int:
     """Identify from logs; returns the exit status."""
-    outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation")
+    outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE)
     model, parameters = _read_free_drive(drive)
     system = model.system()
     experiments = _read_experiments(logs, system, parameters, accept)
-    for sentence in identifiability(system, experiments, parameters).sentences:
+    with _draw_refusal(outputs):
+        before = identifiability(system, experiments, parameters).sentences
+    for sentence in before:
         warn(f"before the fit: {sentence}")
-    with progress("identifying", quiet=quiet) as report_progress:
+    with _draw_refusal(outputs), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
         result = identify(system, experiments, parameters, method=method, window=window, throw=False)
     console = make_console()
@@ -126,6 +133,21 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs) ->
             columns = {q.name: (q.name, q.unit) for q in (*system.inputs, *system.outputs)}
             writers[outputs.output] = partial(write_csv, outputs.output, run.with_columns(given), columns)
     return finish(outputs, writers, {"fit": records(table), "provenance": file_hashes(fit, log)}, None)
+
+
+@contextmanager
+def _draw_refusal(outputs: Outputs) -> Iterator[None]:
+    """Draw what a log is refused for, where figures are wanted; otherwise the message says how to have it drawn."""
+    try:
+        yield
+    except LogError as error:
+        if error.finding is None or error.finding.evidence is None:
+            raise
+        if outputs.plot is None:
+            raise LogError(f"{error}; --plot refusal.png draws it", error.finding) from None
+        figure = {REFUSAL_FIGURE: plot_finding(error.finding)}
+        finish(replace(outputs, json=None), figure_writers(outputs.plot, figure), {}, None)
+        raise
 
 
 def _read_experiments(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
-from pneuopt.cli.terminal import make_console, show_output_files
+from pneuopt.cli.terminal import make_console, show_output_files, show_sentence
 from pneuopt.files.drive import read_drive, read_marks, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -84,7 +84,7 @@ def warn_of_status(path: Path, what: str = "fit") -> None:
 
 def warn(message: str) -> None:
     """Say on standard error what does not stop the command."""
-    make_console(error=True).print(f"warning: {message}", soft_wrap=True)
+    show_sentence(make_console(error=True), f"warning: {message}")
 
 
 def figure_writers(path: Path, figures: Mapping[str, "Figure"]) -> Writers:

@@ -9,11 +9,9 @@ import numpy as np
 
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable
-from pneuopt.dynamics.system import System, names
+from pneuopt.dynamics.system import names
 from pneuopt.identification.command_centre import centre_command
 from pneuopt.identification.repairs import repair_log
-from pneuopt.logs.checks.findings import PISTON_CHANNELS, AxisChannels, Finding
-from pneuopt.logs.doctor import CHECKS, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import estimate_noise, noise_level
 from pneuopt.quantities.arguments import as_tuple, check_parameters
@@ -69,30 +67,6 @@ def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> N
         require(not known, message, ModelError)
 
 
-def check_content(system: Fittable, experiments: Sequence[Experiment]) -> tuple[str, ...]:
-    """Refuse logs of which more than half show the same fault; a window of a good log may well stand still.
-
-    Returns
-    -------
-    tuple of str
-        A sentence for each fault that the logs accept by name.
-    """
-    found: dict[str, dict[str, Finding]] = {}
-    accepted: dict[str, str] = {}
-    for experiment in experiments:
-        check_names("check", experiment.accept, CHECKS, f"{experiment.name}: accept")
-        for finding in examine(experiment, _axis_channels(system.plant)):
-            if finding.fault and finding.check in experiment.accept:
-                accepted.setdefault(finding.channel, f"{experiment.name}: accepted as right: {finding.message}")
-            elif finding.fault:
-                found.setdefault(finding.channel, {})[experiment.name] = finding
-    for faults in found.values():
-        name, fault = next(iter(faults.items()))
-        remedy = f"if the log is right, accept = [{fault.check!r}] in its sidecar, or --accept {fault.check}"
-        require(len(faults) <= len(experiments) / 2, f"{name}: {fault.message}; {remedy}", LogError)
-    return tuple(accepted.values())
-
-
 def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
     """Warn of faults that only the model can find in logs, as a gauge pressure read as absolute.
 
@@ -119,14 +93,6 @@ def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence
                 levels = f"stated as {stated:.2g} {unit}, the log itself shows {shown:.2g} {unit}"
                 out.append(f"{named.name}: the noise of {channel} is {levels}; leave it out to have it estimated")
     return tuple(out)
-
-
-def _axis_channels(plant: System) -> AxisChannels:
-    """The channels of the plant's axis: its motion, and the input that drives it; a piston's if it declares none."""
-    if plant.axis is None:
-        return PISTON_CHANNELS
-    pushes = [q.name for q in plant.inputs if q.unit == plant.axis.force]
-    return AxisChannels(plant.axis.position, plant.axis.speed, *pushes[:1])
 
 
 def _check_conditions(system: Fittable, experiment: Experiment, parameters: ParameterSet, name: str) -> None:

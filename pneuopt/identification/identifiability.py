@@ -16,7 +16,8 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.excitation import Lack
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.runnable import HasSystem, check_smooth
-from pneuopt.identification.checks import check_content, check_free, check_logs
+from pneuopt.identification.checks import check_free, check_logs
+from pneuopt.identification.examination import check_content
 from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.profiles import Profile

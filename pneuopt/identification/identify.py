@@ -16,13 +16,13 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
 from pneuopt.identification.checks import (
     as_experiments,
-    check_content,
     check_free,
     check_logs,
     emit_log_warnings,
     log_remarks,
     outputs_in_log,
 )
+from pneuopt.identification.examination import check_content
 from pneuopt.identification.identifiability import leans_on_prior, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit

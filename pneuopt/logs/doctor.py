@@ -3,26 +3,26 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from pneuopt.logs.checks.findings import PISTON_CHANNELS, AxisChannels, Finding
+from pneuopt.logs.checks.findings import PISTON, LogFinding, StatedAxis
 from pneuopt.logs.checks.sensors import check_pressures, check_sampling
 from pneuopt.logs.checks.signs import check_command, check_position_speed, check_work_sign
 from pneuopt.logs.checks.standstill import check_has_motion, check_scale
 from pneuopt.logs.experiments import Experiment
 
 
-def examine(experiment: Experiment, axis: AxisChannels = PISTON_CHANNELS) -> tuple[Finding, ...]:
+def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFinding, ...]:
     """Find faults of a log before any model is fitted to it.
 
     Parameters
     ----------
     experiment : Experiment
         Its noise, where given, separates motion from noise.
-    axis : AxisChannels
+    axis : StatedAxis
         What the log calls its motion and what drives it.
 
     Returns
     -------
-    tuple of Finding
+    tuple of LogFinding
         Faults first: nothing moves; a channel is constant; position and speed disagree in sign or unit; the force, or
         the pressures, brake the motion on balance, which no drive does; the piston runs against the valve's command, or
         to and fro without one; a pressure is a vacuum, or above the supply.
@@ -40,11 +40,12 @@ def examine(experiment: Experiment, axis: AxisChannels = PISTON_CHANNELS) -> tup
     >>> print(finding.check, finding.message.partition("(")[0], finding.message.partition(": ")[2], sep="; ")
     work; the force brakes the motion on balance ; change the sign of 'force'
     """
-    found = [replace(f, check=name) for name, check in CHECKS.items() for f in check(experiment, axis)]
+    named = ((name, finding) for name, check in CHECKS.items() for finding in check(experiment, axis))
+    found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
     return tuple(sorted(found, key=lambda f: not f.fault))
 
 
-CHECKS: dict[str, Callable[[Experiment, AxisChannels], Iterator[Finding]]] = {
+CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {
     "motion": check_has_motion,
     "speed": check_position_speed,
     "work": check_work_sign,

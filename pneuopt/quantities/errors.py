@@ -28,7 +28,17 @@ class UnknownNameError(InputError):
 
 
 class LogError(InputError):
-    """A log cannot be read; the message names the file, row and column."""
+    """A log cannot be read, or contradicts itself; the message names the file, row and column.
+
+    Attributes
+    ----------
+    finding : LogFinding, optional
+        What the log doctor found, which `plotting.plot_finding` draws.
+    """
+
+    def __init__(self, message: str, finding: Any = None) -> None:
+        super().__init__(message)
+        self.finding = finding
 
 
 class ModelError(InputError):

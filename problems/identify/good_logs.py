@@ -23,7 +23,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # the checkout, which holds `pr
 import numpy as np
 
 import pneuopt as po
-from pneuopt.logs.checks.findings import Finding
+from pneuopt.logs.checks.findings import LogFinding
 from pneuopt.logs.doctor import examine
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, finish, frame
@@ -65,7 +65,7 @@ def main(count: int = COUNT, first: int = 0) -> "pd.DataFrame":
     return frame(claims)
 
 
-def faults(log: po.Experiment) -> list[Finding]:
+def faults(log: po.Experiment) -> list[LogFinding]:
     return [finding for finding in examine(log) if finding.fault]
 
 

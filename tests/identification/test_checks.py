@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.hooks import Log
-from pneuopt.identification.checks import check_content
+from pneuopt.identification.examination import check_content
 from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.read_log import read_log

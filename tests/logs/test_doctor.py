@@ -5,29 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pneuopt.logs.doctor import examine
+from pneuopt.logs.doctor import CHECKS, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
+from tests.logs.bad_logs import BAD_LOGS, T, swing
 
 DATA = Path(__file__).parents[2] / "data"
-T = np.arange(4000) * 1e-3
-
-
-def swing(**changed: Array) -> Experiment:
-    """A drive under friction going to and fro: pressures and force do work."""
-    rng = np.random.default_rng(0)
-    v = 0.3 * np.cos(2 * np.pi * T)
-    push = 30 * np.sign(v) + 60 * v - 5 * np.sin(2 * np.pi * T)
-    columns = {
-        "position": 0.1 + 0.3 / (2 * np.pi) * np.sin(2 * np.pi * T) + 1e-5 * rng.standard_normal(T.size),
-        "speed": v + 1e-3 * rng.standard_normal(T.size),
-        "force": push,
-        "pressure_a": 5e5 + 5e2 * push + 1e3 * rng.standard_normal(T.size),
-        "pressure_b": 4.5e5 - 5e2 * push + 1e3 * rng.standard_normal(T.size),
-    }
-    return Experiment(Trajectory(T, {**columns, **changed}), {"position": 1e-5, "speed": 1e-3}, name="swing")
 
 
 def faults(experiment: Experiment) -> list[str]:
@@ -36,6 +21,18 @@ def faults(experiment: Experiment) -> list[str]:
 
 def test_a_sound_log_has_no_findings() -> None:
     assert examine(swing()) == ()
+
+
+def test_every_check_has_a_log_that_trips_it_alone_and_shows_why() -> None:
+    assert list(BAD_LOGS) == list(CHECKS)
+    for name, log in BAD_LOGS.items():
+        (finding,) = examine(log)
+        assert (finding.check, finding.log) == (name, "swing")
+        shown = finding.evidence
+        assert shown is not None, name
+        inside = (shown.t >= shown.view[0]) & (shown.t <= shown.view[1])
+        assert shown.contradiction[inside].any(), name
+        assert all(curve.shape == shown.t.shape for panel in shown.panels for curve in panel.curves.values()), name
 
 
 @pytest.mark.parametrize("path", sorted(DATA.glob("*/*.csv")), ids=lambda p: f"{p.parent.name}/{p.stem}")

@@ -1,5 +1,5 @@
 """The checks of the log doctor, a function each, from a log to its findings.
 
-A newcomer writes ``check(experiment, axis) -> Iterator[Finding]`` in the file of its subject and a row in
+A newcomer writes ``check(experiment, axis) -> Iterator[LogFinding]`` in the file of its subject and a row in
 `logs.doctor.CHECKS`.
 """

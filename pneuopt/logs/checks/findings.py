@@ -1,11 +1,24 @@
-"""`Finding`: one thing about a log; `AxisChannels`: what the log calls its motion and what drives it."""
+"""`LogFinding`: one thing about a log, with the signals that show it; `StatedAxis`: what is known of the axis."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 
-class AxisChannels(NamedTuple):
-    """The channels of the axis that a log is of: a piston's unless a plant names its own (angle, torque).
+from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array, Mask
+
+LARGE_SHARE = 0.1
+"""Share of a signal's largest value [1] beyond which its sign counts: lower counts noise, higher misses reversals."""
+VIEW_STROKES = 1.0
+"""Strokes to either side of an instant that a figure shows: with fewer a wrong sign looks like a lag, more blur it."""
+MIN_VIEW_SAMPLES = 25
+"""Samples to either side of an instant that its figure shows: fewer look like noise."""
+
+
+class StatedAxis(NamedTuple):
+    """What is known of the axis that a log is of: a piston's channels unless a plant names its own (angle, torque).
 
     Attributes
     ----------
@@ -19,11 +32,42 @@ class AxisChannels(NamedTuple):
     push: str = "force"
 
 
-PISTON_CHANNELS = AxisChannels()
+PISTON = StatedAxis()
+
+
+class Panel(NamedTuple):
+    """Curves over one axis of a figure: by name, in one SI unit."""
+
+    unit: str
+    curves: Mapping[str, Array]
 
 
 @dataclass(frozen=True)
-class Finding:
+class Evidence:
+    """The signals that contradict each other, over time.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        [s]
+    panels : tuple of Panel
+    contradiction : ndarray of bool, shape (n,)
+        Where they contradict each other.
+    view : tuple of (float, float)
+        Begin and end of the time [s] in which this is plainest.
+    label : str
+        What is seen where they contradict each other.
+    """
+
+    t: Array
+    panels: tuple[Panel, ...]
+    contradiction: Mask
+    view: tuple[float, float]
+    label: str = "they contradict each other"
+
+
+@dataclass(frozen=True, eq=False)
+class LogFinding:
     """One thing about a log.
 
     Attributes
@@ -35,9 +79,71 @@ class Finding:
         The log cannot be used so; otherwise it is worth knowing.
     check : str
         The name of the check that found it, by which a user accepts it.
+    log : str
+        The log's name.
+    evidence : Evidence, optional
+        What `plotting.plot_finding` draws.
     """
 
     channel: str
     message: str
     fault: bool
     check: str = ""
+    log: str = ""
+    evidence: Evidence | None = None
+
+
+def evidence(
+    experiment: Experiment,
+    *channels: str | Panel,
+    where: Mask | None = None,
+    at: int | None = None,
+    motion: Array | None = None,
+    label: str = "they contradict each other",
+) -> Evidence:
+    """The evidence of a finding.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    *channels : str or Panel
+        Each in a panel of its own.
+    where : ndarray of bool, optional
+        Where they contradict each other; by default everywhere.
+    at : int, optional
+        The sample about which to look; by default all are seen.
+    motion : ndarray, optional
+        The speed, whose strokes say how much is to be seen.
+    label : str
+        What is seen there.
+
+    Returns
+    -------
+    Evidence
+    """
+    log = experiment.trajectory
+    panels = [c if isinstance(c, Panel) else Panel(experiment.unit(c), {c: log[c]}) for c in channels if c]
+    everywhere = np.ones(len(log), dtype=bool)
+    view = (float(log.t[0]), float(log.t[-1])) if at is None else view_about(log.t, at, motion)
+    return Evidence(log.t, tuple(panels), everywhere if where is None else where, view, label)
+
+
+def is_opposed(a: Array, b: Array) -> Mask:
+    """Where two signals have opposite signs, both beyond a tenth of their largest value."""
+    return np.asarray(np.sign(a) * np.sign(b) < 0) & _is_large(a) & _is_large(b)
+
+
+def _is_large(a: Array) -> Mask:
+    return np.asarray(np.abs(a) > LARGE_SHARE * np.nanmax(np.abs(a), initial=0.0))
+
+
+def view_about(t: Array, at: int, motion: Array | None = None) -> tuple[float, float]:
+    """Begin and end of a few strokes of the motion about a sample [s]; of an eighth of the log without motion."""
+    duration = float(t[-1] - t[0])
+    half = duration / 16
+    if motion is not None and np.isfinite(motion).any():
+        level = LARGE_SHARE * float(np.nanmax(np.abs(motion)))
+        side = np.sign(motion[np.abs(motion) > level])
+        half = VIEW_STROKES * duration / (1 + int(np.count_nonzero(np.diff(side))))
+    half = max(half, MIN_VIEW_SAMPLES * float(np.median(np.diff(t))))
+    return max(float(t[0]), float(t[at]) - half), min(float(t[-1]), float(t[at]) + half)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from pneuopt.logs.checks.findings import AxisChannels
+from pneuopt.logs.checks.findings import Panel, StatedAxis
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.arrays import Array
@@ -18,7 +18,7 @@ MAX_SLOPE_NOISE_SHARE = 0.1
 """Share of a slope's variance [1] that noise may have: higher drowns the work in it, lower blurs fast motion."""
 
 
-def motion_speed(experiment: Experiment, axis: AxisChannels) -> Array | None:
+def motion_speed(experiment: Experiment, axis: StatedAxis) -> Array | None:
     """The speed as logged, else the slope of the position; None without either, or where noise hides the motion."""
     log = experiment.trajectory
     if axis.speed in log:
@@ -28,6 +28,12 @@ def motion_speed(experiment: Experiment, axis: AxisChannels) -> Array | None:
     known = np.isfinite(log[axis.position])
     half = slope_half_width(log.t[known], log[axis.position][known], experiment.noise.get(axis.position))
     return None if half is None else position_slope(log.t, log[axis.position], half)
+
+
+def speed_panel(experiment: Experiment, axis: StatedAxis, motion: Array) -> Panel:
+    """The panel of a speed from `motion_speed`, by the name of what it is."""
+    name = axis.speed if axis.speed in experiment.trajectory else f"slope of the {axis.position}"
+    return Panel(experiment.unit(axis.speed), {name: motion})
 
 
 def slope_half_width(t: Array, x: Array, noise: float | None) -> int | None:

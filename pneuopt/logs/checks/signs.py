@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from pneuopt.logs.checks.findings import AxisChannels, Finding
+from pneuopt.logs.checks.findings import LARGE_SHARE, Evidence, LogFinding, Panel, StatedAxis, evidence, is_opposed
 from pneuopt.logs.checks.motion import (
     MEAN_BLOCKS,
     lagged_correlation,
@@ -15,10 +16,12 @@ from pneuopt.logs.checks.motion import (
     sensor_lags,
     shift,
     slope_half_width,
+    speed_panel,
     window_mean,
 )
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Mask
+from pneuopt.quantities.trajectories import Trajectory
 
 MAX_NET_TRAVEL_SHARE = 0.3
 """Net travel over path [1] up to which a log counts as one that returns: higher blames lifts, lower skips most logs."""
@@ -39,13 +42,14 @@ RECIPROCATING_TRAVEL_RATIO = 1.9
 """Travel over range [1]: at 2 a piston has come back, so it is commanded; a lower bound blames overshoot."""
 
 
-def check_position_speed(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+def check_position_speed(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find a speed that is not the slope of the position, in sign or in unit."""
     log = experiment.trajectory
     if axis.position not in log or axis.speed not in log:
         return
-    known = np.isfinite(log[axis.position]) & np.isfinite(log[axis.speed])
-    t, x, v = log.t[known], log[axis.position][known], log[axis.speed][known]
+    experiment = _known_part(experiment, axis.position, axis.speed)
+    log = experiment.trajectory
+    t, x, v = log.t, log[axis.position], log[axis.speed]
     half = slope_half_width(t, x, experiment.noise.get(axis.position))
     if half is None:
         return
@@ -56,16 +60,34 @@ def check_position_speed(experiment: Experiment, axis: AxisChannels) -> Iterator
         i = int(np.nanargmax(np.abs(slope)))
         seen = f"at {t[i]:.4g} s {axis.position} changes by {slope[i]:.3g}/s, {axis.speed} is {means[0][i]:.3g}"
         message = f"{axis.position} and {axis.speed} run against each other ({seen}): change the sign of one"
-        yield Finding(axis.speed, message, True)
+        shown = _speeds(experiment, axis, slope, is_opposed(slope, means[0]), i)
+        yield LogFinding(axis.speed, message, True, evidence=shown)
     elif found[best] > MIN_SPEED_CORRELATION:
         ratios = [lagged_ratio(slope, mean, best) for mean in means]
         # trapezoids and parabolas through the speed err in opposite directions where its samples are far apart
         if max(ratios) < SPEED_SLOPE_RATIOS[0] or min(ratios) > SPEED_SLOPE_RATIOS[1]:
             message = f"{axis.speed} is {ratios[0]:.3g} times the slope of the {axis.position}: check both units"
-            yield Finding(axis.speed, message, True)
+            fast = np.abs(slope) > LARGE_SHARE * np.nanmax(np.abs(slope))
+            shown = _speeds(experiment, axis, slope, fast, int(np.nanargmax(np.abs(slope))))
+            yield LogFinding(axis.speed, message, True, evidence=shown)
 
 
-def check_work_sign(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+def _known_part(experiment: Experiment, *channels: str) -> Experiment:
+    """The samples in which channels are all known."""
+    log = experiment.trajectory
+    known = np.isfinite(log.matrix(channels)).all(axis=1)
+    part = Trajectory(log.t[known], {n: log[n][known] for n in log})
+    return replace(experiment, trajectory=part, holes=())
+
+
+def _speeds(experiment: Experiment, axis: StatedAxis, slope: Array, where: Mask, at: int) -> Evidence:
+    """The logged speed beside the slope of the position."""
+    speed, unit = experiment.trajectory[axis.speed], experiment.unit(axis.speed)
+    both = Panel(unit, {axis.speed: speed, f"slope of the {axis.position}": slope})
+    return evidence(experiment, both, axis.position, where=where, at=at, motion=slope)
+
+
+def check_work_sign(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find a force, torque or pressures of the wrong sign: a drive does net work on a load that comes back."""
     log, motion = experiment.trajectory, motion_speed(experiment, axis)
     if motion is None:
@@ -84,18 +106,27 @@ def check_work_sign(experiment: Experiment, axis: AxisChannels) -> Iterator[Find
         share = max(_work_share(log.t, push, motion, lag) for push in pushes for lag in sensor_lags(log.t))
         if share < MIN_WORK_SHARE:
             at = int(np.nanargmin(pushes[-1] * motion))
-            seen = f"most at {log.t[at]:.4g} s, where {pushes[-1][at]:.3g} pushes and the speed is {motion[at]:.3g} m/s"
+            unit = experiment.unit(axis.push) if name == axis.push else "Pa"
+            fast = f"{motion[at]:.3g} {experiment.unit(axis.speed)}"
+            seen = f"most at {log.t[at]:.4g} s, where {pushes[-1][at]:.3g} {unit} pushes and the speed is {fast}"
             why = f"{message} the motion on balance ({100 * share:.0f} % of its power, {seen}), which no drive does"
-            yield Finding(name, f"{why}: change the sign of {remedy}", True)
+            speed = speed_panel(experiment, axis, motion)
+            shown = Panel(experiment.unit(axis.push), {axis.push: pushes[0]})
+            if name != axis.push:
+                shown = Panel("Pa(a)", {n: log[n] for n in ("pressure_a", "pressure_b")})
+            brakes = is_opposed(pushes[-1], motion)
+            found = evidence(experiment, shown, speed, where=brakes, at=at, motion=motion, label="it brakes")
+            yield LogFinding(name, f"{why}: change the sign of {remedy}", True, evidence=found)
 
 
-def check_command(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+def check_command(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find a piston that runs against its valve's command, or without one."""
     log, motion = experiment.trajectory, motion_speed(experiment, axis)
     if motion is None or "valve_voltage" not in log:
         return
     known = np.isfinite(motion) & np.isfinite(log["valve_voltage"])
     t, command, motion = log.t[known], log["valve_voltage"][known], motion[known]
+    part = replace(experiment, trajectory=Trajectory(t, {"valve_voltage": command}), noise={}, intersample={})
     if len(t) < 2 * MEAN_BLOCKS:
         return
     if not np.any(np.diff(command)):
@@ -103,14 +134,19 @@ def check_command(experiment: Experiment, axis: AxisChannels) -> Iterator[Findin
         travel = np.cumsum(motion[1:] * np.diff(t))[::every]
         if float(np.abs(np.diff(travel)).sum()) > RECIPROCATING_TRAVEL_RATIO * float(np.ptp(travel)) > 0:
             message = "'valve_voltage' is constant while the piston goes to and fro: log the command that moves it"
-            yield Finding("valve_voltage", message, True)
+            shown = evidence(part, "valve_voltage", speed_panel(experiment, axis, motion))
+            yield LogFinding("valve_voltage", message, True, evidence=shown)
         return
     lowest, highest = _command_correlations(t, command, motion)
     if lowest < WRONG_SIGN_CORRELATIONS[0] and highest < WRONG_SIGN_CORRELATIONS[1]:
         at = int(np.argmax(np.abs(motion)))
         seen = f"correlation {lowest:.2f}; {motion[at]:.3g} m/s at {t[at]:.4g} s under {command[at]:.3g} V"
         message = f"the piston runs against the valve's command ({seen}): change the sign of "
-        yield Finding("valve_voltage", message + "'valve_voltage', or of the motion", True)
+        speed = speed_panel(experiment, axis, motion)
+        shown = evidence(
+            part, "valve_voltage", speed, where=is_opposed(command, motion), at=at, motion=motion, label="opposed"
+        )
+        yield LogFinding("valve_voltage", message + "'valve_voltage', or of the motion", True, evidence=shown)
 
 
 def _work_share(t: Array, push: Array, motion: Array, lag: int) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pneuopt.logs.checks.findings import PISTON_CHANNELS, AxisChannels, Finding
+from pneuopt.logs.checks.findings import PISTON, Evidence, LogFinding, Panel, StatedAxis, evidence
 from pneuopt.logs.checks.motion import MEAN_BLOCKS, motion_speed
 from pneuopt.logs.checks.signs import MIN_SPEED_CORRELATION
 from pneuopt.logs.experiments import Experiment
@@ -19,7 +19,7 @@ MAX_PISTON_SPEED = 50.0
 """Speed [m/s] that no piston or linear servo has; lower blames fast ones, higher misses slow ones in mm."""
 
 
-def check_has_motion(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+def check_has_motion(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find channels without motion."""
     for name in (axis.position, axis.speed):
         if name not in experiment.trajectory:
@@ -27,19 +27,30 @@ def check_has_motion(experiment: Experiment, axis: AxisChannels) -> Iterator[Fin
         y = experiment.trajectory[name]
         y, noise = y[np.isfinite(y)], experiment.noise.get(name, 0.0)
         if y.size and not np.any(np.diff(y)) and (name == axis.position or y[0] == 0):
-            yield Finding(name, f"{name!r} is constant: without motion friction is unidentifiable", True)
+            message = f"{name!r} is constant: without motion friction is unidentifiable"
+            yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
         elif y.size >= 2 * MEAN_BLOCKS and (_is_motionless(y, noise) or (name == axis.position and _is_white(y))):
             message = f"{name!r} shows noise and no motion: log a run in which the drive moves"
-            yield Finding(name, message, True)
+            yield LogFinding(name, message, True, evidence=_stillness(experiment, name, axis))
 
 
-def check_scale(experiment: Experiment, axis: AxisChannels) -> Iterator[Finding]:
+def check_scale(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find motion of a size that no drive has, as millimetres that are read as metres."""
     log, motion = experiment.trajectory, motion_speed(experiment, axis)
     fastest = 0.0 if motion is None else float(np.nanpercentile(np.abs(motion), 99))
-    if axis.position == PISTON_CHANNELS.position and fastest > MAX_PISTON_SPEED:
+    if axis.position == PISTON.position and fastest > MAX_PISTON_SPEED:
         name = axis.speed if axis.speed in log else axis.position
-        yield Finding(name, f"{name!r} moves at {fastest:.3g} m/s: is its unit mm, and read as m?", True)
+        size = np.zeros(len(log)) if motion is None else np.abs(motion)
+        speeds = Panel("m/s", {"speed": size, "no piston is faster": np.full(size.size, MAX_PISTON_SPEED)})
+        shown = evidence(experiment, speeds, where=size > MAX_PISTON_SPEED, at=int(np.nanargmax(size)), motion=motion)
+        message = f"{name!r} moves at {fastest:.3g} m/s: is its unit mm, and read as m?"
+        yield LogFinding(name, message, True, evidence=shown)
+
+
+def _stillness(experiment: Experiment, name: str, axis: StatedAxis) -> Evidence:
+    """A channel without motion beside what should move it."""
+    drives = [n for n in (axis.push, "valve_voltage", "pressure_a") if n in experiment.trajectory]
+    return evidence(experiment, name, *drives[:1])
 
 
 def _is_motionless(y: Array, noise: float) -> bool:

@@ -1,0 +1,41 @@
+"""A log for each check of the log doctor that trips it, and no other check."""
+
+import numpy as np
+
+from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.trajectories import Trajectory
+
+T = np.arange(4000) * 1e-3
+
+
+def swing(**changed: Array) -> Experiment:
+    """A drive under friction going to and fro: pressures and force do work."""
+    rng = np.random.default_rng(0)
+    v = 0.3 * np.cos(2 * np.pi * T)
+    push = 30 * np.sign(v) + 60 * v - 5 * np.sin(2 * np.pi * T)
+    columns = {
+        "position": 0.1 + 0.3 / (2 * np.pi) * np.sin(2 * np.pi * T) + 1e-5 * rng.standard_normal(T.size),
+        "speed": v + 1e-3 * rng.standard_normal(T.size),
+        "force": push,
+        "pressure_a": 5e5 + 5e2 * push + 1e3 * rng.standard_normal(T.size),
+        "pressure_b": 4.5e5 - 5e2 * push + 1e3 * rng.standard_normal(T.size),
+    }
+    return Experiment(Trajectory(T, {**columns, **changed}), {"position": 1e-5, "speed": 1e-3}, name="swing")
+
+
+def only(log: Experiment, *channels: str) -> Experiment:
+    return log.select(channels)
+
+
+RIGHT = swing().trajectory
+BAD_LOGS = {
+    "motion": only(swing(position=0.1 + 1e-5 * np.random.default_rng(1).standard_normal(T.size)), "position", "force"),
+    "speed": only(swing(speed=-RIGHT["speed"]), "position", "speed"),
+    "work": only(swing(force=-RIGHT["force"]), "position", "force"),
+    "command": only(swing(valve_voltage=-RIGHT["speed"]), "position", "valve_voltage"),
+    "scale": only(swing(position=1e3 * RIGHT["position"]), "position", "force"),
+    "pressures": only(swing(pressure_b=RIGHT["pressure_b"] - 4.3e5), "position", "pressure_b"),
+    "sampling": only(swing(position=np.round(RIGHT["position"] / 5e-3) * 5e-3), "position"),
+}
+"""By the name of the check."""
