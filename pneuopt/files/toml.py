@@ -14,14 +14,15 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import InlineTable, Table
 
 from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.keys import PARAMETER_KEYS, Takes
 from pneuopt.quantities.output import plain_value
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.units import read_value, write_value
 
-_PARAMETER_FLAGS = ("free", "log", "per_log")
+_PARAMETER_FLAGS = tuple(name for name, key in PARAMETER_KEYS.items() if key.takes is Takes.FLAG)
+_PARAMETER_NUMBERS = tuple(name for name, key in PARAMETER_KEYS.items() if key.takes is Takes.NUMBER)
 _SECTION_HEAD = re.compile(r"\s*\[+([^\[\]]+)\]")
 _KEY_LINE = re.compile(r"\s*([\w\"'. -]+?)\s*=")
-_PARAMETER_FIELDS = ("value", "lower", "upper", *_PARAMETER_FLAGS, "source")
 
 
 def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
@@ -107,9 +108,9 @@ def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
         If a value cannot be read, a key is unknown, or the value lies outside its bounds.
     """
     fields = entry if isinstance(entry, dict) else {"value": entry}
-    check_names("key", fields, _PARAMETER_FIELDS, where)
+    check_names("key", fields, PARAMETER_KEYS, where)
     numbers: dict[str, Any] = {
-        f: read_value(fields[f], default.unit, where=where) for f in _PARAMETER_FIELDS[:3] if f in fields
+        f: read_value(fields[f], default.unit, where=where) for f in _PARAMETER_NUMBERS if f in fields
     }
     for flag in _PARAMETER_FLAGS:
         require(isinstance(fields.get(flag, False), bool), f"{where}: {flag} must be true or false")
@@ -138,7 +139,7 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
         document[section] = tomlkit.table()
     entries: Any = document[section]
     fields: dict[str, Any] = {
-        f: _format_value(getattr(found, f), found) for f in _PARAMETER_FIELDS[:3] if _field_differs(f, found, given)
+        f: _format_value(getattr(found, f), found) for f in _PARAMETER_NUMBERS if _field_differs(f, found, given)
     }
     fields |= {f: getattr(found, f) for f in (*_PARAMETER_FLAGS, "source") if _field_differs(f, found, given)}
     entry = entries.get(key)

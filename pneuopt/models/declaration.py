@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Protocol
 
 from pneuopt.dynamics.system import System
 from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.keys import Key, Takes
 
 Sections = Mapping[str, Mapping[str, Any]]
 """Contents of a drive's file as written, by section and key."""
@@ -27,40 +28,6 @@ class Drive(Protocol):
 
 
 @dataclass(frozen=True)
-class Key:
-    """A key of a section that chooses how a drive is built.
-
-    Parameters
-    ----------
-    form : str
-        The values that the key takes, as a message names them: "true or false".
-    types : tuple of type
-    usual : object
-        The value where the file leaves the key out.
-    choices : mapping of str to object, optional
-        The words that the key takes, and the object that each stands for.
-    required : bool
-        Whether the file must have the key.
-    """
-
-    form: str
-    types: tuple[type, ...]
-    usual: Any = None
-    choices: Mapping[str, Any] | None = None
-    required: bool = False
-
-
-def flag(usual: bool) -> Key:
-    """Key that is true or false."""
-    return Key("true or false", (bool,), usual)
-
-
-def choice(choices: Mapping[str, Any], usual: str | None = None) -> Key:
-    """Key that is one of several words; without a usual one it is required."""
-    return Key("text", (str,), usual, choices, required=usual is None)
-
-
-@dataclass(frozen=True)
 class Alias:
     """A key that gives a parameter in another form, such as a catalogue's nominal flow for a conductance.
 
@@ -74,6 +41,8 @@ class Alias:
     convert : callable
         ``convert(entry, values, where)`` returns the parameter's value [SI] from the written entry, the values [SI] of
         `uses`, and the place with which the message of an error begins.
+    meaning, unit, example : str
+        What it is, the unit in which a file writes it, and how a file may write it.
     """
 
     section: str
@@ -81,6 +50,14 @@ class Alias:
     parameter: str
     uses: tuple[str, ...]
     convert: Callable[[Any, Mapping[str, float], str], float]
+    meaning: str
+    unit: str
+    example: str
+
+    def as_key(self) -> Key:
+        """The declaration of the key."""
+        condition = f"in place of {self.parameter.partition('.')[2]}"
+        return Key(self.meaning, Takes.PARAMETER, self.unit, example=self.example, condition=condition)
 
 
 @dataclass(frozen=True)
@@ -129,7 +106,8 @@ class Structure:
                 raise InputError(f'{where}: [{section}] has no {key}; write {key} = "...", one of: {words}')
             return known.usual if known.choices is None else known.choices[known.usual]
         entry = self.written[section][key]
-        require(type(entry) in known.types, f"{self.place(section, key)} must be {known.form}, got {entry!r}")
+        proper = type(entry) in known.takes.types
+        require(proper, f"{self.place(section, key)} must be {known.takes.value}, got {entry!r}")
         if known.choices is None:
             return entry
         check_names(key, [entry], known.choices, f"{self.location(section, key)}: [{section}]")

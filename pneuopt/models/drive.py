@@ -9,13 +9,14 @@ import casadi as ca
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.models.axis_rest import with_rest
-from pneuopt.models.declaration import DriveKind, flag
+from pneuopt.models.declaration import DriveKind
 from pneuopt.models.friction import FrictionModel, law_inputs
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.needs import LOAD_EXCITATION, RIG_EXCITATION
 from pneuopt.models.starts.friction import force_starts, motion_starts
 from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.keys import flag
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.units import ATMOSPHERE
 
@@ -142,7 +143,11 @@ FORCE_KIND = DriveKind(
 )
 MOTION_KIND = DriveKind(
     MotionDrive.kind,
-    {"rig": {"chamber": flag(True)}, "friction": FRICTION_KEYS, "ambient": {}},
+    {
+        "rig": {"chamber": flag("whether the pressure of a chamber acts on the piston", usual=True)},
+        "friction": FRICTION_KEYS,
+        "ambient": {},
+    },
     lambda structure: MotionDrive(read_friction(structure), **structure.options("rig")),
 )
 

@@ -28,6 +28,7 @@ class Wrapper:
     ----------
     wrap : callable
         Builds the law from the inner law and, where there are options, a tuple of them.
+    meaning : str
     option : str
         Name of an option in messages, "chamber"; empty without options.
     options : tuple of str
@@ -35,6 +36,7 @@ class Wrapper:
     """
 
     wrap: Callable[..., FrictionModel]
+    meaning: str
     option: str = ""
     options: tuple[str, ...] = ()
 
@@ -49,9 +51,11 @@ FRICTION_LAWS: Mapping[str, Callable[[], FrictionModel]] = {
 """Basic laws from the simplest to the richest: `model = "coulomb"` in a file."""
 
 FRICTION_WRAPPERS: Mapping[str, Wrapper] = {
-    "asymmetric": Wrapper(Asymmetric),
-    "load_dependent": Wrapper(LoadDependent),
-    "pressure_dependent": Wrapper(PressureDependent, "chamber", CHAMBER_PRESSURES),
+    "asymmetric": Wrapper(Asymmetric, "whether friction differs between the directions"),
+    "load_dependent": Wrapper(LoadDependent, "whether friction rises with the transmitted force, as a gear's does"),
+    "pressure_dependent": Wrapper(
+        PressureDependent, "whether friction rises with both pressures, or a list of them", "chamber", CHAMBER_PRESSURES
+    ),
 }
 """Laws that wrap another law, the innermost first: `asymmetric = true` in a file."""
 

@@ -1,16 +1,20 @@
 """Section [friction] of a drive's file: the law and its wrappers."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
-from pneuopt.models.declaration import Key, Structure, choice, flag
+from pneuopt.models.declaration import Structure
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_laws import FRICTION_LAWS, FRICTION_WRAPPERS
 from pneuopt.quantities.errors import check_names
+from pneuopt.quantities.keys import Key, Takes, choice, flag
 
-_CHOICE = Key("true, false or a list", (bool, list), False)
 FRICTION_KEYS: Mapping[str, Key] = {
-    "model": choice(FRICTION_LAWS),
-    **{name: _CHOICE if wrapper.options else flag(False) for name, wrapper in FRICTION_WRAPPERS.items()},
+    "model": choice("friction law", FRICTION_LAWS),
+    **{
+        name: replace(flag(wrapper.meaning), takes=Takes.FLAG_OR_LIST if wrapper.options else Takes.FLAG)
+        for name, wrapper in FRICTION_WRAPPERS.items()
+    },
 }
 
 

@@ -15,12 +15,13 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.models.declaration import DriveKind, Key, Structure, choice
+from pneuopt.models.declaration import DriveKind, Structure
 from pneuopt.models.drive import FORCE, POSITION, SPEED
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.starts.linear import LinearStarts, Polynomials, ResponseShape
 from pneuopt.quantities.errors import ModelError, check_names, require
+from pneuopt.quantities.keys import Key, Takes, choice
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import read_si
@@ -211,12 +212,17 @@ LINEAR_KIND = DriveKind(
     FirstOrder.kind,
     {
         "plant": {
-            "model": choice({"first_order": FirstOrder, "second_order": SecondOrder, "integrator": Integrator}),
-            "input": Key("text", (str,), VALVE_VOLTAGE.name),
-            "output": Key("text", (str,), SPEED.name),
-            "input_unit": Key("text", (str,)),
-            "output_unit": Key("text", (str,)),
-            "pade_order": Key("a whole number", (int,)),
+            "model": choice(
+                "transfer function",
+                {"first_order": FirstOrder, "second_order": SecondOrder, "integrator": Integrator},
+            ),
+            "input": Key("channel that drives the plant", Takes.TEXT, usual=VALVE_VOLTAGE.name),
+            "output": Key("channel that answers", Takes.TEXT, usual=SPEED.name),
+            "input_unit": Key("unit of the input, where it is another: a transducer's", Takes.TEXT, example='"V"'),
+            "output_unit": Key("unit of the output, where it is another: a transducer's", Takes.TEXT, example='"V"'),
+            "pade_order": Key(
+                "order of the dead time's approximant, 0 to 5; 3 with a dead time", Takes.COUNT, example="3"
+            ),
         },
         "friction": FRICTION_KEYS,
     },

@@ -6,11 +6,14 @@ from math import pi
 import casadi as ca
 
 from pneuopt.dynamics.system import Symbols
-from pneuopt.models.declaration import flag
+from pneuopt.quantities.keys import flag
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 
 GRAVITY = 9.80665  # standard acceleration of gravity, 3rd CGPM, 1901 [m/s^2]
-LOAD_KEYS = {"spring": flag(False), "inclined": flag(False)}
+LOAD_KEYS = {
+    "spring": flag("whether a spring acts on the load"),
+    "inclined": flag("whether positive motion goes up an incline"),
+}
 """Keys of section [load] of a drive's file: the arguments of `Load`."""
 
 

@@ -135,7 +135,9 @@ def test_every_declared_key_is_read(kind: str, tmp_path: Path) -> None:
             document = row_document(kind)
             entries: Any = document[section]
             entries[key] = 3.5
-            with pytest.raises(InputError, match=rf"drive.toml:\d+: \[{section}\] {key} must be {known.form}, got 3.5"):
+            with pytest.raises(
+                InputError, match=rf"drive.toml:\d+: \[{section}\] {key} must be {known.takes.value}, got 3.5"
+            ):
                 read_document(document, tmp_path)
             for word in known.choices or ():
                 entries[key] = word

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from pneuopt.models.declaration import Alias, DriveKind, Key, Structure, choice, flag
+from pneuopt.models.declaration import Alias, DriveKind, Structure
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.pneumatic.chamber import ChamberModel, Polytropic, Thermal
@@ -18,20 +18,28 @@ from pneuopt.models.pneumatic.gas import (
 )
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
 from pneuopt.quantities.errors import UnitError, check_names, require
+from pneuopt.quantities.keys import Key, choice, flag, table
 from pneuopt.quantities.units import read_value
 
 _CRITICAL_RATIO = "valve.critical_ratio"
-_SMOOTHING_UNITS = {"corner": "1", "zero": "1", "pressure": "Pa"}
+_SMOOTHING_KEYS = {
+    "corner": Key("rounding of the corner where the flow chokes", usual=Smoothing.corner),
+    "zero": Key("rounding of the flow law at no flow", usual=Smoothing.zero),
+    "pressure": Key("rounding of the larger of two pressures", unit="Pa", usual=Smoothing.pressure),
+}
 _SECTIONS: Mapping[str, Mapping[str, Key]] = {
-    "cylinder": {"stops": flag(True)},
+    "cylinder": {"stops": flag("whether the covers stop the piston", usual=True)},
     "valve": {
-        "law": choice({"iso6358": Iso6358, "isentropic": IsentropicNozzle}, "iso6358"),
-        "spool": choice({spool.name.lower(): spool for spool in Spool}, "second_order"),
-        "smoothing": Key("a table", (dict,), {}),
+        "law": choice("flow law of the edges", {"iso6358": Iso6358, "isentropic": IsentropicNozzle}, "iso6358"),
+        "spool": choice("lag of the spool", {spool.name.lower(): spool for spool in Spool}, "second_order"),
+        "smoothing": table("widths over which the flow law is rounded", _SMOOTHING_KEYS, usual={}),
     },
     "supply": {},
     "gas": {},
-    "chamber": {"model": choice({"polytropic": Polytropic, "thermal": Thermal}, "polytropic"), "mixed": flag(False)},
+    "chamber": {
+        "model": choice("change of state of the air", {"polytropic": Polytropic, "thermal": Thermal}, "polytropic"),
+        "mixed": flag("whether inflow, outflow and volume have an exponent each"),
+    },
     "ambient": {},
     "load": LOAD_KEYS,
     "friction": FRICTION_KEYS,
@@ -45,13 +53,13 @@ def _build_drive(structure: Structure) -> PneumaticDrive:
     return PneumaticDrive(valve, read_friction(structure), load, _read_chamber(structure), cylinder)
 
 
-def _read_smoothing(table: Mapping[str, Any], structure: Structure) -> Smoothing:
+def _read_smoothing(entries: Mapping[str, Any], structure: Structure) -> Smoothing:
     """Read the rounding of the flow law: smoothing = { corner = 0.02, zero = 1e-3, pressure = "100 Pa" }."""
     where = structure.place("valve", "smoothing")
-    check_names("key", table, _SMOOTHING_UNITS, where)
-    widths = {n: read_value(v, _SMOOTHING_UNITS[n], where=f"{where}: {n}") for n, v in table.items()}
+    check_names("key", entries, _SMOOTHING_KEYS, where)
+    widths = {n: read_value(v, _SMOOTHING_KEYS[n].unit, where=f"{where}: {n}") for n, v in entries.items()}
     for name, width in widths.items():
-        require(width > 0, f"{where}: {name} must be positive, got {table[name]}; smaller is sharper and stiffer")
+        require(width > 0, f"{where}: {name} must be positive, got {entries[name]}; smaller is sharper and stiffer")
     return Smoothing(**widths)
 
 
@@ -78,5 +86,16 @@ PNEUMATIC_KIND = DriveKind(
     PneumaticDrive.kind,
     _SECTIONS,
     _build_drive,
-    aliases=(Alias("valve", "nominal_flow", "valve.conductance", (_CRITICAL_RATIO,), _read_nominal_flow),),
+    aliases=(
+        Alias(
+            "valve",
+            "nominal_flow",
+            "valve.conductance",
+            (_CRITICAL_RATIO,),
+            _read_nominal_flow,
+            "nominal flow of a catalogue, from 6 to 5 bar(g)",
+            "l/min(ANR)",
+            '"700 l/min(ANR)"',
+        ),
+    ),
 )
