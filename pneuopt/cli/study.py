@@ -32,9 +32,9 @@ from pneuopt.evaluation.requirements import (
     with_user_limit,
 )
 from pneuopt.files.drive import read_drive
-from pneuopt.files.loop import construct_at
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
 from pneuopt.files.study import Pareto, Study, SweptAxis, read_axes, read_pareto, read_study
+from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.plotting import plot_front, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require

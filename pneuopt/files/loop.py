@@ -1,39 +1,33 @@
 """The loop in a tuning.toml: [loop], [pid], [sensor], [dither], [feedforward] and the sections of `COMPENSATORS`."""
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pneuopt.control.compensation import Compensator
 from pneuopt.control.compensators import COMPENSATORS
-from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import System
-from pneuopt.files.toml import read_parameter
-from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.files.toml import construct_at, read_fixed_value, read_parameter
+from pneuopt.files.tuning_keys import LOOP_KEYS
+from pneuopt.quantities.errors import check_names, require
+from pneuopt.quantities.keys import Key
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.units import read_value, write_value
 
 TuningSections = Mapping[str, Any]
-Made = TypeVar("Made")
 
 TUNABLE_SECTIONS = ("pid", "dither", "feedforward", *COMPENSATORS)
 """Sections whose values may be free."""
-LOOP_SECTIONS = ("loop", "sensor", *TUNABLE_SECTIONS)
+LOOP_SECTIONS = tuple(LOOP_KEYS)
 
-_LOOP_STRUCTURE: Mapping[str, tuple[str, ...]] = {
-    "loop": ("measured", "actuated"),
-    "pid": ("form", "sample_time", "delay", "limits"),
-    "dither": ("waveform", "analogue"),
-    "feedforward": (),
-    **{section: tuple(f.name for f in fields(part)) for section, part in COMPENSATORS.items()},
-}
 _SHARED_PID_KEYS = ("b", "c", "Tt")
 _GAIN_CORRECTIONS: Mapping[Form, Mapping[str, str]] = {
     Form.PARALLEL: {"K": "Kp", "Ti": "Ki = Kp/Ti", "Td": "Kd = Kp Td", "N": "Tf = Td/N"},
@@ -68,22 +62,9 @@ def read_loop_sections(table: TuningSections, plant: System, path: str | Path) -
     return loop, _parameters(table, loop, path)
 
 
-def read_fixed_value(entries: Mapping[str, Any], key: str, unit: str, where: str) -> float:
-    """A value that cannot be free [unit]."""
-    return read_value(entries[key], unit, where=f"{where} {key}")
-
-
-def construct_at(make: Callable[[], Made], where: str) -> Made:
-    """Call `make`; an `InputError` that it raises gets the place in the file before its message."""
-    try:
-        return make()
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-
-
 def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
     wiring = table.get("loop", {})
-    check_names("key", wiring, _LOOP_STRUCTURE["loop"], f"{path}: [loop]")
+    check_names("key", wiring, LOOP_KEYS["loop"], f"{path}: [loop]")
     for key, signal in wiring.items():
         require(isinstance(signal, str), f"{path}: [loop] {key} must be a signal's name, got {signal!r}")
     pid = _pid(table["pid"], f"{path}: [pid]")
@@ -97,13 +78,29 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
 
 
 def _pid(table: Mapping[str, Any], where: str) -> PID:
-    form = str(table.get("form", "parallel"))
-    check_names("form", [form], [f.value for f in Form], where)
-    _check_gains(table, Form(form), where)
-    sample_time = read_fixed_value(table, "sample_time", "s", where) if "sample_time" in table else None
-    delay = _sample_count(table.get("delay", 0), f"{where} delay")
+    keys = LOOP_KEYS["pid"]
+    form = _read_choice(table, "form", keys, where)
+    _check_gains(table, form, where)
+    sample_time = _read_value(table, "sample_time", keys, where)
+    delay = _sample_count(table.get("delay", keys["delay"].usual), f"{where} delay")
     banded = "dead_band" in table
-    return construct_at(lambda: PID(sample_time, "limits" in table, Form(form), delay, banded), where)
+    return construct_at(lambda: PID(sample_time, "limits" in table, form, delay, banded), where)
+
+
+def _read_choice(table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str) -> Any:
+    """What the word of a key stands for, of the usual one where the section leaves it out."""
+    word, words = str(table.get(key, keys[key].usual)), keys[key].choices or {}
+    check_names(key, [word], words, where)
+    return words[word]
+
+
+def _read_value(
+    table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str, units: Mapping[str, str] | None = None
+) -> Any:
+    """A value that cannot be free, in its declared unit; the usual one where the section leaves it out."""
+    if key not in table:
+        return keys[key].usual
+    return read_fixed_value(table, key, keys[key].unit.format_map(units or {}), where)
 
 
 def _sample_count(table: Any, where: str) -> int:
@@ -124,27 +121,27 @@ def _check_gains(table: Mapping[str, Any], form: Form, where: str) -> None:
 
 
 def _dither(table: Mapping[str, Any], where: str) -> Dither:
-    shape = str(table.get("waveform", "sine"))
-    check_names("waveform", [shape], [w.value for w in Waveform], where)
-    require(isinstance(table.get("analogue", False), bool), f"{where} analogue must be true or false")
+    keys, analogue = LOOP_KEYS["dither"], table.get("analogue", LOOP_KEYS["dither"]["analogue"].usual)
+    shape = _read_choice(table, "waveform", keys, where)
+    require(isinstance(analogue, bool), f"{where} analogue must be true or false")
     require("frequency" in table, f'{where} has no frequency; write frequency = "160 Hz"')
     given = read_parameter(table["frequency"], Parameter(1.0, "Hz"), f"{where} frequency")
-    return construct_at(lambda: Dither(given.value, table.get("analogue", False), Waveform(shape)), where)
+    return construct_at(lambda: Dither(given.value, analogue, shape), where)
 
 
 def _sensor(table: Mapping[str, Any], plant: System, where: str) -> SensorLag | Encoder:
-    check_names("key", table, ("lag", "resolution", "filter"), where)
+    keys = LOOP_KEYS["sensor"]
+    check_names("key", table, keys, where)
     message = 'write lag = "5 ms", or of an encoder resolution = "10 um" and filter = "5 ms"'
     require(bool(table), f"{where} has no lag; {message}")
     require("lag" not in table or len(table) == 1, f"{where} has a lag or an encoder, not both; {message}")
     if "lag" in table:
-        lag = read_fixed_value(table, "lag", "s", where)
+        lag = _read_value(table, "lag", keys, where)
         return construct_at(lambda: SensorLag(lag), where)
     usual = Encoder() if plant.axis is None else Encoder(position=plant.axis.position)
-    unit = {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")
-    resolution = read_fixed_value(table, "resolution", unit, where) if "resolution" in table else usual.resolution
-    filter_time = read_fixed_value(table, "filter", "s", where) if "filter" in table else usual.filter
-    return construct_at(lambda: replace(usual, resolution=resolution, filter=filter_time), where)
+    units = {"position": {q.name: q.unit for q in plant.outputs}.get(usual.position, "m")}
+    read = {key: _read_value(table, key, keys, where, units) for key in table}
+    return construct_at(lambda: replace(usual, **read), where)
 
 
 def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
@@ -157,12 +154,9 @@ def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
 
 def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:
     """A compensator, whose fields are choices of an enum."""
-    kind, chosen = COMPENSATORS[section], dict[str, Any]()
+    kind, keys = COMPENSATORS[section], LOOP_KEYS[section]
     require(kind.size in table, f"{where} has no {kind.size}, without which it adds nothing; write {kind.size}")
-    for key in (f.name for f in fields(kind) if f.name in table):
-        choices = type(getattr(kind, key))
-        check_names(key, [str(table[key])], [c.value for c in choices], where)
-        chosen[key] = choices(table[key])
+    chosen = {key: _read_choice(table, key, keys, where) for key in keys}
     return construct_at(lambda: kind(**chosen), where)
 
 
@@ -185,7 +179,7 @@ def _section_parameters(
 ) -> dict[str, Parameter]:
     keys = [n.removeprefix(f"{section}.") for n in own if n.startswith(f"{section}.")]
     keys = [k for k in keys if k not in ("lower", "upper")]
-    check_names("key", entries, (*_LOOP_STRUCTURE[section], *keys), where)
+    check_names("key", entries, (*LOOP_KEYS[section], *keys), where)
     names = {k: f"{section}.{k}" for k in keys if k in entries}
     return {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
 

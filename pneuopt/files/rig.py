@@ -22,16 +22,41 @@ from typing import Any, TypeVar
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
-from pneuopt.files.loop import construct_at, read_fixed_value
-from pneuopt.files.toml import read_toml
+from pneuopt.files.toml import construct_at, read_fixed_value, read_toml
 from pneuopt.models.declaration import Drive
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.quantities.errors import ModelError, check_names, require
+from pneuopt.quantities.keys import Key, table
+from pneuopt.quantities.unit_algebra import difference_unit
 
 Part = TypeVar("Part", Actuator, Sensor, Encoder)
-RIG_SECTIONS = ("actuator", "sensors", "encoder")
-_TIMES = ("lag", "filter")
+_SENSOR = table(
+    "the sensor of an output",
+    {
+        "lag": Key("lag of first order", unit="s", usual=Sensor.lag),
+        "noise": Key("standard deviation of its noise", unit="{signal}", usual=Sensor.noise),
+        "resolution": Key("step of the digital value; 0: none", unit="{signal}", usual=Sensor.resolution),
+    },
+)
+RIG_KEYS: Mapping[str, Key] = {
+    "actuator": table(
+        "an imperfect valve or amplifier",
+        {
+            "hysteresis": Key("width of the loop, as catalogues give it", unit="{signal}", usual=Actuator.hysteresis),
+            "dead_zone": Key("command around zero that does nothing", unit="{signal}", usual=Actuator.dead_zone),
+        },
+    ),
+    "sensors": table("what the sensors show", {}, others=_SENSOR, named="output"),
+    "encoder": table(
+        "by which the controller gets a speed out of the measured position",
+        {
+            "filter": Key("time constant of its low-pass", unit="s", usual=Encoder.filter),
+            "resolution": Key("one count; 0: none", unit="{signal}", usual=Encoder.resolution),
+        },
+    ),
+}
+"""The sections of a rig.toml and their keys; {signal} stands for the unit of the signal."""
 
 
 def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
@@ -54,14 +79,16 @@ def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
     InputError
         Or its kind; the message names file, section and key.
     """
-    table = read_toml(path).unwrap()
-    check_names("section", table, RIG_SECTIONS, str(path))
-    for name, entry in table.items():
+    sections = read_toml(path).unwrap()
+    check_names("section", sections, RIG_KEYS, str(path))
+    for name, entry in sections.items():
         require(isinstance(entry, dict), f"{path}: {name} must be a section, [{name}]")
     own = construct_at(lambda: replace(loop, plant=stick_slip_drive(drive).system(), sensor=None), str(path))
-    actuator = _read_numbers(table.get("actuator", {}), Actuator(), loop.command.unit, f"{path}: [actuator]")
-    encoder = _read_encoder(table.get("encoder", {}), loop, f"{path}: [encoder]")
-    sensors = _read_sensors(table.get("sensors", {}), loop, f"{path}: [sensors") or _own_sensors(loop)
+    actuator = _read_numbers(
+        sections.get("actuator", {}), RIG_KEYS["actuator"], Actuator(), loop.command.unit, f"{path}: [actuator]"
+    )
+    encoder = _read_encoder(sections.get("encoder", {}), loop, f"{path}: [encoder]")
+    sensors = _read_sensors(sections.get("sensors", {}), loop, f"{path}: [sensors") or _own_sensors(loop)
     return construct_at(lambda: Rig(own, sensors, actuator, encoder), str(path))
 
 
@@ -78,20 +105,20 @@ def stick_slip_drive(drive: Drive) -> Drive:
     return replace(same, friction=sticking)  # type: ignore[no-any-return]
 
 
-def _read_sensors(table: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Sensor]:
+def _read_sensors(entries: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Sensor]:
     units = {q.name: q.unit for q in loop.plant.outputs}
-    check_names("output", table, units, f"{where}]")
-    for name, entry in table.items():
+    check_names("output", entries, units, f"{where}]")
+    for name, entry in entries.items():
         require(isinstance(entry, dict), f"{where}] must hold sections, [sensors.{name}]")
-    return {n: _read_numbers(entry, Sensor(), units[n], f"{where}.{n}]") for n, entry in table.items()}
+    return {n: _read_numbers(entry, _SENSOR, Sensor(), units[n], f"{where}.{n}]") for n, entry in entries.items()}
 
 
-def _read_encoder(table: Mapping[str, Any], loop: ClosedLoop, where: str) -> Encoder:
+def _read_encoder(entries: Mapping[str, Any], loop: ClosedLoop, where: str) -> Encoder:
     axis = loop.plant.axis
     usual = loop.sensor if isinstance(loop.sensor, Encoder) else Encoder()
     usual = replace(usual, position=axis.position) if axis is not None else usual
     unit = {q.name: q.unit for q in loop.plant.outputs}.get(usual.position, "m")
-    return _read_numbers(table, usual, unit, where)
+    return _read_numbers(entries, RIG_KEYS["encoder"], usual, unit, where)
 
 
 def _own_sensors(loop: ClosedLoop) -> dict[str, Sensor]:
@@ -101,10 +128,9 @@ def _own_sensors(loop: ClosedLoop) -> dict[str, Sensor]:
     return {loop.feedback.name: Sensor(lag=loop.sensor.lag if isinstance(loop.sensor, SensorLag) else 0.0)}
 
 
-def _read_numbers(table: Mapping[str, Any], usual: Part, unit: str, where: str) -> Part:
+def _read_numbers(entries: Mapping[str, Any], section: Key, usual: Part, unit: str, where: str) -> Part:
     """A copy of a part with the numbers that a section holds, in the unit of its signal, or in seconds."""
-    keys = [n for n in (*_TIMES, "noise", "resolution", "hysteresis", "dead_zone") if hasattr(usual, n)]
-    check_names("key", table, keys, where)
-    plain = unit.partition("(")[0]
-    read: dict[str, Any] = {n: read_fixed_value(table, n, "s" if n in _TIMES else plain, where) for n in table}
+    check_names("key", entries, section.keys, where)
+    units = {n: key.unit.format(signal=difference_unit(unit)) for n, key in section.keys.items()}
+    read: dict[str, Any] = {n: read_fixed_value(entries, n, units[n], where) for n in entries}
     return construct_at(lambda: replace(usual, **read), where)

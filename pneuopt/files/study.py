@@ -12,20 +12,55 @@ from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.requirements import read_bound
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.keys import Key, Takes, flag, table
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import count_gauge_from, read_unit, read_value, si_conversion
 
-_SECTION_KEYS = {
-    "study": ("drive", "tuning", "tune"),
-    "metrics": ("band", "show"),
-    "pareto": ("between", "points", "lower", "upper"),
-}
-_RANGE_KEYS = ("from", "to", "steps")
 _AXIS_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
-_DEFAULT_METRICS = ("SettlingTime", "Overshoot")
 _BETWEEN_EXAMPLE = 'between = ["settling_time", "peak_control"]'
-_DEFAULT_POINTS = 9
-"""Designs of a front, where the file has none: each is a tuning, so more take long; fewer hide the bend."""
+_DEFAULT_POINTS = 9  # designs of a front: each is a tuning, so more take long; fewer hide the bend
+_RANGE_KEYS: Mapping[str, Key] = {
+    "from": Key("first value", unit="{own}", required=True, example='"2 kg"'),
+    "to": Key("last value", unit="{own}", required=True, example='"8 kg"'),
+    "steps": Key("how many values", Takes.COUNT, required=True, example="4"),
+}
+_SWEPT_AXIS = Key("a list of values, or a range", Takes.AXIS, "{own}", keys=_RANGE_KEYS, example='["4 kg", "8 kg"]')
+STUDY_KEYS: Mapping[str, Key] = {
+    "study": table(
+        "what is studied; the files are relative to this one",
+        {
+            "drive": Key("a drive.toml or a fit.toml", Takes.TEXT, required=True, example='"fit.toml"'),
+            "tuning": Key("a tuning.toml or a tuned.toml", Takes.TEXT, required=True, example='"tuned.toml"'),
+            "tune": flag("whether each cell of a grid is tuned, from its neighbours' gains"),
+        },
+        required=True,
+    ),
+    "axes": table("the axes of a grid", {}, others=_SWEPT_AXIS, named="parameter"),
+    "metrics": table(
+        "of a grid: what is shown",
+        {
+            "band": Key("half width of the settling band; by default the tuning's", example='"2 %"'),
+            "show": Key(
+                "metrics on screen and in the figure", Takes.LIST, usual=["SettlingTime", "Overshoot"], named="metric"
+            ),
+        },
+    ),
+    "pareto": table(
+        "a front between two requirements, in place of a grid",
+        {
+            "between": Key(
+                "the two, by their keys in a tuning",
+                Takes.LIST,
+                required=True,
+                example='["settling_time", "peak_control"]',
+            ),
+            "points": Key("designs of the front", Takes.COUNT, usual=_DEFAULT_POINTS),
+            "lower": Key("where the second ends; by default the least that can be", unit="{own}", example='"100 N"'),
+            "upper": Key("where it begins; by default the tuning's limit", unit="{own}", example='"250 N"'),
+        },
+    ),
+}
+"""The sections of a study.toml and their keys."""
 
 
 @dataclass(frozen=True)
@@ -119,26 +154,27 @@ def read_study(path: str | Path) -> Study:
     InputError
         UnitError, UnknownNameError or other; the message names file, section and key.
     """
-    path, table = Path(path), read_toml(path).unwrap()
-    check_names("section", table, (*_SECTION_KEYS, "axes"), str(path))
-    for name in table:
-        require(isinstance(table[name], dict), f"{path}: {name} must be a section, [{name}]")
-    for name, keys in _SECTION_KEYS.items():
-        check_names("key", table.get(name, {}), keys, f"{path}: [{name}]")
-    axes, metrics = _flatten_axes(table.get("axes", {})), table.get("metrics", {})
+    path, sections = Path(path), read_toml(path).unwrap()
+    check_names("section", sections, STUDY_KEYS, str(path))
+    for name in sections:
+        require(isinstance(sections[name], dict), f"{path}: {name} must be a section, [{name}]")
+    for name, section in STUDY_KEYS.items():
+        if section.others is None:
+            check_names("key", sections.get(name, {}), section.keys, f"{path}: [{name}]")
+    axes, metrics = _flatten_axes(sections.get("axes", {})), sections.get("metrics", {})
     for name in ("axes", "metrics"):
-        alone = name not in table or "pareto" not in table
+        alone = name not in sections or "pareto" not in sections
         require(alone, f"{path}: [{name}] belongs to a grid, [pareto] to a front; leave one of them out")
-    require(bool(axes) or "pareto" in table, f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
+    require(bool(axes) or "pareto" in sections, f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
     band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
     require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
-    given = table.get("study", {})
+    given, known = sections.get("study", {}), STUDY_KEYS["study"].keys
     drive, tuning = (_file_path(given, key, path) for key in ("drive", "tuning"))
-    tune = given.get("tune", False)
+    tune = given.get("tune", known["tune"].usual)
     require(isinstance(tune, bool), f"{path}: [study] tune must be true or false, got {tune!r}")
-    require(not (tune and "pareto" in table), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
+    require(not (tune and "pareto" in sections), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
     require(not (tune and band), f"{path}: [metrics] band would not be the one tuned for; state it in {tuning.name}")
-    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), table.get("pareto"), tune)
+    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), sections.get("pareto"), tune)
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
@@ -185,8 +221,8 @@ def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
     InputError
         If a requirement is unknown or there twice, or a value cannot be read.
     """
-    table, where = study.pareto or {}, f"{study.path}: [pareto]"
-    pair, points = table.get("between"), table.get("points", _DEFAULT_POINTS)
+    given, where = study.pareto or {}, f"{study.path}: [pareto]"
+    pair, points = given.get("between"), given.get("points", STUDY_KEYS["pareto"].keys["points"].usual)
     two = isinstance(pair, list) and len(pair) == 2 and all(isinstance(key, str) for key in pair)
     require(
         two,
@@ -197,20 +233,20 @@ def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
     require(first != second, f"{where} between names {first} twice; a front needs two requirements, {_BETWEEN_EXAMPLE}")
     counts = isinstance(points, int) and not isinstance(points, bool) and points >= 2
     require(counts, f"{where} points is the number of designs, at least 2, got {points!r}")
-    given = [key for key in ("lower", "upper") if key in table]
-    ends = {key: read_bound(second, table[key], units[second], f"{where} {key}") for key in given}
+    stated = [key for key in ("lower", "upper") if key in given]
+    ends = {key: read_bound(second, given[key], units[second], f"{where} {key}") for key in stated}
     for key, value in ends.items():
-        require(value > 0, f"{where} {key}: {second} must be positive, got {table[key]!r}")
+        require(value > 0, f"{where} {key}: {second} must be positive, got {given[key]!r}")
     ordered = len(ends) < 2 or ends["lower"] < ends["upper"]
-    require(ordered, f"{where} lower, {table.get('lower')}, is not below upper, {table.get('upper')}")
+    require(ordered, f"{where} lower, {given.get('lower')}, is not below upper, {given.get('upper')}")
     return Pareto((first, second), points, ends.get("lower"), ends.get("upper"))
 
 
-def _flatten_axes(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten_axes(entries: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """By full name; without quotes, TOML reads `load.mass` as a table within a table."""
     found: dict[str, Any] = {}
-    for key, entry in table.items():
-        nested = isinstance(entry, dict) and not set(_RANGE_KEYS) & entry.keys()
+    for key, entry in entries.items():
+        nested = isinstance(entry, dict) and not _RANGE_KEYS.keys() & entry.keys()
         found |= _flatten_axes(entry, f"{prefix}{key}.") if nested else {f"{prefix}{key}": entry}
     return found
 
@@ -234,19 +270,19 @@ def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
     steps = entry["steps"]
     counts = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 2
     require(counts, f"{where} steps is the number of values, at least 2, got {steps!r}")
-    first, last = (read_value(entry[key], unit, where=f"{where} {key}") for key in _RANGE_KEYS[:2])
+    first, last = (read_value(entry[key], unit, where=f"{where} {key}") for key in ("from", "to"))
     return [float(v) for v in np.linspace(first, last, steps)]
 
 
 def _metric_names(metrics: Mapping[str, Any], path: Path) -> tuple[str, ...]:
-    show = metrics.get("show", list(_DEFAULT_METRICS))
+    show = metrics.get("show", STUDY_KEYS["metrics"].keys["show"].usual)
     good = isinstance(show, list) and len(show) > 0 and all(isinstance(name, str) for name in show)
     require(good, f'{path}: [metrics] show must be a list of names, ["SettlingTime", "Overshoot"], got {show!r}')
     return tuple(dict.fromkeys(show))
 
 
-def _file_path(table: Mapping[str, Any], key: str, path: Path) -> Path:
-    if key not in table:
+def _file_path(given: Mapping[str, Any], key: str, path: Path) -> Path:
+    if key not in given:
         raise InputError(f'{path}: [study] has no {key}; write {key} = "{key}.toml"')
-    require(isinstance(table[key], str), f"{path}: [study] {key} must be a file's name, got {table[key]!r}")
-    return path.parent / str(table[key])
+    require(isinstance(given[key], str), f"{path}: [study] {key} must be a file's name, got {given[key]!r}")
+    return path.parent / str(given[key])

@@ -4,10 +4,10 @@ A value is "32 mm", or { value = "40 N", lower = "5 N", upper = "90 N", free = t
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
@@ -18,6 +18,8 @@ from pneuopt.quantities.keys import PARAMETER_KEYS, Takes
 from pneuopt.quantities.output import plain_value
 from pneuopt.quantities.parameters import Parameter
 from pneuopt.quantities.units import read_value, write_value
+
+Made = TypeVar("Made")
 
 _PARAMETER_FLAGS = tuple(name for name, key in PARAMETER_KEYS.items() if key.takes is Takes.FLAG)
 _PARAMETER_NUMBERS = tuple(name for name, key in PARAMETER_KEYS.items() if key.takes is Takes.NUMBER)
@@ -149,6 +151,19 @@ def write_parameter(document: tomlkit.TOMLDocument, name: str, found: Parameter,
         entries[key] = fields["value"]
     else:
         entries[key] = inline_table({"value": entry or _format_value(found.value, found)} | fields)
+
+
+def read_fixed_value(entries: Mapping[str, Any], key: str, unit: str, where: str) -> float:
+    """A value that cannot be free [unit]."""
+    return read_value(entries[key], unit, where=f"{where} {key}")
+
+
+def construct_at(make: Callable[[], Made], where: str) -> Made:
+    """Call `make`; an `InputError` that it raises gets the place in the file before its message."""
+    try:
+        return make()
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def toml_table(entries: Mapping[str, Any]) -> Table:

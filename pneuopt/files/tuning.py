@@ -20,17 +20,33 @@ from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, Spread
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.loop import (
-    LOOP_SECTIONS,
     TUNABLE_SECTIONS,
     TuningSections,
-    construct_at,
-    read_fixed_value,
     read_loop_sections,
 )
 from pneuopt.files.method import read_method
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
-from pneuopt.files.toml import inline_table, read_parameter, read_toml, toml_table, write_parameter
+from pneuopt.files.toml import (
+    construct_at,
+    inline_table,
+    read_fixed_value,
+    read_parameter,
+    read_toml,
+    toml_table,
+    write_parameter,
+)
+from pneuopt.files.tuning_keys import (
+    ACCEPT_KEY,
+    BUDGET_KEYS,
+    REFERENCE_KEYS,
+    SCENARIO_KEYS,
+    TUNING_KEYS,
+    limit_key,
+    objective_key,
+    signal_units,
+)
 from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.keys import Takes
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import count_gauge_from, read_value
@@ -42,14 +58,6 @@ if TYPE_CHECKING:
 
 TUNED_SECTIONS = ("certified", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
-
-ACCEPT_KEY = "accept"
-"""Top-level key of the defects with which a design is certified all the same."""
-
-_TUNING_SECTIONS = (*LOOP_SECTIONS, "reference", "minimise", "limits", "scenarios", "method", "budget")
-SCENARIO_KINDS = ("corners", "samples", "tolerances")
-_SAMPLE_DEFAULTS = (("count", 20), ("seed", 0))
-_EXTRA_KEYS: Mapping[str, str] = {"settling_time": "band", "step_envelope": "bounds"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +114,8 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
         UnitError, UnknownNameError, ModelError or other; the message names file, section and key.
     """
     table = {name: entry for name, entry in read_toml(path).unwrap().items() if name not in TUNED_SECTIONS}
-    check_names("section", table, (*_TUNING_SECTIONS, ACCEPT_KEY), str(path))
-    for name in (n for n in _TUNING_SECTIONS if n != "reference"):
+    check_names("section", table, TUNING_KEYS, str(path))
+    for name in (n for n, key in TUNING_KEYS.items() if key.takes is Takes.TABLE):
         require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
     require("pid" in table, f"{path}: no controller; add a section [pid]")
     loop, parameters = read_loop_sections(table, plant, path)
@@ -118,7 +126,7 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     method = read_method(table.get("method", {}), f"{path}: [method]")
     references = _references(table, loop, path)
     max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
-    accept = _read_accept(table.get(ACCEPT_KEY, []), f"{path}: {ACCEPT_KEY}")
+    accept = _read_accept(table.get(ACCEPT_KEY, TUNING_KEYS[ACCEPT_KEY].usual), f"{path}: {ACCEPT_KEY}")
     return Tuning(loop, references, parameters, spec, scenarios, validation, method, max_steps, accept)
 
 
@@ -189,8 +197,9 @@ def _merge_scenarios(parts: Sequence[Mapping[str, float | Factor]]) -> dict[str,
 
 def _read_budget(table: Mapping[str, Any], where: str) -> float:
     """Read how many steps a simulation may take."""
-    check_names("key", table, ("steps",), where)
-    steps = read_fixed_value(table, "steps", "1", where) if "steps" in table else MAX_STEPS
+    check_names("key", table, BUDGET_KEYS, where)
+    known = BUDGET_KEYS["steps"]
+    steps = read_fixed_value(table, "steps", known.unit, where) if "steps" in table else known.usual
     require(steps > 0, f"{where} steps must be positive, got {steps:g}; {MAX_STEPS:g} is usual")
     return steps
 
@@ -199,8 +208,9 @@ def _read_accept(words: Any, where: str) -> tuple[Defect, ...]:
     """Read the defects that the user accepts by name."""
     proper = isinstance(words, list) and all(isinstance(word, str) for word in words)
     require(proper, f'{where}: write defects in a list before the first section, {ACCEPT_KEY} = ["hunts"]')
-    check_names("defect", words, [defect.value for defect in Defect], where)
-    return tuple(Defect(word) for word in words)
+    known = TUNING_KEYS[ACCEPT_KEY].choices or {}
+    check_names("defect", words, known, where)
+    return tuple(known[word] for word in words)
 
 
 def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
@@ -218,9 +228,9 @@ def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tu
 def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
     """Read one [[reference]], in the units of the loop's signals."""
     unit, outputs = loop.feedback.unit, {q.name: q.unit for q in loop.plant.outputs}
-    difference = unit.partition("(")[0]
-    units = {"step": difference, "initial": unit, "at": "s", "horizon": "s", "scale": difference}
-    check_names("key", entry, (*units, "start", "disturbance"), where)
+    signals = signal_units(loop.command.unit, unit)
+    units = {n: key.unit.format_map(signals) for n, key in REFERENCE_KEYS.items() if key.takes is Takes.NUMBER}
+    check_names("key", entry, REFERENCE_KEYS, where)
     start = entry.get("start", {})
     require(isinstance(start, dict), f'{where} start: write start = {{ position = "250 mm" }}')
     check_names("output", start, outputs, f"{where} start")
@@ -251,8 +261,9 @@ def _read_objective(table: TuningSections, path: str | Path) -> dict[Requirement
     for key, entry in table.get("minimise", {}).items():
         spot = f"{where} {key}"
         require(isinstance(entry, dict), f"{spot}: write {key} = {{ weight = 1.0 }}; a limit belongs under [limits]")
-        check_names("key", entry, ("weight", *_extra_keys(key)), spot)
-        weight = read_fixed_value(entry, "weight", "1", spot) if "weight" in entry else 1.0
+        keys = objective_key(key).keys
+        check_names("key", entry, keys, spot)
+        weight = read_fixed_value(entry, "weight", "1", spot) if "weight" in entry else keys["weight"].usual
         require(0 < weight < float("inf"), f"{spot}: weight must be positive, got {weight:g}")
         weights[_make_requirement(key, entry, {"max": None} if key == "step_envelope" else {}, spot)] = weight
     return weights
@@ -267,7 +278,7 @@ def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path
         spot = f"{where} {key}"
         bound = REQUIREMENTS_BY_KEY[key].metric.sense.value
         entry = given if isinstance(given, dict) else {bound: given}
-        check_names("key", entry, (bound, *_extra_keys(key)), spot)
+        check_names("key", entry, limit_key(key).keys, spot)
         require(bound in entry or key == "step_envelope", f"{spot} has no {bound}")
         at = f"{spot} {bound}" if entry is given else spot
         limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
@@ -296,11 +307,6 @@ def _read_envelope(table: Any, where: str) -> EnvelopeBounds:
     )
 
 
-def _extra_keys(key: str) -> tuple[str, ...]:
-    """The keys of a requirement beside its limit and weight."""
-    return (_EXTRA_KEYS[key],) if key in _EXTRA_KEYS else ()
-
-
 def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: str | Path) -> None:
     """Write the tuned values of the free parameters into a document, in the units that the user gave them in."""
     for section in TUNABLE_SECTIONS:
@@ -314,7 +320,7 @@ def _write_gains(document: tomlkit.TOMLDocument, tuned: ParameterSet, source: st
 def _read_kinds(
     table: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
 ) -> Iterator[Scenarios]:
-    check_names("kind", table, SCENARIO_KINDS, f"{where}: [scenarios]")
+    check_names("kind", table, SCENARIO_KEYS, f"{where}: [scenarios]")
     for kind, given in table.items():
         spot = f"{where}: [scenarios.{kind}]"
         require(isinstance(given, dict), f'{spot} must be a section, with "load.mass" = "30 %" in it')
@@ -325,7 +331,8 @@ def _read_kind(
     kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
 ) -> Scenarios:
     entries = dict(given)
-    count, seed = (entries.pop(key, default) if kind == "samples" else 0 for key, default in _SAMPLE_DEFAULTS)
+    draw = {key: entries.pop(key, known.usual) for key, known in SCENARIO_KEYS[kind].keys.items()}
+    count, seed = draw.get("count", 0), draw.get("seed", 0)
     require(isinstance(count, int) and isinstance(seed, int), f"{where} count and seed are whole numbers")
     try:
         spreads = _read_spreads(entries, where, parameters)

@@ -3,6 +3,7 @@
 A file is a table whose keys are its sections, a section is a table of keys, and so on down.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -23,6 +24,9 @@ class Takes(Enum):
     FLAG_OR_LIST = "true, false or a list"
     TABLE = "a table"
     TABLES = "sections [[...]]"
+    SAMPLES = "a number of samples"
+    SPREAD = "a fraction, or two values"
+    AXIS = "a list of values, or a range"
 
     @property
     def types(self) -> tuple[type, ...]:
@@ -40,6 +44,9 @@ _TYPES: Mapping[Takes, tuple[type, ...]] = {
     Takes.FLAG_OR_LIST: (bool, list),
     Takes.TABLE: (dict,),
     Takes.TABLES: (list,),
+    Takes.SAMPLES: (int, str),
+    Takes.SPREAD: (str, int, float, list),
+    Takes.AXIS: (list, dict),
 }
 
 
@@ -107,6 +114,27 @@ def choice(meaning: str, choices: Mapping[str, Any], usual: str | None = None) -
 def table(meaning: str, keys: Mapping[str, Key], **options: Any) -> Key:
     """Key that is a table, or a section, of other keys."""
     return replace(Key(meaning, Takes.TABLE, keys=keys), **options)
+
+
+def first_sentence(kind: type) -> str:
+    """What a class is, by its docstring; empty where Python was told to leave docstrings out."""
+    first = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
+    return _plain(re.split(r"[.;] ", first)[0])
+
+
+def argument_meanings(kind: type) -> dict[str, str]:
+    """What each argument of a class means, the first sentence of its docstring's section Parameters."""
+    section = (kind.__doc__ or "").partition("----------\n")[2].partition("\n\n")[0]
+    found: dict[str, str] = {}
+    for names, lines in re.findall(r"^    (\w[\w, ]*) : .*\n((?:^        .*\n?)+)", section, re.MULTILINE):
+        meaning = _plain(re.split(r"[.;:] ", " ".join(lines.split()))[0])
+        found |= dict.fromkeys(names.split(", "), meaning)
+    return found
+
+
+def _plain(sentence: str) -> str:
+    """Without markup, unit and full stop."""
+    return re.sub(r" \[[^]]*\]$", "", sentence.removesuffix(".").replace("`", ""))
 
 
 def parameter_key(parameter: Parameter, condition: str = "") -> Key:
