@@ -10,6 +10,7 @@ import numpy as np
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
+from pneuopt.quantities.keys import Key, Takes
 from pneuopt.quantities.units import read_value, si_conversion
 
 CHANNELS: Mapping[str, str] = {
@@ -25,6 +26,14 @@ CHANNELS: Mapping[str, str] = {
     "position_reference": "m",
 }
 """The channels of a log and their SI units."""
+
+COLUMN_KEYS: Mapping[str, Key] = {
+    "column": Key("the column's name", Takes.TEXT, required=True, example='"U valve"'),
+    "unit": Key("the column's unit; by default as its name says", Takes.TEXT, example='"V"'),
+    "centre": Key("subtracted from the column", unit="{column}", usual=0.0, example='"5 V"'),
+    "scale": Key("what the column is multiplied by, or its inverse", unit="{own}/{column}", example='"35 N/V"'),
+}
+"""The table of a channel: which column it is, and how that is converted."""
 
 MIN_SAMPLES = 10
 """The fewest samples of a log: with fewer its noise level is a guess; a larger bound refuses logs that are enough."""
@@ -137,7 +146,7 @@ def _columns_from_entries(
 
 def _resolve_column(table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str]) -> _Column:
     column = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
-    check_names("key", column, ("column", "unit", "centre", "scale"), where)
+    check_names("key", column, COLUMN_KEYS, where)
     require(isinstance(column.get("column"), str), f'{where}: say which column: {{ column = "U valve" }}', LogError)
     name = column["column"]
     bare, unit = _split_unit(name)

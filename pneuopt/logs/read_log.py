@@ -9,13 +9,12 @@ from typing import Any, Protocol
 from pneuopt.logs.columns import CHANNELS, read_channels
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.readers import read_table
+from pneuopt.logs.sidecar_keys import ACCEPTED_CHECKS, INTERSAMPLE_KEY, SIDECAR_KEYS
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value
-
-ACCEPTED_CHECKS = "accept"  # of a sidecar: the checks that its log need not pass
 
 
 class Plant(Protocol):
@@ -105,8 +104,8 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
         raise LogError(f"{side}: not valid TOML: {error}") from None
     other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
     require(sidecar is not None or "drive" not in sections, other, LogError)
-    check_names("key", sections, (ACCEPTED_CHECKS, "columns", "noise", "conditions", "intersample"), str(side))
-    accept = sections.get(ACCEPTED_CHECKS, [])
+    check_names("key", sections, SIDECAR_KEYS, str(side))
+    accept = sections.get(ACCEPTED_CHECKS, SIDECAR_KEYS[ACCEPTED_CHECKS].usual)
     is_list = isinstance(accept, list) and all(isinstance(name, str) for name in accept)
     require(
         is_list,
@@ -134,7 +133,7 @@ def _read_noise(
 
 def _read_intersample(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, Intersample]:
     check_names("channel", entries, trajectory, where)
-    known = {kind.value: kind for kind in Intersample}
+    known = INTERSAMPLE_KEY.choices or {}
     for channel, word in entries.items():
         require(
             isinstance(word, str) and word in known,
