@@ -9,7 +9,7 @@ leave it there, too; holding it needs no weight for the prior beside that of the
 in the covariance of the others (`Fit.prior_covariance`).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
@@ -59,7 +59,7 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
     try:
-        for start in starts_by_cost(problem, lambda: _has_state_noise(fits[0][1])):
+        for start in starts_by_cost(problem, lambda: _only_needs_confirmation([fit for _, fit, _ in fits])):
             held, fit = fit_holding_unidentifiable(problem, start)
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
             if _explains_to_noise(held, fit) and not held.held:
@@ -99,8 +99,9 @@ def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = la
     ----------
     problem : EstimationProblem
     confirms : callable
-        Called after the first start: whether it led to an optimum that only needs confirmation, as that of a model that
-        does not explain the log. The other starts are then taken as they are; settling all would cost more.
+        Called before each further start: whether the first led to an optimum that only needs confirmation. The next
+        start is then taken as it is, for settling all would cost more; the others are settled where it is not called
+        enough.
 
     Yields
     ------
@@ -113,7 +114,10 @@ def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = la
     """
     candidates = problem.candidates()
     yield candidates[0]
-    guessed = [] if confirms() else [c for c in candidates if c.trial_parameters]
+    while len(candidates) > 1 and confirms():
+        candidates = candidates[1:]
+        yield candidates[0]
+    guessed = [c for c in candidates if c.trial_parameters]
     settled = [_settle_start(problem, c) for c in guessed] if len(guessed) > 1 else []
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
     yield from [c for c in candidates[1:] if not settled or not c.trial_parameters]
@@ -221,9 +225,14 @@ def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
     )
 
 
-def _has_state_noise(fit: Fit) -> bool:
-    """Whether a fit converged with gaps that stand for noise of the states."""
-    return fit.status.converged and fit.jumps is not None
+def _only_needs_confirmation(fits: Sequence[Fit]) -> bool:
+    """Whether the next start is tried as it is, after fits of which the first is the best.
+
+    So is one start where the best fit converged; and each where its gaps stand for noise of the states, for settling
+    with wide gaps says little there.
+    """
+    best = fits[0]
+    return best.status.converged and (len(fits) == 1 or best.jumps is not None)
 
 
 def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
