@@ -23,7 +23,8 @@ from pneuopt.identification.result import ChosenWidth
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.shooting.least_squares import MAX_SEARCH_SUBSTEPS, LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.search import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
 from pneuopt.shooting.transcription import Transcription
 

@@ -1,7 +1,7 @@
 """The lifted least squares at one iterate: data and gap residuals of all segments as normal equations."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
@@ -211,6 +211,32 @@ def weigh_gaps(segments: Segments, slopes: SegmentLinearisation, sigma: Array) -
         arrow = _assemble(segments, slopes, 1 / sigma)
     finite = math.isfinite(squares) and bool(np.isfinite(slopes.grams).all())
     return NormalEquations(segments, slopes, arrow, chi_square, 0.5 * squares if finite else math.inf)
+
+
+def correct_residuals(
+    equations: NormalEquations, nodes: Array, correction: IntegrationCorrection, sigma: Array
+) -> NormalEquations:
+    """The normal equations with other residuals, by finer integration steps, and the sensitivities as they are.
+
+    The gradient by the data stays that of the old residuals, which moves no parameter by more standard deviations than
+    the root of the sum of squares by which they have changed.
+
+    Parameters
+    ----------
+    equations : NormalEquations
+    nodes : ndarray, shape (m, n)
+        Where they are linearised.
+    correction : IntegrationCorrection
+        Of the run without any correction.
+    sigma : ndarray, shape (n,)
+        Standard deviation of a gap, in nominal sizes.
+    """
+    segments, slopes = equations.segments, equations.linearisation
+    squares = np.nansum(((slopes.y + correction.y - segments.measured) * segments.weights) ** 2, axis=1)
+    grams = slopes.grams.copy()
+    grams[:, -1, -1] = squares.sum(axis=1)
+    gaps = segment_gaps(segments, nodes, slopes.x_end + correction.x_end)
+    return weigh_gaps(segments, replace(slopes, grams=grams, squares=squares, gaps=gaps), sigma)
 
 
 def segment_gaps(segments: Segments, nodes: Array, x_end: Array) -> Array:

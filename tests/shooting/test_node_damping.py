@@ -11,9 +11,10 @@ from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.shooting.equations import missed_curvature, normal_equations
-from pneuopt.shooting.least_squares import LeastSquares, _Search
+from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.levenberg_marquardt import Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.search import Search
 from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.transcription import Phase, Residuals, Transcription, regular_nodes
 
@@ -100,13 +101,13 @@ def test_the_missed_curvature_is_that_of_the_nodes_that_overshoot() -> None:
 @pytest.mark.parametrize("is_near", [False, True])
 def test_nodes_are_damped_alone_near_an_optimum_only(is_near: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where gaps stand for noise of the states; before, nodes would be left behind that tighter gaps cannot free."""
-    damped, search = list[bool](), _Search(segment(wrong_squares()), LeastSquares())
+    damped, search = list[bool](), Search(segment(wrong_squares()), LeastSquares())
     search.noisy_gaps = is_near
 
     def descend(*given: Any, damps_nodes: bool) -> Descent:
         damped.append(damps_nodes)
         return Descent(*given, damps_nodes=damps_nodes)
 
-    monkeypatch.setattr("pneuopt.shooting.least_squares.Descent", descend)
-    search._run_stage()
+    monkeypatch.setattr("pneuopt.shooting.search.Descent", descend)
+    search._run_stage(8)
     assert damped == [is_near]

@@ -1,0 +1,389 @@
+"""`Search`: the stages of a lifted least squares, from loose gaps to tight ones, and from coarse steps to fine ones.
+
+A first stage that explains the logs to their noise is followed by the last one at once; the stages between are for
+starts from which that does not soon converge.
+"""
+
+import math
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pneuopt.dynamics.compiled.rollout import RolloutResult
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations, positive_definite_inverse
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, ConvergenceTest, assess_convergence
+from pneuopt.shooting.equations import correct_residuals, weigh_gaps
+from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
+from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, stable_substeps, start_nodes
+from pneuopt.shooting.solution import Fit, Optimum
+
+if TYPE_CHECKING:
+    from pneuopt.shooting.least_squares import LeastSquares, Stage
+
+# promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
+STAGE_COST_TOLERANCE = 1e-3
+# promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
+FINAL_COST_TOLERANCE = 5e-7
+# step of a parameter over the tolerance of convergence [1] at which a stage with noise of the states ends: lower
+# settles states that no parameter depends on, higher leaves the parameters short of their optimum
+STATE_NOISE_TOLERANCE = 0.01
+MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
+# relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
+STALL_COST_DECREASE = 2e-3
+GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
+# relative change of a parameter [1] after which the stiffness is computed anew: higher risks unstable steps
+STIFFNESS_UPDATE_CHANGE = 0.03
+# error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
+# estimates, lower costs a run with sensitivities
+MAX_GRADIENT_ERROR = 0.01
+MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample: a search with more would take hours, fewer refuse stiff models
+# iterations of the last stage right after the first: more are lost where stages between are needed, fewer may not
+# converge
+JUMP_ITERATIONS = 10
+# promised decrease over the cost [1] at which such a first stage ends: lower iterates for what the last one finds
+# anyway, higher jumps from a start that is not near
+JUMP_COST_TOLERANCE = 1e-2
+MAX_STAGE_REFINEMENT = 8  # factor on the start's integration steps in a stage: higher takes long, lower may be unstable
+
+
+class _StageEnd(NamedTuple):
+    """Where a stage ended."""
+
+    nodes: Array
+    z: Array
+    cost: float
+
+
+class _Snapshot(NamedTuple):
+    """Where a search is, and by which integration."""
+
+    stage: "Stage"
+    current: Iterate
+    correction: IntegrationCorrection | None
+    substeps: int
+    output_substeps: int
+
+
+class Search:
+    """The stages of a search for the nodes and the free parameters of the segments of one transcription.
+
+    Parameters
+    ----------
+    segments : Segments
+    method : LeastSquares
+    """
+
+    def __init__(self, segments: Segments, method: "LeastSquares") -> None:
+        self.segments, self.method = segments, method
+        self.scaling = ParameterScaling(segments.transcription)
+        self.gap_scales = gap_scales(segments, method.kinematic)
+        self.iterations, self.stage = 0, method.stages[0]
+        self.correction: IntegrationCorrection | None
+        self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[_StageEnd]()
+        nodes = start_nodes(segments)
+        self.stiffness_parameters = self.scaling.values(self.scaling.start)
+        self.required_substeps = method.substeps or stable_substeps(
+            segments, nodes, self.stiffness_parameters, RK4_MAX_H_LAMBDA
+        )
+        self.substeps = self.start_substeps = method.substeps or min(self.required_substeps, MAX_SEARCH_SUBSTEPS)
+        self.output_substeps, self.correction, self.integration_change = self.substeps, None, math.nan
+        self.current = self._evaluate(nodes, self.scaling.start)
+
+    def solve(self) -> Fit:
+        """Run all stages; an interruption (Ctrl-C) ends them with the best iterate so far, marked."""
+        began = time.perf_counter()
+        try:
+            status = self._run_stages()
+        except KeyboardInterrupt:
+            status = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
+        return self._fit(status, time.perf_counter() - began)
+
+    def _run_stages(self) -> Status:
+        if self._is_too_stiff:
+            verdict = f"the model is so stiff that a sample takes {self.required_substeps} integration steps"
+            remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
+            return Status(Code.NOT_CONVERGED, (verdict, remedy))
+        last, allowed = self.method.stages[-1], None
+        for stage in self.method.stages:
+            if stage is last and self._gaps_absorb_misfit():
+                allowed = self._allow_state_noise()
+                if allowed.converged:
+                    return self._refine_steps(allowed)
+            self._enter_stage(stage, self.current.nodes, self.current.z)
+            if not math.isfinite(self.current.cost):
+                return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
+            self.has_stalled = self._finish_stage(stage.iterations)
+            self.stage_ends.append(_StageEnd(self.current.nodes, self.current.z, self.current.cost))
+            if stage is self.method.stages[0] and (found := self._jump_to_last_stage()):
+                return self._refine_steps(found)
+        status = self._convergence_status(self.current)
+        # gaps that absorb the misfit of the model: the answer depends on their weight
+        gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
+        return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
+
+    def _jump_to_last_stage(self) -> Status | None:
+        """The status of an optimum that the last stage soon reaches after a first that explains the log; or None."""
+        if len(self.method.stages) < 3 or not self._is_noise(self.current.cost):
+            return None
+        before = self._snapshot()
+        self._enter_stage(self.method.stages[-1], self.current.nodes, self.current.z)
+        if math.isfinite(self.current.cost):
+            self._finish_stage(JUMP_ITERATIONS)
+            found = self._convergence_status(self.current)
+            if found.converged and self._is_noise(self.current.cost):
+                return found
+        self._restore(before)
+        return None
+
+    @property
+    def _is_too_stiff(self) -> bool:
+        """Whether a sample of the start takes more integration steps than a search can afford."""
+        return self.required_substeps > self.start_substeps
+
+    def _gaps_absorb_misfit(self) -> bool:
+        """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""
+        absorbing = self.current.equations.gap_share > MAX_GAP_SHARE
+        return self.has_stalled and absorbing and not self._is_noise(self.current.cost)
+
+    def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
+        """Let the gaps stand for noise of the states of a wrong model: the tightest with which all residuals agree."""
+        last = self.method.stages[-1]
+        for stage, end in reversed(list(zip(self.method.stages[:-1], self.stage_ends, strict=False))):
+            if self._is_noise(end.cost):
+                before = self._snapshot()
+                self.noisy_gaps = True
+                self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), end.nodes, end.z)
+                self._finish_stage(last.iterations)
+                found = self._convergence_status(self.current)
+                if found.converged:
+                    return found
+                self._restore(before)
+                self.noisy_gaps = False
+                break
+        return status
+
+    def _snapshot(self) -> _Snapshot:
+        return _Snapshot(self.stage, self.current, self.correction, self.substeps, self.output_substeps)
+
+    def _restore(self, to: _Snapshot) -> None:
+        self.stage, self.current, self.correction, self.substeps, self.output_substeps = to
+
+    def _enter_stage(self, stage: "Stage", nodes: Array, z: Array) -> None:
+        """Weigh the gaps as in a stage, with integration steps from the stiffness at these nodes."""
+        steps, q = self.substeps, self.scaling.values(z)
+        if not self.method.substeps and not np.allclose(q, self.stiffness_parameters, rtol=STIFFNESS_UPDATE_CHANGE):
+            needed, self.stiffness_parameters = stable_substeps(self.segments, nodes, q, RK4_MAX_H_LAMBDA), q
+            steps = min(needed, MAX_STAGE_REFINEMENT * self.start_substeps)  # fewer, too: a bad start may be stiff
+        is_known = steps == self.substeps and self.correction is None and nodes is self.current.nodes
+        self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
+        if is_known:
+            slopes = self.current.equations.linearisation
+            self.current = Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
+        else:
+            self.current = self._evaluate(nodes, z)
+
+    def _apply_finer_steps(self, steps: int) -> float:
+        """Integrate the current iterate by finer steps; return the largest change of y [standard deviations]."""
+        nodes, z, before = self.current.nodes, self.current.z, self._outputs()
+        if self._corrects_residuals:
+            self._correct_residuals(steps)
+        else:
+            self.substeps, self.output_substeps, self.correction = steps, steps, None
+            self.current = self._evaluate(nodes, z)
+        return self._largest_change(self._outputs() - before)
+
+    @property
+    def _corrects_residuals(self) -> bool:
+        """Whether finer steps are for the residuals alone: derivatives need them where these exceed the noise."""
+        return not self.noisy_gaps and self._is_noise(self.current.cost)
+
+    def _correct_residuals(self, steps: int) -> None:
+        """Add what finer steps change to the current residuals; derivatives are computed anew where that is much."""
+        current, before, fine = self.current, self._outputs(), self._run(steps)
+        slopes = current.equations.linearisation
+        self.correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
+        self.output_substeps, sigma = steps, self.stage.gap * self.gap_scales
+        change = np.nansum(((fine.y - before) * self.segments.weights)[np.isfinite(self.segments.measured)] ** 2)
+        if change <= MAX_GRADIENT_ERROR**2:
+            equations = correct_residuals(current.equations, current.nodes, self.correction, sigma)
+            self.current = Iterate(current.nodes, current.z, equations)
+        else:
+            self.current = self._evaluate(current.nodes, current.z)
+
+    def _outputs(self) -> Array:
+        """The model's outputs with the correction of finer steps, shape (m, n, n_outputs)."""
+        y = self.current.equations.linearisation.y
+        return y if self.correction is None else y + self.correction.y
+
+    def _refine_steps(self, status: Status) -> Status:
+        """Halve the integration steps until no estimate moves; steps that the user gave stay."""
+        for _ in range(MAX_STEP_HALVINGS):
+            if not status.converged:
+                break
+            before = self._snapshot()
+            change = self._apply_finer_steps(self.output_substeps if self.method.substeps else 2 * self.output_substeps)
+            if not math.isfinite(self.current.cost):
+                self._restore(before)
+                break
+            if self._convergence_status(self.current).converged:
+                self.integration_change = math.nan if self.method.substeps else change
+                if self.noisy_gaps:
+                    self._run_stage(self.stage.iterations)  # the finer steps have moved its optimum a little
+                break
+            self._run_stage(self.stage.iterations)
+            status = self._convergence_status(self.current)
+        return status
+
+    def _finish_stage(self, iterations: int) -> bool:
+        """Run a stage, then again with the finer steps that it asks for; return as `_run_stage` does.
+
+        Where an iterate explains the log to its noise, the finer steps correct its residuals within the stage.
+        """
+        has_ended = self._run_stage(iterations)
+        if self.stage.refine > 1 and self.correction is None:
+            before = self._snapshot()
+            self._apply_finer_steps(self.stage.refine * self.substeps)
+            if math.isfinite(self.current.cost):
+                return self._run_stage(iterations)
+            self._restore(before)
+        return has_ended
+
+    def _is_noise(self, cost: float) -> bool:
+        """Whether this cost is that of the noise alone."""
+        return 2 * cost <= MAX_CHI_SQUARE_RATIO * self.current.equations.count
+
+    def _run_stage(self, iterations: int) -> bool:
+        """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
+        damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
+        descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
+        for _ in range(iterations):
+            if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
+                self._correct_residuals(self.stage.refine * self.substeps)
+                descent.objective = self._objective()
+            trial = descent.step(self.current)
+            if trial is None:
+                return True
+            self.iterations += 1
+            before, self.current = self.current.cost, trial
+            self._report()
+        return before - self.current.cost < STALL_COST_DECREASE * before
+
+    def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
+        """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction.
+
+        Where the gaps stand for noise of the states, a hundredth of the tolerance in the parameters' directions: the
+        states of such a fit estimate that noise, and settle long after the parameters.
+        """
+        promised = 0.5 * current.equations.arrow.descent_rate(step)
+        if self.noisy_gaps and promised < STAGE_COST_TOLERANCE * current.cost:
+            return self._largest_parameter_step(current, reduced, step) < STATE_NOISE_TOLERANCE * self.method.tolerance
+        if self.stage is self.method.stages[-1]:
+            return promised < FINAL_COST_TOLERANCE * max(1.0, 2 * current.cost / max(1, current.equations.count))
+        is_first = self.stage is self.method.stages[0] and self._is_noise(current.cost)
+        return (
+            not self.noisy_gaps
+            and promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
+        )
+
+    def _largest_parameter_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> float:
+        """The largest step of a parameter in its standard deviations; infinite where the data do not determine all."""
+        keep = self.scaling.movable(current.z, current.equations, reduced)
+        if current.equations.unidentifiable_parameters(reduced, keep).size:
+            return math.inf
+        spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
+        return float(np.max(np.abs(step.parameters[keep]) / spread, initial=0.0))
+
+    def _objective(self) -> Objective:
+        sigma = self.stage.gap * self.gap_scales
+        return Objective(self.segments, self.scaling, sigma, self.substeps, self.correction)
+
+    def _evaluate(self, nodes: Array, z: Array) -> Iterate:
+        return self._objective().evaluate(nodes, z)
+
+    def _convergence_status(self, current: Iterate) -> Status:
+        return self._assess(current).status
+
+    def _assess(self, current: Iterate) -> ConvergenceTest:
+        message, tolerance = f"{self.iterations} iterations", self.method.tolerance
+        return assess_convergence(
+            current.equations, self.scaling, current.z, tolerance, message, noisy_gaps=self.noisy_gaps
+        )
+
+    def _fit(self, status: Status, seconds: float) -> Fit:
+        transcription, current, equations = self.segments.transcription, self.current, self.current.equations
+        q = self.scaling.values(current.z)
+        free = transcription.parameters.free_names
+        values = dict(zip(free, q[transcription.free].tolist(), strict=True))
+        is_run = self.correction is not None and math.isfinite(self.integration_change)  # at these very nodes
+        run = self.correction.fine_run if is_run and self.correction else self._run(self.output_substeps)
+        stats = {
+            "iterations": float(self.iterations),
+            "seconds": seconds,
+            "cost": equations.cost,
+            "substeps": float(self.output_substeps),
+            "largest_gap": equations.largest_gap,
+            "gap_share": equations.gap_share,
+            "gap_deviation": self.stage.gap,
+            "integration_error": self._integration_error(run),
+        }
+        at_bound, held = self.scaling.at_bound(current.z) & ~self.scaling.held, self.scaling.held
+        keep = self.scaling.has_effect(equations) & ~at_bound & ~held
+        covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
+        if math.isfinite(equations.cost):
+            covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
+            prior = equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
+            names = self._doubtful_parameters()
+        if covariance is not None:
+            gaps = self.stage.gap * self.gap_scales
+            optimum = Optimum(equations, run, current.nodes, q, keep, gaps, self.substeps)
+        return Fit(
+            self.segments.trajectories(run),
+            transcription.parameters.with_values(values),
+            status,
+            stats,
+            covariance,
+            equations.chi_square,
+            equations.count,
+            at_bound,
+            equations.gaps[self.segments.linked] if self.noisy_gaps else None,
+            *names,
+            prior,
+            optimum=optimum,
+        )
+
+    def _doubtful_parameters(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
+        if self._is_too_stiff:
+            return (), ()
+        free, found = self.segments.transcription.parameters.free_names, self._assess(self.current)
+        return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
+
+    def _integration_error(self, run: RolloutResult) -> float:
+        """Largest change of an output when the steps are halved [noise standard deviations]."""
+        return (
+            self.integration_change
+            if math.isfinite(self.integration_change)
+            else self._largest_change(self._run(2 * self.output_substeps).y - run.y)
+        )
+
+    def _largest_change(self, change: Array) -> float:
+        weighted = np.abs(change) * self.segments.weights
+        return float(np.max(weighted, where=np.isfinite(self.segments.measured), initial=0.0))
+
+    def _run(self, steps: int) -> RolloutResult:
+        return self.segments.run(self.current.nodes, self.scaling.values(self.current.z), steps, states=True)
+
+    def _report(self) -> None:
+        if self.method.progress is not None:
+            current, gap = self.current, self.current.equations.largest_gap
+            stages = self.method.stages
+            number = "loosened" if self.noisy_gaps else f"stage {stages.index(self.stage) + 1}/{len(stages)}"
+            self.method.progress(
+                f"{number}  iteration {self.iterations}  cost {current.cost:.6g}  largest gap {gap:.1e}"
+            )

@@ -1,0 +1,76 @@
+"""The shortcuts of a search: the last stage right after the first, and finer integration steps without derivatives."""
+
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pneuopt.shooting.equations import correct_residuals, normal_equations
+from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
+from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.search import Search
+from pneuopt.shooting.segments import IntegrationCorrection, segment, start_nodes
+from pneuopt.shooting.solution import Fit
+from tests.shooting.test_least_squares import two_logs
+
+FIRST, *OTHERS = LeastSquares().stages
+
+
+def fit_by_stages(method: LeastSquares) -> tuple[Fit, list[str]]:
+    """The fit of the two logs, and the number of the stage of each iteration."""
+    lines: list[str] = []
+    fit = solve_least_squares(two_logs(), replace(method, progress=lines.append))
+    return fit, [line.split()[1] for line in lines]
+
+
+def test_a_first_stage_that_explains_the_logs_is_followed_by_the_last() -> None:
+    short, stages = fit_by_stages(LeastSquares())
+    assert set(stages) == {"1/6", "6/6"}
+    # a first stage that ends before it explains the logs is followed by all others
+    long, all_stages = fit_by_stages(LeastSquares(stages=(replace(FIRST, iterations=1), *OTHERS)))
+    assert set(all_stages) > {"1/6", "2/6", "6/6"}
+    assert short.covariance is not None
+    deviations = np.sqrt(np.diag(short.covariance))
+    moved = [short.parameters.value(n) - long.parameters.value(n) for n in short.parameters.free_names]
+    assert (np.abs(moved) < 1e-3 * deviations).all()
+
+
+def test_a_last_stage_that_does_not_soon_converge_is_left_for_the_stages_between(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("pneuopt.shooting.search.JUMP_ITERATIONS", 1)
+    fit, stages = fit_by_stages(LeastSquares())
+    assert stages.index("6/6") < stages.index("2/6")
+    assert fit.status.converged
+    assert fit.stats["gap_deviation"] == OTHERS[-1].gap
+
+
+def test_corrected_residuals_have_the_cost_of_a_run_with_the_correction() -> None:
+    segments, gaps = segment(two_logs()), np.array([1e-3, 1e-3])
+    scaling, nodes = ParameterScaling(segments.transcription), start_nodes(segments)
+    z = scaling.start
+    given = segments, nodes, scaling.values(z), scaling.chain(z), gaps, 2
+    plain = normal_equations(*given)
+    change = np.random.default_rng(0).normal(0.0, 1e-3, plain.linearisation.y.shape)
+    fine = segments.run(nodes, scaling.values(z), 4)
+    correction = IntegrationCorrection(change, fine.x_end - plain.linearisation.x_end, fine)
+    cheap, whole = correct_residuals(plain, nodes, correction, gaps), normal_equations(*given, correction)
+    assert cheap.cost == pytest.approx(whole.cost, rel=1e-12)
+    assert cheap.cost != pytest.approx(plain.cost, rel=1e-6)
+    assert_allclose(cheap.gaps, whole.gaps, rtol=1e-12)
+    assert cheap.chi_square == pytest.approx(whole.chi_square, rel=1e-12)
+
+
+@pytest.mark.parametrize(("limit", "runs"), [(1e9, 0), (0.0, 1)])
+def test_derivatives_are_computed_anew_only_where_finer_steps_change_much(
+    limit: float, runs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = Search(segment(two_logs()), LeastSquares())
+    evaluate = Mock(wraps=search._evaluate)
+    monkeypatch.setattr("pneuopt.shooting.search.MAX_GRADIENT_ERROR", limit)
+    monkeypatch.setattr(search, "_evaluate", evaluate)
+    search._correct_residuals(4)
+    assert evaluate.call_count == runs
+    assert search.output_substeps == 4
