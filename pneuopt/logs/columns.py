@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,21 +37,29 @@ COLUMN_KEYS: Mapping[str, Key] = {
 
 MIN_SAMPLES = 10
 """The fewest samples of a log: with fewer its noise level is a guess; a larger bound refuses logs that are enough."""
+MAX_MAGNITUDE = 1e30
+"""Magnitude of a sample in the file's unit [1]: more is the 9.91e37 by which instruments say overload; a smaller bound
+refuses counts."""
+MAX_ROWS_SHOWN = 20
+"""Rows that a message lists [1]: more fill the screen, fewer leave repeated stamps to be found one a run."""
+MAX_NAME_PARTS = 8
+"""Words of a column's name that are compared with channels [1]: each costs a search; no channel has more than three."""
 
 _SYNONYMS = {"t": "time", "velocity": "speed", "displacement": "position", "voltage": "valve_voltage"}
 _BRACKETED_UNIT = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")
 
 
 def read_channels(
-    table: Table, entries: Mapping[str, Any] | None, where: str, channels: Mapping[str, str] = CHANNELS
-) -> dict[str, Array]:
+    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str] = CHANNELS
+) -> tuple[dict[str, Array], tuple[str, ...]]:
     """Read the channels of a log from its columns.
 
     Parameters
     ----------
     table : Table
-    entries : mapping, optional
-        Channel to column, as in a sidecar's [columns]; None: the columns' names say it.
+    entries : mapping
+        Channel to column, as in a sidecar's [columns]; false leaves a channel out. The other columns' names say what
+        they are.
     where : str
         Where the entries come from, for messages.
     channels : mapping of str to str
@@ -59,25 +67,34 @@ def read_channels(
 
     Returns
     -------
-    dict of str to ndarray, each of shape (n,)
+    values : dict of str to ndarray, each of shape (n,)
         In SI units, "time" among them, strictly increasing; NaN where a sample is missing.
+    remarks : tuple of str
+        What the table says of itself, and the columns that are not read although their names nearly are channels.
 
     Raises
     ------
     LogError, UnitError, UnknownNameError
         If the log cannot be understood beyond doubt.
     """
-    if entries is None:
-        found = _columns_from_names(table, channels)
-    else:
-        found = _columns_from_entries(table, entries, where, channels)
+    check_names("channel", entries, channels, where)
+    found = {
+        name: _resolve_column(table, name, entry, f"{where}.{name}", channels)
+        for name, entry in entries.items()
+        if entry is not False
+    }
+    remarks = list(table.remarks)
+    found |= _columns_from_names(table, channels, entries, {column.name for column in found.values()}, remarks)
+    if "time" not in found and len(table.stamps) == 1:
+        found["time"] = _Column(next(iter(table.stamps)), 1.0, 0.0)
+        remarks.append(f"the time stamps of column {found['time'].name!r} are read as the time")
     require("time" in found, f'{table.path}: no time; name a column "time [s]", or say which in a sidecar', LogError)
     require(len(found) > 1, f"{table.path}: no channel but time; known: {', '.join(channels)}", LogError)
     numbers = table.read([column.name for column in found.values()])
     _check_finite(table, numbers)
     values = {channel: c.factor * numbers[c.name] + c.offset for channel, c in found.items()}
     _check_samples(table, found, values)
-    return values
+    return values, tuple(remarks)
 
 
 class _Column(NamedTuple):
@@ -88,21 +105,32 @@ class _Column(NamedTuple):
     offset: float
 
 
-def _columns_from_names(table: Table, channels: Mapping[str, str]) -> dict[str, _Column]:
-    """Columns whose name is a channel and its unit; a name that nearly is a channel is an error."""
+def _columns_from_names(
+    table: Table, channels: Mapping[str, str], entries: Mapping[str, Any], used: Collection[str], remarks: list[str]
+) -> dict[str, _Column]:
+    """Columns whose name is a channel and its unit; a name that nearly is a channel is an error.
+
+    Beside entries, which name the columns that count, it is a remark.
+    """
     found: dict[str, _Column] = {}
-    for name in filter(None, table.names):
-        channel, unit = _split_channel(name, channels)
-        if not channel:
-            _check_misspelling(table, name, channels)
+    for name in table.names:
+        channel, _ = _split_channel(name, channels)
+        if not name or name in used or channel in entries:
             continue
-        where = f"{table.path}: column {name!r}"
-        require(channel not in found, f"{where}: {channel!r} has another column; name one in a sidecar", LogError)
-        entry = {"column": name, "unit": unit} if unit else name
         try:
-            found[channel] = _resolve_column(table, channel, entry, where, channels)
-        except UnitError as error:
-            raise UnitError(f"{error} (or list the columns to use in a sidecar)") from None
+            if not channel:
+                _check_misspelling(table, name, channels)
+                continue
+            where = f"{table.path}: column {name!r}"
+            column = _resolve_column(table, channel, name, where, channels)
+        except (LogError, UnitError) as error:
+            if not entries:
+                remedy = "" if isinstance(error, LogError) else " (or list the columns to use in a sidecar)"
+                raise type(error)(f"{error}{remedy}") from None
+            remarks.append(f"{str(error).removeprefix(f'{table.path}: ')}; it is not read")
+            continue
+        require(channel not in found, f"{where}: {channel!r} has another column; name one in a sidecar", LogError)
+        found[channel] = column
     return found
 
 
@@ -125,7 +153,9 @@ def _split_unit(name: str) -> tuple[str, str]:
 
 def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> None:
     bare, unit = _split_unit(name)
-    parts = bare.casefold().replace(" ", "_").split("_")
+    if name in table.stamps:
+        return
+    parts = bare.casefold().replace(" ", "_").split("_")[:MAX_NAME_PARTS]
     for n in range(len(parts), 0 if not unit else len(parts) - 1, -1):
         head = "_".join(parts[:n])
         near = difflib.get_close_matches(head, channels, n=1, cutoff=0.85) or [_SYNONYMS.get(head, "")]
@@ -135,13 +165,6 @@ def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> 
             "or list the columns to use in a sidecar",
             LogError,
         )
-
-
-def _columns_from_entries(
-    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str]
-) -> dict[str, _Column]:
-    check_names("channel", entries, channels, where)
-    return {name: _resolve_column(table, name, entry, f"{where}.{name}", channels) for name, entry in entries.items()}
 
 
 def _resolve_column(table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str]) -> _Column:
@@ -154,11 +177,20 @@ def _resolve_column(table: Table, channel: str, entry: Any, where: str, channels
         name = bare
     if name not in table.names:
         raise UnknownNameError("column", column["column"], filter(None, table.names), where)
-    unit = str(column.get("unit") or unit or _split_channel(name, channels)[1])
+    if name in table.stamps:
+        return _stamp_column(name, channel, column, where)
+    unit = str(column.get("unit") or unit or table.units.get(name) or _split_channel(name, channels)[1])
     require(bool(unit), f'{where}: no unit; write "{bare} [{channels[channel]}]", or unit = "..."', UnitError)
     raw_centre = read_value(column["centre"], unit, where=f"{where}.centre") if "centre" in column else 0.0
     factor, offset = _column_scaling(unit, column.get("scale"), channels[channel], where)
     return _Column(name, factor, offset - factor * raw_centre)
+
+
+def _stamp_column(name: str, channel: str, entry: Mapping[str, Any], where: str) -> _Column:
+    require(channel == "time", f"{where}: column {name!r} holds time stamps, no numbers; name another", LogError)
+    remedy = f"{where}: its time stamps are read in seconds; leave out unit, centre and scale"
+    require(entry.keys() == {"column"}, remedy, LogError)
+    return _Column(name, 1.0, 0.0)
 
 
 def _column_scaling(unit: str, scale: str | float | None, target: str, where: str) -> tuple[float, float]:
@@ -191,13 +223,14 @@ def _read_gain(scale: str, unit: str, target: str, where: str) -> float:
 
 
 def _check_finite(table: Table, numbers: Mapping[str, Array]) -> None:
-    """Refuse an infinite sample; NaN stands for a missing one."""
+    """Refuse an infinite sample, and one that no sensor gives; NaN stands for a missing one."""
     for name, column in numbers.items():
-        infinite = np.isinf(column)
-        if infinite.any():
-            row = int(np.argmax(infinite))
+        wrong = np.abs(column) > MAX_MAGNITUDE
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            what = "is not a number" if np.isinf(column[row]) else "is no measured value"
             raise LogError(
-                f"{table.path}: row {row + table.first_row}, column {name!r}: {column[row]} is not a number; "
+                f"{table.path}: row {row + table.first_row}, column {name!r}: {column[row]:.6g} {what}; "
                 "leave the cell empty if the sample is missing"
             )
 
@@ -218,12 +251,29 @@ def _check_samples(table: Table, found: Mapping[str, _Column], values: Mapping[s
             require(
                 not missing.any(), f"{table.path}: row {row}, {where}: the time is missing; delete the row", LogError
             )
-    late = np.flatnonzero(np.diff(t) <= 0)
-    if late.size:
-        before, after = t[late[0]], t[late[0] + 1]
-        kind = "repeats" if after == before else "runs backwards"
-        row = int(late[0]) + 1 + table.first_row
-        raise LogError(
-            f"{table.path}: row {row}: time {kind} ({before:.9g} s, then {after:.9g} s); "
-            "delete the row, or cut the log there"
-        )
+    _check_order(table, t)
+
+
+def _check_order(table: Table, t: Array) -> None:
+    """Refuse a time that does not increase, and name all rows where it does not."""
+    steps = np.diff(t)
+    if (steps > 0).all():
+        return
+    parts = []
+    for kind, late in (("repeats", np.flatnonzero(steps == 0)), ("runs backwards", np.flatnonzero(steps < 0))):
+        if late.size:
+            before, after = t[late[0]], t[late[0] + 1]
+            rows = _list_rows((late + 1 + table.first_row).tolist())
+            parts.append(f"{rows}: time {kind} ({before:.9g} s, then {after:.9g} s)")
+    coarse = 2 * np.count_nonzero(steps == 0) > steps.size
+    remedy = "delete the row, or cut the log there"
+    if coarse:
+        remedy = "the time is too coarse for the samples; export it with more digits"
+    raise LogError(f"{table.path}: {'; '.join(parts)}; {remedy}")
+
+
+def _list_rows(rows: Sequence[int]) -> str:
+    """As in "row 14" or "rows 14, 20, ... (57 in all)"."""
+    shown = ", ".join(str(row) for row in rows[:MAX_ROWS_SHOWN])
+    more = f", ... ({len(rows)} in all)" if len(rows) > MAX_ROWS_SHOWN else ""
+    return f"row {shown}" if len(rows) == 1 else f"rows {shown}{more}"

@@ -40,6 +40,8 @@ class Experiment:
     holes : tuple of (int, int)
         Ranges of samples without inputs, empty ones between two rows far apart: the state behind a hole does not follow
         from the state before it. `identify` finds them.
+    remarks : tuple of str
+        What its reader did that the user may want to know, a sentence each: rows that are skipped as metadata, say.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class Experiment:
     intersample: Mapping[str, Intersample] = field(default_factory=dict)
     holes: tuple[tuple[int, int], ...] = ()
     accept: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         where = self.name or "experiment"

@@ -1,5 +1,6 @@
 """Reader of MATLAB's .mat logs, versions 4 to 7: one vector a channel, or a structure of vectors."""
 
+import io
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,12 +16,14 @@ _STRUCTURE_REMEDY = "in MATLAB, save('run.mat', '-struct', 'S') with S a structu
 _STRUCTURE_REMEDY += "S = table2struct(T, 'ToScalar', true)"
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, raw: bytes) -> Table:
     """Read a .mat file.
 
     Parameters
     ----------
     path : Path
+        For messages.
+    raw : bytes
         Its vectors of real numbers are columns, and so are those in its structures, by the name of their field; NaN is
         a missing sample. Whatever else the file holds is left alone.
 
@@ -34,16 +37,17 @@ def read_table(path: Path) -> Table:
     LogError
         If the file is not a .mat file of these versions, or holds no vector.
     """
-    columns = [(name, value) for name, value in _flatten(_load(path)) if _is_vector(value)]
+    columns = [(name, value) for name, value in _flatten(_load(path, raw)) if _is_vector(value)]
     require(bool(columns), f"{path}: no vector of numbers; {_STRUCTURE_REMEDY}", LogError)
     return Table(path, [name for name, _ in columns], 1, partial(_read_columns, path, dict(columns)))
 
 
-def _load(path: Path) -> Mapping[str, Any]:
+def _load(path: Path, raw: bytes) -> Mapping[str, Any]:
     from scipy.io import loadmat
 
     try:
-        return loadmat(path, squeeze_me=True)
+        file: Any = io.BytesIO(raw)  # which the types do not know
+        return loadmat(file, squeeze_me=True)
     except NotImplementedError:
         remedy = "in MATLAB, save it with the option '-v7'"
         raise LogError(f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}") from None

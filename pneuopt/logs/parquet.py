@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, raw: bytes) -> Table:
     """Read a Parquet file.
 
     Parameters
     ----------
     path : Path
+        For messages.
+    raw : bytes
         Its columns that are used hold integers, floats or decimals; a null or NaN is a missing sample.
 
     Returns
@@ -35,27 +37,27 @@ def read_table(path: Path) -> Table:
     InputError
         If pyarrow is not installed.
     """
-    with _parquet_file(path) as file:
-        return Table(path, file.schema_arrow.names, 1, partial(_read_columns, path))
+    with _parquet_file(path, raw) as file:
+        return Table(path, file.schema_arrow.names, 1, partial(_read_columns, path, raw))
 
 
 @contextmanager
-def _parquet_file(path: Path) -> "Iterator[pq.ParquetFile]":
+def _parquet_file(path: Path, raw: bytes) -> "Iterator[pq.ParquetFile]":
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
         raise InputError(f"{path}: Parquet needs pyarrow; run: pip install 'pneuopt[logs]'") from None
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(pa.BufferReader(raw)) as file:
             yield file
     except (pa.ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise LogError(f"{path}: cannot be read as Parquet ({reason}); export the log again") from None
 
 
-def _read_columns(path: Path, names: Sequence[str]) -> dict[str, Array]:
-    with _parquet_file(path) as file:
+def _read_columns(path: Path, raw: bytes, names: Sequence[str]) -> dict[str, Array]:
+    with _parquet_file(path, raw) as file:
         places = [file.schema_arrow.names.index(name) for name in names]
         columns = file.read()
     return {name: _floats(path, name, columns.column(i)) for name, i in zip(names, places, strict=True)}

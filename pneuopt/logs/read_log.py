@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
+from pneuopt.logs.budget import MAX_NESTING, MAX_SIDECAR_BYTES, read_bytes
 from pneuopt.logs.columns import CHANNELS, read_channels
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.readers import read_table
@@ -34,7 +37,7 @@ class Plant(Protocol):
 def read_log(
     path: str | Path,
     *,
-    columns: Mapping[str, str | Mapping[str, str | float]] | None = None,
+    columns: Mapping[str, str | bool | Mapping[str, str | float]] | None = None,
     sidecar: str | Path | None = None,
     plant: Plant | None = None,
     ambient_pressure: float = ATMOSPHERE,
@@ -44,13 +47,15 @@ def read_log(
     Parameters
     ----------
     path : str or Path
-        Its suffix says the format: text (.csv, .txt, .tsv, .dat), .parquet or .mat (up to version 7). In a text, the
-        first row names the columns; a comma, semicolon or tab separates them; the decimal mark is a point or a comma;
-        an empty cell is a missing sample.
+        Its suffix says the format: text (.csv, .txt, .tsv, .dat), .parquet or .mat (up to version 7). In a text, a
+        comma, semicolon, tab or white space separates the columns; the decimal mark is a point or a comma; an empty
+        cell or NaN is a missing sample; rows above the one that names the columns are metadata, and one below it may
+        hold their units. The time may be stamps (ISO 8601, 12.03.2026 10:00:00,5, a time of day), which count from
+        the first.
     columns : mapping, optional
         Channel to column, in place of the sidecar's [columns]: "t [ms]", or a mapping with `column`, `unit`,
-        `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied, or an encoder's "8192 count/rev"). Without
-        either, the header has to say "position [mm]" or "position_mm".
+        `centre` ("5 V", subtracted) and `scale` ("35 N/V", multiplied, or an encoder's "8192 count/rev"); False leaves
+        a channel out. The other columns are read where their names say "position [mm]" or "position_mm".
     sidecar : str or Path, optional
         TOML with [columns], [noise], [conditions], [intersample] (force = "held", or "linear"); by default the file of
         the same name, if there is one. Before them, accept = ["work"] names checks that the log need not pass.
@@ -70,38 +75,28 @@ def read_log(
         If anything in the files is missing, ambiguous or not a number; the message names file, row, column, remedy.
     """
     path = Path(path)
-    sha256 = hashlib.sha256(_read_bytes(path)).hexdigest()
+    raw = read_bytes(path)
+    sha256 = hashlib.sha256(raw).hexdigest()
     side, sections = _read_sidecar(path, sidecar)
-    entries, where = (columns, "columns") if columns is not None else (sections.get("columns"), f"{side}: columns")
+    entries, where = (columns, "columns") if columns is not None else (sections.get("columns", {}), f"{side}: columns")
     units = {} if plant is None else _plant_channels(plant)
     channels = {**CHANNELS, **units}
     with count_gauge_from(ambient_pressure):
-        values = read_channels(read_table(path), entries, where, channels)
+        values, remarks = read_channels(read_table(path, raw), entries, where, channels)
         conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
     trajectory = Trajectory(values.pop("time"), values)
     noise = _read_noise(sections.get("noise", {}), trajectory, f"{side}: noise", channels)
     own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
     between = _read_intersample(sections.get("intersample", {}), trajectory, f"{side}: intersample")
     accept = tuple(sections.get(ACCEPTED_CHECKS, ()))
-    return Experiment(trajectory, noise, conditions, path.stem, sha256, own, between, accept=accept)
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
+    return Experiment(trajectory, noise, conditions, path.stem, sha256, own, between, accept=accept, remarks=remarks)
 
 
 def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping[str, Any]]:
     side = path.with_suffix(".toml") if sidecar is None else Path(sidecar)
     if sidecar is None and not side.exists():
         return side, {}
-    raw = _read_bytes(side)
-    try:
-        sections = tomllib.loads(raw.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise LogError(f"{side}: not valid TOML: {error}") from None
+    sections = _parse_toml(side, read_bytes(side, MAX_SIDECAR_BYTES))
     other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
     require(sidecar is not None or "drive" not in sections, other, LogError)
     check_names("key", sections, SIDECAR_KEYS, str(side))
@@ -115,6 +110,16 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
     for key, section in ((key, section) for key, section in sections.items() if key != ACCEPTED_CHECKS):
         require(isinstance(section, dict), f"{side}: {key} must be a section, [{key}]", LogError)
     return side, sections
+
+
+def _parse_toml(path: Path, raw: bytes) -> dict[str, Any]:
+    brackets = np.frombuffer(raw, np.uint8)
+    depth = np.cumsum(np.isin(brackets, list(b"[{")).astype(int) - np.isin(brackets, list(b"]}")))
+    require(depth.max(initial=0) <= MAX_NESTING, f"{path}: too many brackets in brackets; a sidecar has 2", LogError)
+    try:
+        return tomllib.loads(raw.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # of which TOMLDecodeError and UnicodeDecodeError are
+        raise LogError(f"{path}: not valid TOML: {error}") from None
 
 
 def _plant_channels(plant: Plant) -> dict[str, str]:

@@ -7,7 +7,7 @@ from pneuopt.logs import csv, mat, parquet
 from pneuopt.logs.table import Table
 from pneuopt.quantities.errors import LogError, require
 
-READERS: Mapping[str, Callable[[Path], Table]] = {
+READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
     ".csv": csv.read_table,
     ".txt": csv.read_table,
     ".tsv": csv.read_table,
@@ -18,13 +18,15 @@ READERS: Mapping[str, Callable[[Path], Table]] = {
 """The suffix of a file, in lower case, to the function that reads it."""
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, raw: bytes) -> Table:
     """Read a log's columns with the reader of its suffix.
 
     Parameters
     ----------
     path : Path
-        Of a file that can be read.
+        Its suffix says the format.
+    raw : bytes
+        What the file holds.
 
     Returns
     -------
@@ -38,4 +40,4 @@ def read_table(path: Path) -> Table:
     suffix = path.suffix.lower()
     shown = f"{suffix!r} files" if suffix else "a name without suffix"
     require(suffix in READERS, f"{path}: no reader for {shown}; known: {', '.join(READERS)}", LogError)
-    return READERS[suffix](path)
+    return READERS[suffix](path, raw)

@@ -1,9 +1,11 @@
 """`Table`: a log as its file has it: named columns of numbers that have no meaning yet."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from pneuopt.logs.budget import MAX_COLUMNS, MAX_NAME
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 
@@ -14,7 +16,7 @@ class Table:
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         For messages.
     names : sequence of str
         The columns in the file's order; "" for a column without a name.
@@ -24,19 +26,33 @@ class Table:
         Takes names, and returns these columns as floats, each of shape (n,), NaN where a sample is missing. Nothing
         else is parsed, because other columns may hold anything. It raises a `LogError` that names the row and column of
         the first cell that is not a number.
+    units : mapping of str to str
+        Units that the file states apart from the names, by column: in a row of units, or as a property.
+    stamps : frozenset of str
+        The columns of time stamps, which `read` gives in seconds from the first.
+    remarks : tuple of str
+        What the reader did that the user may want to know, a sentence each: rows that are no samples, say.
 
     Raises
     ------
     LogError
-        If two columns have the same name.
+        If two columns have the same name, or there are more columns, or longer names, than a log has.
     """
 
-    path: Path
+    path: Path | str
     names: Sequence[str]
     first_row: int
     read: Callable[[Sequence[str]], Mapping[str, Array]]
+    units: Mapping[str, str] = field(default_factory=dict)
+    stamps: frozenset[str] = frozenset()
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in filter(None, self.names):
-            once = list(self.names).count(name) == 1
-            require(once, f"{self.path}: two columns are named {name!r}; rename one", LogError)
+        n = len(self.names)
+        require(
+            n <= MAX_COLUMNS, f"{self.path}: {n} columns are more than {MAX_COLUMNS}; export fewer channels", LogError
+        )
+        for name, uses in Counter(filter(None, self.names)).items():
+            require(uses == 1, f"{self.path}: two columns are named {name[:MAX_NAME]!r}; rename one", LogError)
+            text = f"{self.path}: the name of column {name[:20]!r}... has {len(name)} characters; shorten it"
+            require(len(name) <= MAX_NAME, text, LogError)

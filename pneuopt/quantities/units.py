@@ -16,66 +16,18 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from pneuopt.quantities.errors import UnitError, require
+from pneuopt.quantities.vocabulary import COMMON_UNITS, UNIT_DEFINITIONS
 
 ATMOSPHERE = 101325.0
 """Standard atmosphere [Pa] (ISO 2533), which gauge pressures count from unless `count_gauge_from` says otherwise."""
 
-# The whole vocabulary; a short one of our own keeps surprises out ("Ns" as "newtons", "pt" as a pint) and loads fast.
-_UNIT_DEFINITIONS = """
-nano- = 1e-9 = n-
-micro- = 1e-6 = µ- = μ- = u-
-milli- = 1e-3 = m-
-centi- = 1e-2 = c-
-deci- = 1e-1 = d-
-hecto- = 1e2 = h-
-kilo- = 1e3 = k-
-mega- = 1e6 = M-
-giga- = 1e9 = G-
-meter = [length] = m = metre
-kilogram = [mass] = kg
-second = [time] = s = sec
-ampere = [current] = A = amp
-kelvin = [temperature] = K
-radian = [angle] = rad
-cycle = [cycle]
-percent = 0.01 = %
-permille = 0.001 = ‰
-ppm = 1e-6
-count = 1 = cnt
-gram = 1e-3 kilogram = g
-tonne = 1000 kilogram = t
-pound = 0.45359237 kilogram = lb
-minute = 60 second = min
-hour = 3600 second = h
-inch = 0.0254 meter = in
-foot = 0.3048 meter = ft
-degree_Celsius = kelvin; offset: 273.15 = °C = degC = celsius
-degree = 0.017453292519943295769 radian = deg = °
-revolution = 6.283185307179586477 radian = rev
-rpm = revolution / minute
-hertz = cycle / second = Hz
-newton = kilogram * meter / second ** 2 = N
-kilogram_force = 9.80665 newton = kgf = kp
-pound_force = 4.4482216152605 newton = lbf
-pascal = newton / meter ** 2 = Pa
-bar = 1e5 pascal
-psi = 6894.757293168361 pascal
-standard_atmosphere = 101325 pascal = atm
-joule = newton * meter = J
-watt = joule / second = W
-volt = watt / ampere = V
-coulomb = ampere * second = C
-ohm = volt / ampere = Ω
-liter = 1e-3 meter ** 3 = l = L = litre
-newton_meter = newton * meter = Nm
-newton_second = newton * second = Ns
-volt_second = volt * second = Vs
-"""
-_COMMON_UNITS = """
-m mm um cm km in s ms us min h kg g t N kN Nm V mV A mA K degC Hz kHz rad deg rad/s rpm m/s mm/s m/s^2 m^2 m^3 mm^2
-cm^2 cm^3 l N*s/m V*s/m 1/s m^3/(s*Pa) % count kg*m^2 N*m rev N*m*s/rad newton volt meter Pa kPa MPa bar mbar psi
-Pa(a) Pa(g) kPa(a) kPa(g) MPa(a) MPa(g) bar(a) bar(g) mbar(a) mbar(g) psi(a) psi(g)
-"""
+MAX_UNIT_LENGTH = 80
+"""Length of a unit's text [character]: a longer one takes seconds; a shorter bound refuses gains in base units."""
+MAX_UNIT_POWER = 144
+"""Product of the powers in a unit's text [1]: a higher one takes minutes and gigabytes; no unit of a drive has 20."""
+MAX_NUMBER_LENGTH = 64
+"""Length of a number [character]: Python refuses to convert the 4300 digits that are no slip of the finger."""
+
 _SYMBOLS = {"℃": "degC", "°C": "degC", "°": "deg"}  # which pint takes for no part of a name
 _gauge_zero: ContextVar[float] = ContextVar("gauge_zero", default=ATMOSPHERE)
 _NUMBER_WITH_UNIT = re.compile(
@@ -125,7 +77,7 @@ def read_value(text: str | float, unit: str, *, where: str = "") -> float:
         require(free, f'{_place_prefix(where)}{text!r} has no unit; write "{number} {_example_unit(unit)}"', UnitError)
         unit_text = "1"
     factor, offset = _exact_conversion(unit_text, unit, where)
-    value = _convert(number, factor, offset)
+    value = _convert(number, factor, offset, where)
     _check_vacuum(value, _split_level(unit)[1], text, where)
     _check_absolute_zero(value, unit_text, text, where)
     return value
@@ -220,6 +172,23 @@ def read_unit(text: str | float, unit: str) -> str:
     return _split_number(text, "")[1] or unit
 
 
+def is_unit(text: str) -> bool:
+    """Whether a text is a unit that `read_value` knows, a pressure's level among them.
+
+    Examples
+    --------
+    >>> is_unit("mm"), is_unit("bar(g)"), is_unit("valve"), is_unit("1")
+    (True, True, False, False)
+    """
+    if not re.search(r"[^\W\d_]|[%‰°]", text):
+        return False
+    try:
+        _parse_unit(_split_level(text.strip())[0])
+    except UnitError:
+        return False
+    return True
+
+
 def write_value(value: float, unit: str, digits: int = 6) -> str:
     """Write an SI number with a unit that reads well; `read_value` reads it back to the digits given.
 
@@ -261,8 +230,10 @@ def _split_number(text: str | float, where: str) -> tuple[str, str]:
     shown = text if isinstance(text, str) else repr(text)
     match = _NUMBER_WITH_UNIT.fullmatch(shown)
     if match is None or isinstance(text, bool):
-        raise UnitError(f'{_place_prefix(where)}{text!r} is not a number with a unit; write for instance "32 mm"')
+        raise UnitError(f'{_place_prefix(where)}{shown[:60]!r} is not a number with a unit; write for instance "32 mm"')
     number, unit = match.groups()
+    text_is_short = len(number) <= MAX_NUMBER_LENGTH
+    require(text_is_short, f"{_place_prefix(where)}a number of {len(number)} characters; round it", UnitError)
     comma = re.fullmatch(r",(\d+)\s*([^\d.,]*)", unit)
     if comma and "." not in number:
         mended = f"{number}.{comma[1]} {comma[2]}".strip()
@@ -295,8 +266,11 @@ def _exact_conversion(unit_text: str, unit: str, where: str) -> tuple[Fraction, 
     return source.factor / goal.factor, (source.offset - goal.offset + shift) / goal.factor
 
 
-def _convert(number: str, factor: Fraction, offset: Fraction) -> float:
-    return float(number) if "inf" in number else float(Fraction(number) * factor + offset)
+def _convert(number: str, factor: Fraction, offset: Fraction, where: str) -> float:
+    try:
+        return float(number) if "inf" in number else float(Fraction(number) * factor + offset)
+    except OverflowError:
+        raise UnitError(f"{_place_prefix(where)}{number} is larger than any number that is measured") from None
 
 
 def _split_level(unit_text: str) -> tuple[str, str]:
@@ -324,12 +298,16 @@ def _parse_unit(unit_text: str, where: str = "") -> _UnitScale:
     try:
         return _parse_with_pint(functools.reduce(lambda text, s: text.replace(s, _SYMBOLS[s]), _SYMBOLS, unit_text))
     except Exception:  # whatever pint raises on a text, the text is not a unit
-        raise UnitError(f"{_place_prefix(where)}unknown unit {unit_text!r}; {_suggest_unit(unit_text)}") from None
+        shown = unit_text[:40]
+        raise UnitError(f"{_place_prefix(where)}unknown unit {shown!r}; {_suggest_unit(shown)}") from None
 
 
 @cache
 def _parse_with_pint(unit_text: str) -> _UnitScale:
-    require(not re.search(r"\d{3}", unit_text), "a power this high would take for ever")
+    require(len(unit_text) <= MAX_UNIT_LENGTH, "a text this long is no unit")
+    require(not re.search(r"\d{3}|\d\s*[eE]\s*[+-]?\d", unit_text), "a power this high would take for ever")
+    powers = (int(power) for power in re.findall(r"(?:\*\*|\^)[\s(]*[+-]?(\d+)", unit_text))
+    require(math.prod(power for power in powers if power) <= MAX_UNIT_POWER, "a power of powers would, too")
     require("%%" not in unit_text.replace(" ", ""), "a percentage of a percentage is a slip of the finger")
     unit = _registry().parse_units(unit_text)
     zero, one = (_registry().Quantity(Fraction(k), unit).to_base_units() for k in range(2))
@@ -343,7 +321,7 @@ def _registry() -> Any:
     import pint
 
     registry: Any = pint.UnitRegistry(None, non_int_type=Fraction, autoconvert_offset_to_baseunit=True)
-    registry.load_definitions(_UNIT_DEFINITIONS.strip().splitlines())
+    registry.load_definitions(UNIT_DEFINITIONS.strip().splitlines())
     return registry
 
 
@@ -364,7 +342,7 @@ def _example_unit(unit: str) -> str:
 
 
 def _suggest_unit(unit_text: str) -> str:
-    known = {key.casefold(): unit for unit in _COMMON_UNITS.split() for key in (unit, re.sub(r"[()]", "", unit))}
+    known = {key.casefold(): unit for unit in COMMON_UNITS.split() for key in (unit, re.sub(r"[()]", "", unit))}
     near = difflib.get_close_matches(unit_text.casefold(), known, n=1, cutoff=0.6)
     return f"did you mean {known[near[0]]!r}?" if near else "write for instance mm, m/s, N, bar(g), V, ms or %"
 

@@ -208,3 +208,24 @@ def test_gauge_pressures_count_from_where_they_are_told_to() -> None:
 def test_a_temperature_below_absolute_zero_is_refused_where_its_dimension_alone_says_what_it_is() -> None:
     with pytest.raises(UnitError, match="below absolute zero"):
         read_si("-300 degC")
+
+
+@pytest.mark.parametrize(
+    "unit", ["mm**9e9", "mm^(9e9)", "mm^999999999", "((mm**99)**99)**99", "m" * 100_000, "1e9**9e9*m", "(" * 5000 + "m"]
+)
+def test_a_unit_that_would_take_for_ever_is_refused(unit: str) -> None:
+    with pytest.raises(UnitError, match="unknown unit") as error:
+        si_conversion(unit, "m")
+    assert len(str(error.value)) < 200
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1e999 N", "1e999 is larger than any number that is measured"),
+        ("9" * 4301 + " N", "a number of 4301 characters; round it"),
+    ],
+)
+def test_a_number_beyond_all_measure_is_refused(text: str, said: str) -> None:
+    with pytest.raises(UnitError, match=said):
+        read_value(text, "N")

@@ -1,0 +1,381 @@
+import hashlib
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.read_log import read_log
+from pneuopt.quantities.errors import InputError, LogError, UnitError, UnknownNameError
+from pneuopt.quantities.intersample import Intersample
+from pneuopt.quantities.units import ATMOSPHERE, si_conversion
+
+HEADER = "time [s],position [mm]\n"
+BODY = "\n".join(f"{k / 10},{k}" for k in range(12)) + "\n"
+SIDECAR = """
+[columns]
+time = "t [ms]"
+valve_voltage = { column = "U valve", unit = "V", centre = "5 V" }
+force = { column = "U valve", unit = "V", centre = "5000 mV", scale = "-35.15065 N/V" }
+[noise]
+force = "2 N"
+[conditions]
+"supply.pressure" = "6.3 bar(g)"
+"load.mass" = "5 kg"
+"""
+RENAMED = "t [ms],U valve,note\n" + "".join(f"{k},{k},free text\n" for k in range(12))
+
+
+def written(folder: Path, text: str | bytes, sidecar: str = "") -> Path:
+    path = folder / "run_01.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    if sidecar:
+        path.with_suffix(".toml").write_text(sidecar, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["time [s],position [mm]", "time_s,position_mm", "Time (s),Position (mm)", '"time [ s ]", "position[mm]"'],
+)
+def test_the_header_may_name_channels_and_units(tmp_path: Path, header: str) -> None:
+    path = written(tmp_path, f"{header}\n{BODY}")
+    run = read_log(path)
+    np.testing.assert_allclose(run.trajectory["position"], 1e-3 * np.arange(12), rtol=1e-15)
+    np.testing.assert_allclose(run.trajectory.t, 0.1 * np.arange(12), rtol=1e-15)
+    assert (run.name, run.sha256) == ("run_01", hashlib.sha256(path.read_bytes()).hexdigest())
+    assert (run.noise, run.conditions) == ({}, {})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        (HEADER + BODY).replace(",", ";").replace(".", ","),
+        (HEADER + BODY).replace(",", "\t").replace(".", ","),
+        (HEADER + BODY).replace(",", ";"),
+        (HEADER + BODY).replace(",", " , "),
+        (HEADER + BODY).replace("\n", ",\n"),  # trailing delimiter everywhere
+        HEADER + BODY.replace("\n", ",\n"),  # in the rows only
+        HEADER.replace("\n", ",\n") + BODY,  # in the header only
+        "\ufeff" + HEADER + BODY + "\n\n",
+        (HEADER + BODY).replace("\n", "\r\n"),
+        HEADER + "".join(f'"{k // 10},{k % 10}","{k},0"\n' for k in range(12)),
+    ],
+    ids=["semicolon", "tab", "point", "spaces", "trail", "trail-rows", "trail-header", "bom", "crlf", "quoted"],
+)
+def test_dialects_agree(tmp_path: Path, text: str) -> None:
+    run = read_log(written(tmp_path, text))
+    np.testing.assert_allclose(run.trajectory["position"], 1e-3 * np.arange(12), rtol=1e-15)
+    np.testing.assert_allclose(run.trajectory.t, 0.1 * np.arange(12), rtol=1e-15)
+
+
+def test_an_older_windows_file(tmp_path: Path) -> None:
+    text = "time [s]\tposition [µm]\n" + "".join(f"{k},5\t{k}\n" for k in range(12))
+    assert read_log(written(tmp_path, text.encode("cp1252"))).trajectory["position"][3] == pytest.approx(3e-6)
+
+
+def test_pressures_become_absolute(tmp_path: Path) -> None:
+    run = read_log(written(tmp_path, "time_ms,pressure_a_bar(g),pressure_b [kPa(a)]\n" + BODY.replace("\n", ",100\n")))
+    np.testing.assert_allclose(run.trajectory["pressure_a"], 1e5 * np.arange(12) + ATMOSPHERE, rtol=1e-15)
+    assert run.trajectory["pressure_b"][0] == 1e5
+    assert run.trajectory.t[1] == pytest.approx(1e-4)
+
+
+def test_a_sidecar_is_found_and_says_it_all(tmp_path: Path) -> None:
+    run = read_log(written(tmp_path, RENAMED, SIDECAR))
+    assert run.trajectory.names == ("valve_voltage", "force")
+    np.testing.assert_allclose(run.trajectory["valve_voltage"], np.arange(12) - 5.0)
+    np.testing.assert_allclose(run.trajectory["force"], -35.15065 * (np.arange(12) - 5.0))
+    assert run.noise == {"force": 2.0}
+    assert run.conditions == {"supply.pressure": 6.3e5 + ATMOSPHERE, "load.mass": 5.0}
+
+
+def test_columns_in_place_of_the_sidecars(tmp_path: Path) -> None:
+    path = written(tmp_path, RENAMED)
+    sensor = {"column": "U valve", "unit": "V", "centre": "1 V", "scale": "2 bar(g)/V"}
+    run = read_log(path, columns={"time": "t [ms]", "pressure_a": sensor})
+    np.testing.assert_allclose(run.trajectory["pressure_a"], 2e5 * (np.arange(12) - 1.0) + ATMOSPHERE)
+    counts = {"column": "U valve", "unit": "count", "scale": "0.5 um"}
+    run = read_log(path, columns={"time": "t [ms]", "position": counts})
+    assert run.trajectory["position"][2] == pytest.approx(1e-6)
+
+
+def test_a_drive_that_has_a_sidecars_name_is_told(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"is a drive, but has the name of the sidecar of run_01\.csv; rename one"):
+        read_log(written(tmp_path, HEADER + BODY, '[drive]\nkind = "force"\n'))
+
+
+def test_an_explicit_sidecar(tmp_path: Path) -> None:
+    side = tmp_path / "rig.toml"
+    side.write_text('[noise]\nposition = "20 um"\n')
+    assert read_log(written(tmp_path, HEADER + BODY), sidecar=side).noise == {"position": 2e-5}
+
+
+def test_other_columns_are_left_alone(tmp_path: Path) -> None:
+    rows = "".join(f"{k};{k};12.03.2024 10:00;;ok\n" for k in range(12))
+    run = read_log(written(tmp_path, "time [s];position [mm];date;;remark\n" + rows))
+    assert run.trajectory.names == ("position",)
+
+
+def test_missing_samples_and_any_start_time(tmp_path: Path) -> None:
+    rows = "".join(f"{1.7e9 + k},{'' if k in {3, 4} else k}\n" for k in range(12))
+    run = read_log(written(tmp_path, HEADER + rows))
+    assert np.flatnonzero(np.isnan(run.trajectory["position"])).tolist() == [3, 4]
+    assert run.trajectory.t[0] == 1.7e9
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (HEADER + BODY + "1.2,abc\n", "row 14, column 'position [mm]': 'abc' is not a number"),
+        (HEADER + BODY + "1.2,n/a\n", "'n/a' is not a number (decimal mark '.'); leave the cell empty"),
+        (HEADER + BODY + "1.2,9.91e37\n", "9.91e+37 is no measured value; leave the cell empty"),
+        (HEADER + BODY + "1.2,1e999\n", "row 14, column 'position [mm]': '1e999' is not a number"),
+        (HEADER + BODY + "1.2,inf\n", "'inf' is not a number"),
+        (HEADER + BODY + "1.2,1_0\n", "'1_0' is not a number"),
+        (HEADER + BODY + ",3\n", "row 14, column 'time [s]': the time is missing; delete the row"),
+        (HEADER + BODY + "1.1,3\n", "row 14: time repeats (1.1 s, then 1.1 s); delete the row"),
+        (HEADER + BODY + "0.5,3\n", "row 14: time runs backwards (1.1 s, then 0.5 s)"),
+        (HEADER + BODY + "1.2\n", "row 14 has 1 field, the header 2; mend or delete the row"),
+        (HEADER + BODY + "1.2;3\n", "row 14 has 1 field"),
+        (HEADER + BODY + "\n1.3,4\n", "row 14 has 1 field"),
+        (HEADER + BODY.replace(".", ","), "row 2 has 3 fields, the header 2; is ',' the decimal mark, too?"),
+        (HEADER.replace(",", ";") + "0.5;1,5\n" * 12, "row 2, column 'time [s]': '0.5' is not a number"),
+        (HEADER.replace(",", ";") + "0;1.234,5\n" * 12, "'1.234,5' is not a number"),
+        (HEADER + "0,1\n1,2\n", "2 samples are too few; at least 10"),
+        (HEADER + "".join(f"{k},\n" for k in range(12)), "column 'position [mm]' is empty; leave it out"),
+        ("", "row 1 is empty"),
+        (HEADER, "a header, but no samples"),
+        (BODY, "row 1 holds the number '0.0', not a column's name"),
+        ("time [s]\n" + "".join(f"{k}\n" for k in range(12)), "one column only; put ',', ';' or a tab"),
+        ("time [s],position [mm],position [mm]\n" + BODY, "two columns are named 'position [mm]'; rename one"),
+        ("time [s],position [mm],position_mm\n" + BODY.replace("\n", ",1\n"), "'position' has another column"),
+        ("a,b\n" + BODY, 'no time; name a column "time [s]"'),
+        ("time [s],b\n" + BODY, "no channel but time; known: time, valve_voltage"),
+        ("time [s],presure_a_bar(g)\n" + BODY, "'presure_a_bar(g)' looks like the channel 'pressure_a'"),
+        ("time [s],Pressure_c [bar(g)]\n" + BODY, "looks like the channel 'pressure_"),
+        ("time [s],velocity [m/s]\n" + BODY, "looks like the channel 'speed'"),
+        ("t [s],position [mm]\n" + BODY, "looks like the channel 'time'"),
+        (b"PK\x03\x04\0\0", "not a text file"),
+        ((HEADER + BODY).encode("utf-16")[2:], "export the log as CSV in UTF-8"),
+    ],
+)
+def test_refuses_a_log_and_says_where(tmp_path: Path, text: str | bytes, said: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(LogError) as error:
+        read_log(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert said in str(error.value)
+
+
+def test_a_quote_that_is_not_closed_swallows_no_row(tmp_path: Path) -> None:
+    rows = BODY.splitlines()
+    inches = "".join(f'{row},{5}" pipe\n' for row in rows)
+    assert len(read_log(written(tmp_path, "time [s],position [mm],remark\n" + inches)).trajectory) == 12
+    opened = "".join(f"{row},{chr(34) if k in {3, 9} else ''}ok\n" for k, row in enumerate(rows))
+    assert len(read_log(written(tmp_path, "time [s],position [mm],remark\n" + opened)).trajectory) == 12
+    swallowed = "remark,time [s],position [mm]\n" + "".join(
+        f"{chr(34) if k == 3 else ''}ok,{r}\n" for k, r in enumerate(rows)
+    )
+    with pytest.raises(LogError, match=r'row 5: a quote \("\) is opened and not closed; mend the row'):
+        read_log(written(tmp_path, swallowed))
+
+
+def test_rows_that_may_be_samples_are_never_skipped(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"row 2, column 'time.*: 'late' is not a number"):
+        read_log(written(tmp_path, HEADER + "late,1\n" + BODY))
+    with pytest.raises(LogError, match=r"row 2, column 'time.*: the time is missing"):
+        read_log(written(tmp_path, HEADER + ",\n" + BODY))
+    three = "time [s],position [mm],force [N]\n" + "".join(f"{k},{k},{k}\n" for k in range(20))
+    with pytest.raises(LogError, match="rows 2 to 13 hold numbers, but other columns than the rows below"):
+        read_log(written(tmp_path, HEADER + BODY + three))
+
+
+def test_all_rows_whose_time_repeats_are_told_at_once(tmp_path: Path) -> None:
+    times = [*range(20), 19, 20, 20, 21, 3, 4]
+    with pytest.raises(LogError) as error:
+        read_log(written(tmp_path, HEADER + "".join(f"{t},{k}\n" for k, t in enumerate(times))))
+    assert "rows 22, 24: time repeats (19 s, then 19 s); row 26: time runs backwards (21 s, then 3 s)" in str(
+        error.value
+    )
+    coarse = HEADER + "".join(f"{k // 10},{k}\n" for k in range(300))
+    with pytest.raises(
+        LogError, match=r"23, 24, \.\.\. \(270 in all\): .*too coarse for the samples; export it with more"
+    ):
+        read_log(written(tmp_path, coarse))
+
+
+def test_a_sidecar_adds_to_the_headers(tmp_path: Path) -> None:
+    text = "t [ms],position [mm],velocity [m/s],speed_raw\n" + "".join(f"{k},{k},{k},{k}\n" for k in range(12))
+    run = read_log(written(tmp_path, text, '[columns]\ntime = "t [ms]"\n'))
+    assert run.trajectory.names == ("position",)
+    assert [r[:60] for r in run.remarks] == [
+        "column 'velocity [m/s]' looks like the channel 'speed'; writ"[:60],
+        "column 'speed_raw': unknown unit 'raw'; did you mean 'rad'?;"[:60],
+    ]
+    run = read_log(written(tmp_path, text, '[columns]\ntime = "t [ms]"\nspeed = "velocity [m/s]"\nposition = false\n'))
+    assert run.trajectory.names == ("speed",)
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("time [s],position", 'no unit; write "position [m]", or unit = "..."'),
+        ("time [s],position [kg]", "unit 'kg' does not measure 'm'"),
+        ("time [s],position_raw", "unknown unit 'raw'"),
+        ("time [s],pressure_a [bar]", 'write "bar(a)" or "bar(g)"'),
+        ("time [s],speed [bar(g)]", "does not measure 'm/s'"),
+    ],
+)
+def test_refuses_a_columns_unit(tmp_path: Path, header: str, said: str) -> None:
+    with pytest.raises(UnitError) as error:
+        read_log(written(tmp_path, f"{header}\n{BODY}"))
+    assert f"column {header.split(',')[1]!r}" in str(error.value)
+    assert said in str(error.value)
+    assert "list the columns to use in a sidecar" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("valve_voltage", "valve_volts", "columns: unknown channel 'valve_volts'; did you mean 'valve_voltage'?"),
+        ('"t [ms]"', '"tt [ms]"', "columns.time: unknown column 'tt [ms]'; did you mean 't [ms]'?"),
+        ("centre = ", "center = ", "unknown key 'center'; did you mean 'centre'?"),
+        ('column = "U valve", unit = "V", centre = "5 V"', 'unit = "V"', "columns.valve_voltage: say which column"),
+        ("[noise]", "[noises]", "unknown key 'noises'; did you mean 'noise'?"),
+        ("[noise]\nforce", "[noise]\nposition", "noise: unknown channel 'position'; known: force, valve_voltage"),
+        ('"2 N"', '"2 mm"', "noise.force: unit 'mm' does not measure 'N'"),
+        ('"2 N"', '"-2 N"', "run_01: noise of 'force' must be positive, got -2"),
+        ('"2 N"', "2", 'noise.force: 2 has no unit; write "2 N"'),
+        ("N/V", "N/m", "columns.force.scale: unit 'N/m' does not measure"),
+        ('"5 V"', '"5 N"', "columns.valve_voltage.centre: unit 'N' does not measure 'V'"),
+        ('unit = "V", centre = "5 V"', 'centre = "5 V"', "columns.valve_voltage: no unit"),
+        ("6.3 bar(g)", "6.3 bar", "conditions.supply.pressure: a pressure level in 'bar'"),
+        ("[noise]", "[noise", "not valid TOML: "),
+        ("[columns]", "noise = 3\n[columns]", "noise must be a section, [noise]"),
+        (
+            "force = { column",
+            "pressure_a = { column",
+            "columns.pressure_a.scale: '-35.15065 N/V' does not say from where",
+        ),
+    ],
+)
+def test_refuses_a_sidecar_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
+    text = SIDECAR.replace('[noise]\nforce = "2 N"\n', "") if new.startswith("noise =") else SIDECAR
+    assert old in text
+    path = written(tmp_path, RENAMED, text.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        read_log(path)
+    assert said in str(error.value)
+    assert "run_01" in str(error.value)
+
+
+def test_refuses_what_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"none\.csv: cannot be read \(No such file"):
+        read_log(tmp_path / "none.csv")
+    with pytest.raises(LogError, match=r"none\.toml: cannot be read"):
+        read_log(written(tmp_path, HEADER + BODY), sidecar=tmp_path / "none.toml")
+    with pytest.raises(LogError, match="cannot be read"):
+        read_log(tmp_path)
+
+
+def test_a_log_has_a_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wide = ",".join(f"c{i}" for i in range(20_000))
+    with pytest.raises(LogError, match="20001 columns are more than 4096; export fewer channels"):
+        read_log(written(tmp_path, f"time [s],{wide}\n" + f"0{',1' * 20_000}\n" * 12))
+    with pytest.raises(
+        LogError, match=r"the name of column 'aaaaaaaaaaaaaaaaaaaa'\.\.\. has 300 characters; shorten it"
+    ):
+        read_log(written(tmp_path, f"time [s],position [mm],{'a' * 300}\n" + BODY.replace("\n", ",1\n")))
+    with pytest.raises(LogError, match="row 2: a cell has more than 131072 characters; cut it"):
+        read_log(written(tmp_path, 'time [s],position [mm],note\n0,1,"' + "a" * 200_000 + '"\n1,1,\n'))
+    monkeypatch.setattr("pneuopt.logs.budget.MAX_CELLS", 20)
+    with pytest.raises(LogError, match=r"12 rows of 2 channels are more than 2e\+01 samples; cut the log"):
+        read_log(written(tmp_path, HEADER + BODY))
+
+
+def test_only_files_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    for name in (tmp_path / "pipe.csv", Path("/dev/zero")):
+        with pytest.raises(LogError, match="is a pipe or a device; save the log in a file"):
+            read_log(name)
+    with pytest.raises(LogError, match=r"cannot be read \(.*null"):
+        read_log("a\0b.csv")
+    with pytest.raises(LogError, match=r"run_01\.toml: too many brackets in brackets"):
+        read_log(written(tmp_path, HEADER + BODY, "[columns]\ntime = " + "[" * 3000 + "]" * 3000))
+    with pytest.raises(LogError, match=r"run_01\.toml: is larger than 1 MiB"):
+        read_log(written(tmp_path, HEADER + BODY, "#" * 2**21))
+
+
+def test_a_log_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, HEADER + BODY, '[noise]\nposition = "1 um"\n')
+    opened: list[str] = []
+
+    def open_and_count(self: Path, mode: str) -> object:
+        opened.append(self.name)
+        return io.FileIO(self, mode)
+
+    monkeypatch.setattr(Path, "open", open_and_count)
+    read_log(path)
+    assert opened == ["run_01.csv", "run_01.toml"]
+
+
+def test_reads_a_long_log(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).normal(size=(25_000, 5))
+    rows = "\n".join(f"{k};" + ";".join(f"{v:.9g}" for v in row) for k, row in enumerate(values)).replace(".", ",")
+    header = "time [ms];position [mm];force [N];pressure_a [bar(g)];pressure_b [bar(g)];valve_voltage [V]\n"
+    path = written(tmp_path, header + rows)
+    run = read_log(path)
+    assert len(run.trajectory) == 25_000
+
+
+NUMBERS = st.lists(st.one_of(st.none(), st.floats(-1e9, 1e9)), min_size=10, max_size=20)
+
+
+@settings(max_examples=40)
+@given(
+    NUMBERS,
+    st.sampled_from([";", "\t"]),
+    st.sampled_from([".", ","]),
+    st.sampled_from([("position", "mm"), ("force", "kN"), ("pressure_a", "bar(g)"), ("speed", "m/s")]),
+)
+def test_a_written_log_reads_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    raw: list[float | None],
+    delimiter: str,
+    decimal: str,
+    column: tuple[str, str],
+) -> None:
+    channel, unit = column
+    raw[0] = raw[0] or 1.0
+    rows = [f"{k / 8!r}{delimiter}{'' if v is None else repr(v)}".replace(".", decimal) for k, v in enumerate(raw)]
+    text = f"time [s]{delimiter}{channel} [{unit}]\n" + "\n".join(rows) + "\n"
+    run = read_log(written(tmp_path_factory.mktemp("log"), text))
+    factor, offset = si_conversion(unit, CHANNELS[channel])
+    expected = [np.nan if v is None else factor * v + offset for v in raw]
+    np.testing.assert_allclose(run.trajectory[channel], expected, rtol=1e-14, equal_nan=True)
+
+
+def test_a_sidecar_says_how_channels_run_between_samples(tmp_path: Path) -> None:
+    log = read_log(written(tmp_path, HEADER + BODY, '[intersample]\nposition = "held"\n'))
+    assert log.intersample == {"position": Intersample.HELD}
+    assert log.select([n for n in log.trajectory if n != "position"]).intersample == {}
+    assert log.with_intersample({"position": Intersample.LINEAR}).intersample == {"position": Intersample.LINEAR}
+    for wrong in ('"foh"', "1", '["held"]'):
+        with pytest.raises(LogError, match=r"intersample\.position is .*; it must be 'held' or 'linear'"):
+            read_log(written(tmp_path, HEADER + BODY, f"[intersample]\nposition = {wrong}\n"))
+    with pytest.raises(UnknownNameError, match="positoin"):
+        read_log(written(tmp_path, HEADER + BODY, '[intersample]\npositoin = "held"\n'))
+
+
+def test_gauge_sensors_count_from_the_drives_ambient_pressure(tmp_path: Path) -> None:
+    rows = "".join(f"{k * 1e-3:.3f},{k}\n" for k in range(20))
+    path = written(tmp_path, "time [s],pressure_a [bar(g)]\n" + rows, '[conditions]\n"supply.pressure" = "6 bar(g)"\n')
+    high = read_log(path, ambient_pressure=84e3)
+    assert high.trajectory["pressure_a"][2] == pytest.approx(2e5 + 84e3)
+    assert high.conditions["supply.pressure"] == 684e3
+    assert read_log(path).trajectory["pressure_a"][2] == pytest.approx(2e5 + ATMOSPHERE)
