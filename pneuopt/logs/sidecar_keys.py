@@ -11,7 +11,7 @@ ACCEPTED_CHECKS = "accept"  # the checks that the log need not pass
 
 def _column_key(channel: str, unit: str) -> Key:
     meaning = f"column of the {channel.replace('_', ' ')}"
-    return Key(meaning, Takes.TEXT_OR_TABLE, unit, keys=COLUMN_KEYS, example=f'"{channel} [{unit}]"')
+    return Key(meaning, Takes.COLUMN, unit, keys=COLUMN_KEYS, example=f'"{channel} [{unit}]"')
 
 
 INTERSAMPLE_KEY = Key(
@@ -20,9 +20,9 @@ INTERSAMPLE_KEY = Key(
 SIDECAR_KEYS: Mapping[str, Key] = {
     ACCEPTED_CHECKS: Key("checks that this log need not pass", Takes.LIST, usual=[], example='["work"]'),
     "columns": table(
-        "which column is which channel; without it the header says so",
+        "which column is which channel; false leaves one out; the header says the others",
         {channel: _column_key(channel, unit) for channel, unit in CHANNELS.items()},
-        others=Key("column of another signal of the drive", Takes.TEXT_OR_TABLE, "{own}", keys=COLUMN_KEYS),
+        others=Key("column of another signal of the drive", Takes.COLUMN, "{own}", keys=COLUMN_KEYS),
         named="signal",
     ),
     "noise": table(

@@ -27,7 +27,7 @@ class Takes(Enum):
     SAMPLES = "a number of samples"
     SPREAD = "a fraction, or two values"
     AXIS = "a list of values, or a range"
-    TEXT_OR_TABLE = "text, or a table"
+    COLUMN = "a column's name, a table, or false"
 
     @property
     def types(self) -> tuple[type, ...]:
@@ -48,7 +48,7 @@ _TYPES: Mapping[Takes, tuple[type, ...]] = {
     Takes.SAMPLES: (int, str),
     Takes.SPREAD: (str, int, float, list),
     Takes.AXIS: (list, dict),
-    Takes.TEXT_OR_TABLE: (str, dict),
+    Takes.COLUMN: (str, dict, bool),
 }
 
 
