@@ -1,4 +1,4 @@
-"""The command line: `pneuopt identify | tune | simulate | study | info`.
+"""The command line: `pneuopt identify | tune | simulate | study | keys | info`.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 130
 interrupted. Each command imports what it needs, so that `--help` waits for no heavy import.
@@ -154,6 +154,20 @@ def study_command(
         from pneuopt.cli.study import run_study
 
         raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet))
+
+
+@app.command("keys")
+def keys_command(
+    word: Annotated[
+        str | None, typer.Argument(metavar="[WORD]", help="A file, a section, a key, or a word of its meaning.")
+    ] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print tables in Markdown, as in README.")] = False,
+) -> None:
+    """Show what may stand in the files: each key, its unit, its default and what it means."""
+    with _report_errors():
+        from pneuopt.cli.keys import run_keys
+
+        raise typer.Exit(run_keys(word, markdown))
 
 
 @app.command("info")

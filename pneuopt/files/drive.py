@@ -13,12 +13,12 @@ import numpy as np
 import tomlkit
 
 from pneuopt.dynamics.system import System
+from pneuopt.files.drive_keys import KIND_KEY
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.models.declaration import Alias, Drive, DriveKind, Sections, Structure
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import HardwareError, InputError, ModelError, UnknownNameError, check_names, require
-from pneuopt.quantities.keys import choice
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code, Status
@@ -33,7 +33,7 @@ FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "pr
 
 AMBIENT_PRESSURE = "ambient.pressure"  # the parameter of a drive that its gauge pressures count from
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
-_DRIVE_SECTION = {"drive": {"kind": choice("what drives the load", DRIVE_KINDS)}}
+_DRIVE_SECTION = {"drive": {"kind": KIND_KEY}}
 
 
 def read_drive(path: str | Path) -> tuple[Drive, ParameterSet]:

@@ -60,9 +60,9 @@ LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
 }
 """By section the keys that choose how a loop is built, and those of its sensor."""
 
-SECTION_MEANINGS: Mapping[str, str] = {
+LOOP_MEANINGS: Mapping[str, str] = {
     "loop": "which signals the controller connects",
-    "pid": "the controller; it is needed, with its first gain at least",
+    "pid": "the controller; required, with its first gain at least",
     "sensor": "what the controller sees of the signal: a lag, or an encoder",
     "dither": "a small oscillation added to the command",
     "feedforward": "what a change of the reference adds to the command",
@@ -72,7 +72,7 @@ SECTION_MEANINGS: Mapping[str, str] = {
 _PUSH = Key("by how much it changes", unit="{own}", example='"50 N"')
 _KNOWN = Key("its value at time 0", unit="{own}", example='"250 mm"')
 REFERENCE_KEYS: Mapping[str, Key] = {
-    "step": Key("height of the step; needed without a disturbance", unit="{difference}", example='"0.1 m/s"'),
+    "step": Key("height of the step; required without a disturbance", unit="{difference}", example='"0.1 m/s"'),
     "horizon": Key("end of the experiment", unit="s", required=True, example='"1 s"'),
     "initial": Key("value before the step", unit="{measured}", usual=Step.initial),
     "at": Key("when it steps", unit="s", usual=Step.at),
@@ -139,7 +139,7 @@ TUNING_KEYS: Mapping[str, Key] = {
     ACCEPT_KEY: Key(
         "defects with which a design is certified all the same", Takes.LIST, choices=_words(Defect), usual=[]
     ),
-    **{section: table(SECTION_MEANINGS[section], keys) for section, keys in LOOP_KEYS.items()},
+    **{section: table(LOOP_MEANINGS[section], keys) for section, keys in LOOP_KEYS.items()},
     "reference": table("a step to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
     "minimise": table("what shall be small, weighted", {n: objective_key(n) for n in REQUIREMENTS_BY_KEY}),
     "limits": table("what shall be kept", {n: limit_key(n) for n in REQUIREMENTS_BY_KEY}),

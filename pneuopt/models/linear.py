@@ -247,7 +247,12 @@ def _assemble_plant(
         parameters = parameters | ParameterSet(
             {
                 "plant.dead_time": Parameter(
-                    0.01, "s", 1e-3, 10.0, log=True, meaning="delay from the input to its effect"
+                    0.01,
+                    "s",
+                    1e-3,
+                    10.0,
+                    log=True,
+                    meaning="delay from the input to its effect; none where it is left out",
                 )
             }
         )

@@ -1,0 +1,74 @@
+"""The command `keys`: what stands in which file, as on the screen and as in README's appendix."""
+
+import difflib
+import textwrap
+from collections.abc import Sequence
+from itertools import groupby
+
+import typer
+
+from pneuopt.cli.exit_status import EXIT_SUCCESS
+from pneuopt.cli.terminal import make_console
+from pneuopt.files.key_list import FILE_MEANINGS, KeyRow, list_keys
+from pneuopt.quantities.errors import InputError
+
+_MARGIN = "    "
+
+
+def run_keys(word: str | None, markdown: bool) -> int:
+    """Print the keys whose name or meaning has the word in it; all without one."""
+    rows = find_keys(word)
+    typer.echo(format_markdown(rows) if markdown else _format_screen(rows, make_console().width))
+    return EXIT_SUCCESS
+
+
+def find_keys(word: str | None) -> Sequence[KeyRow]:
+    """Rows of the list by a word: of a file, a section, a key or its meaning; those with that very name come first.
+
+    Raises
+    ------
+    InputError
+        If there is no such row.
+    """
+    rows = list_keys()
+    if word is None:
+        return rows
+    sought = word.casefold().strip("[]")
+    exact = [r for r in rows if sought in (r.file, r.section, r.full_name.casefold(), r.name.casefold().split(".")[-1])]
+    found = exact or [r for r in rows if sought in f"{r.full_name} {r.key.meaning}".casefold()]
+    if not found:
+        names = {n for row in rows for n in (row.section, row.full_name, row.name.split(".")[-1]) if n}
+        near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+        raise InputError(
+            f"no key has {word!r} in it; " + (f"did you mean {near[0]!r}?" if near else "leave it out to see all")
+        )
+    return found
+
+
+def format_markdown(rows: Sequence[KeyRow]) -> str:
+    """Tables in Markdown, one a file."""
+    parts = []
+    for file, own in groupby(rows, key=lambda row: row.file):
+        parts.append(f"**{file}**: {FILE_MEANINGS[file]}\n\n| key | unit | default | |\n|---|---|---|---|")
+        parts[-1] += "".join(f"\n{_markdown_row(row)}" for row in own)
+    return "\n\n".join(parts)
+
+
+def _markdown_row(row: KeyRow) -> str:
+    name = f"**[{row.section}]**" if (not row.name and row.key.keys) or row.key.others else f"`{row.full_name}`"
+    cells = [name, row.unit, row.usual and f"`{row.usual}`", row.remarks]
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _format_screen(rows: Sequence[KeyRow], width: int) -> str:
+    """Lines no wider than the terminal."""
+    lines: list[str] = []
+    for file, own in groupby(rows, key=lambda row: row.file):
+        lines += ["", *textwrap.wrap(f"{file}: {FILE_MEANINGS[file]}", width)]
+        for row in own:
+            unit, usual = f" [{row.unit}]" if row.unit else "", f" = {row.usual}" if row.usual else ""
+            lines += textwrap.wrap(
+                f"{row.full_name}{unit}{usual}", width, initial_indent="  ", subsequent_indent=_MARGIN
+            )
+            lines += textwrap.wrap(row.remarks, width, initial_indent=_MARGIN, subsequent_indent=_MARGIN)
+    return "\n".join(lines[1:])

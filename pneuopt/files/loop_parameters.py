@@ -1,0 +1,56 @@
+"""The parameters of a loop's parts as keys of a tuning.toml: gains, dither, feedforward, compensators."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.dither import Dither
+from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.forms import Form
+from pneuopt.control.pid import PID
+from pneuopt.control.sensor import SensedSignal
+from pneuopt.files.tuning_keys import TUNING_KEYS
+from pneuopt.quantities.keys import Key, parameter_key
+from pneuopt.quantities.parameters import ParameterSet, Quantity
+
+SAMPLE_TIME = 1e-3  # [s], by which the usual values are shown that count in samples
+_LIMITS = ("lower", "upper")  # parameters that a file states as a pair, limits
+
+
+def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping[str, Key]:
+    """All sections of a tuning.toml with all their keys.
+
+    Parameters
+    ----------
+    command, measured : str
+        Units of the loop's signals; by default these words stand for them.
+
+    Returns
+    -------
+    mapping of str to Key
+    """
+    signal = SensedSignal(Quantity("measured", measured), {}, SAMPLE_TIME)
+    parts = {
+        "pid": _pid_keys(command, measured),
+        "dither": _parameter_keys(Dither().parameters(command), "frequency"),
+        "feedforward": _parameter_keys(Feedforward().parameters(measured, command), "gain"),
+        **{name: _parameter_keys(part().parameters(signal, command), part.size) for name, part in COMPENSATORS.items()},
+    }
+    return {n: replace(key, keys={**key.keys, **parts.get(n, {})}) for n, key in TUNING_KEYS.items()}
+
+
+def _pid_keys(command: str, measured: str) -> dict[str, Key]:
+    """The gains of every form, and what is shared; those of some forms say which."""
+    found: dict[str, Key] = {}
+    for form in Form:
+        pid = PID(SAMPLE_TIME, form=form, dead_band=True).parameters(measured, command)
+        for name in (n for n in pid if n not in _LIMITS and n not in found):
+            forms = [f'"{f.value}"' for f in Form if name in f.gains]
+            own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""
+            found[name] = parameter_key(pid[name], own or ("with limits" if name == "Tt" else ""))
+    return found
+
+
+def _parameter_keys(parameters: ParameterSet, required: str) -> dict[str, Key]:
+    """The parameters of a part, one of which a file must state."""
+    return {n: replace(parameter_key(p), required=n == required) for n, p in parameters.items()}
