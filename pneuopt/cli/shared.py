@@ -67,7 +67,7 @@ def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status
 def read_fit_and_tuning(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
     """Read the loop and its parameters; those of the plant are fixed."""
     model, plant = read_drive(fit)
-    task = read_tuning(tuning, model.system())
+    task = read_tuning(tuning, model.system(), plant)
     warn_of_status(fit)
     return task, plant.fixed(*plant.free_names) | task.parameters
 

@@ -129,7 +129,7 @@ def tune_cell(drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, 
     ConvergenceError
         If no design is certified.
     """
-    task = read_tuning(tuning, read_drive(drive)[0].system())
+    task = read_tuning(tuning, read_drive(drive)[0].system(), parameters)
     result = tune(
         task.loop,
         task.references,

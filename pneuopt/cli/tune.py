@@ -86,7 +86,7 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
         return EXIT_INTERRUPTED
     writers: Writers = {}
     if outputs.output is not None:
-        writers[outputs.output] = partial(write_tuned, outputs.output, tuning, result)
+        writers[outputs.output] = partial(write_tuned, outputs.output, tuning, result, task.wire)
     if outputs.plot is not None:
         before_gains = parameters if result.status.converged else None
         writers |= figure_writers(outputs.plot, _loop_figures(task, result.parameters, before_gains))
@@ -131,7 +131,7 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     show_metrics(make_console(), metrics, task.loop, limits=task.specification.limits)
     writers: Writers = {}
     if outputs.output is not None:
-        runs = [_with_reference(r) for r in _simulate_responses(task, parameters)]
+        runs = [_as_logged(r, task.centre) for r in _simulate_responses(task, parameters)]
         paths = number_paths(outputs.output, len(runs))
         check_output_paths(paths, [fit, tuning])
         columns = _loop_columns(task.loop)
@@ -290,9 +290,11 @@ def _loop_columns(loop: ClosedLoop) -> Columns:
     return columns | {"control": (command.name, command.unit)}
 
 
-def _with_reference(response: Response) -> Trajectory:
+def _as_logged(response: Response, centre: float) -> Trajectory:
+    """The response with its reference, and with the command that is on the wire."""
     run, reference = response.run, response.reference
-    return run.with_columns({"reference": np.where(run.t >= reference.at, reference.final, reference.initial)})
+    wanted = np.where(run.t >= reference.at, reference.final, reference.initial)
+    return run.with_columns({"reference": wanted, "control": run["control"] + centre})
 
 
 def _tuning_tables(result: TuningResult) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class ClosedLoop:
     Parameters
     ----------
     plant : drive or System
-        Held as its system.
+        Held as its system, whose command, and so the loop's, is the deviation from the valve's centre.
     pid : PID
     dither : Dither, optional
     actuated : str, optional

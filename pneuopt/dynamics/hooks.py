@@ -143,9 +143,9 @@ class FinalElement(NamedTuple):
     ----------
     name, moving_part, medium : str
         Nouns for a sentence: the element, its part that the command moves, the spring through which it pushes the body.
-    limit, dead_zone, bandwidth : str
+    limit, dead_zone, bandwidth, centre : str
         Parameters: the size of the command that moves the part by its half travel; its dead zone [half travels] and,
-        where it lags, its bandwidth [Hz].
+        where it lags, its bandwidth [Hz]; the command at which the part stands in its middle, None where that is 0.
     stroke : str
         The state of the part [half travels], where it lags.
     pushing : tuple of str
@@ -160,6 +160,7 @@ class FinalElement(NamedTuple):
     bandwidth: str
     stroke: str
     pushing: tuple[str, ...]
+    centre: str | None = None
 
 
 class Axis(NamedTuple):

@@ -8,6 +8,7 @@ and `as_runnable` take its system, and every verb that is given a model begins w
 from collections.abc import Mapping, Sequence
 from typing import Protocol, TypeVar
 
+from pneuopt.dynamics.centre import count_from_centre
 from pneuopt.dynamics.hooks import Log, Start
 from pneuopt.dynamics.system import FRICTION_DIRECTION, DiscreteSystem, Motion, System
 from pneuopt.quantities.arguments import wrong_argument
@@ -125,7 +126,10 @@ def as_runnable(model: M | HasSystem, argument: str = "system") -> M | System:
 
 
 class PlantField:
-    """A field of a dataclass that takes a drive as well as its system, and holds the system."""
+    """A field of a dataclass that takes a drive as well as its system, and holds the system.
+
+    A controller counts its command from the valve's centre, so the system that is held does (`count_from_centre`).
+    """
 
     def __set_name__(self, owner: type, name: str) -> None:
         """Remember the field's name."""
@@ -140,7 +144,7 @@ class PlantField:
 
     def __set__(self, instance: object, model: HasSystem) -> None:
         """Hold the system of `model`; errors as for `as_system`."""
-        instance.__dict__[self._name] = as_system(model, self._name)
+        instance.__dict__[self._name] = count_from_centre(as_system(model, self._name))
 
 
 def check_smooth(model: Runnable) -> None:

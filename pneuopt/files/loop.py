@@ -36,16 +36,20 @@ _GAIN_CORRECTIONS: Mapping[Form, Mapping[str, str]] = {
 }
 
 
-def read_loop_sections(table: TuningSections, plant: System, path: str | Path) -> tuple[ClosedLoop, ParameterSet]:
+def read_loop_sections(
+    table: TuningSections, plant: System, path: str | Path, centre: float = 0.0
+) -> tuple[ClosedLoop, ParameterSet]:
     """The loop of a tuning's sections.
 
     Parameters
     ----------
-    said : mapping of str to mapping
+    table : mapping of str to mapping
         The sections; others than `LOOP_SECTIONS` are not read.
     plant : System
     path : str or Path
         What the messages of errors begin with.
+    centre : float
+        Of the plant's valve [the command's unit]; the limits in the file are those of the wire, the loop's are about it.
 
     Returns
     -------
@@ -59,7 +63,7 @@ def read_loop_sections(table: TuningSections, plant: System, path: str | Path) -
         Or its kind; the message names file, section and key.
     """
     loop = _loop(table, plant, path)
-    return loop, _parameters(table, loop, path)
+    return loop, _parameters(table, loop, path, centre)
 
 
 def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
@@ -160,9 +164,9 @@ def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensa
     return construct_at(lambda: kind(**chosen), where)
 
 
-def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path) -> ParameterSet:
+def _parameters(table: TuningSections, loop: ClosedLoop, path: str | Path, centre: float) -> ParameterSet:
     own = loop.parameters.select(n for n in loop.parameters if n.startswith(tuple(f"{s}." for s in LOOP_SECTIONS)))
-    read = _read_limits(table["pid"], own, f"{path}: [pid] limits")
+    read = _read_limits(table["pid"], own, centre, f"{path}: [pid] limits")
     for section in TUNABLE_SECTIONS:
         read |= _section_parameters(table.get(section, {}), section, own, f"{path}: [{section}]")
     for name in (n for n, p in read.items() if p.free):
@@ -184,7 +188,8 @@ def _section_parameters(
     return {name: read_parameter(entries[k], own[name], f"{where} {k}") for k, name in names.items()}
 
 
-def _read_limits(entries: Mapping[str, Any], own: ParameterSet, where: str) -> dict[str, Parameter]:
+def _read_limits(entries: Mapping[str, Any], own: ParameterSet, centre: float, where: str) -> dict[str, Parameter]:
+    """Limits of the command about the valve's centre, from those on the wire."""
     if "limits" not in entries:
         return {}
     ends, unit = entries["limits"], own["pid.lower"].unit
@@ -194,4 +199,9 @@ def _read_limits(entries: Mapping[str, Any], own: ParameterSet, where: str) -> d
     )
     low, high = (read_value(end, unit, where=where) for end in ends)
     require(low < high, f"{where}: {ends[0]} is not below {ends[1]}")
-    return {"pid.lower": replace(own["pid.lower"], value=low), "pid.upper": replace(own["pid.upper"], value=high)}
+    wire = [write_value(v, unit, 3) for v in (centre, 0.0, 2 * centre)]
+    remedy = f'write what the wire may carry, limits = ["{wire[1]}", "{wire[2]}"] for instance'
+    inside = centre == 0 or low < centre < high
+    require(inside, f"{where}: the valve's centre, {wire[0]}, does not lie between {ends[0]} and {ends[1]}; {remedy}")
+    ends = {"pid.lower": low - centre, "pid.upper": high - centre}
+    return {name: replace(own[name], value=value) for name, value in ends.items()}

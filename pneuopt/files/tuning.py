@@ -10,6 +10,7 @@ import tomlkit
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Step
+from pneuopt.dynamics.centre import command_centre
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
 from pneuopt.evaluation.certificate import Defect
@@ -49,14 +50,14 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Takes
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import count_gauge_from, read_value
+from pneuopt.quantities.units import count_gauge_from, read_value, write_value
 from pneuopt.tuning.method import Method
 
 if TYPE_CHECKING:
     from pneuopt.tuning.result import TuningResult
 
 
-TUNED_SECTIONS = ("certified", "status", "provenance")
+TUNED_SECTIONS = ("certified", "wire", "status", "provenance")
 """Sections that a result adds to a tuning's file; reading the tuning passes over them."""
 
 
@@ -82,6 +83,8 @@ class Tuning:
         Steps of the simulations that are refused as too many.
     accept : tuple of Defect
         Defects with which a design is certified all the same.
+    centre : float
+        What is on the wire to the valve while the loop's command is zero [the command's unit].
     """
 
     loop: ClosedLoop
@@ -93,9 +96,15 @@ class Tuning:
     method: Method | None = None
     max_steps: float = MAX_STEPS
     accept: tuple[Defect, ...] = ()
+    centre: float = 0.0
+
+    @property
+    def wire(self) -> dict[str, str]:
+        """What a controller adds to the loop's command for the valve, as [wire] in a tuned.toml; empty for nothing."""
+        return {"centre": write_value(self.centre, self.loop.command.unit)} if self.centre else {}
 
 
-def read_tuning(path: str | Path, plant: System) -> Tuning:
+def read_tuning(path: str | Path, plant: System, parameters: ParameterSet | None = None) -> Tuning:
     """Read a tuning for a plant, whose signals set the units.
 
     Parameters
@@ -103,6 +112,8 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     path : str or Path
         A tuning.toml, or a tuned.toml made from one.
     plant : System
+    parameters : ParameterSet, optional
+        The plant's, whose valve's centre the limits of the command are counted from; by default its own.
 
     Returns
     -------
@@ -118,7 +129,8 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     for name in (n for n, key in TUNING_KEYS.items() if key.takes is Takes.TABLE):
         require(isinstance(table.get(name, {}), dict), f"{path}: {name} must be a section, [{name}]")
     require("pid" in table, f"{path}: no controller; add a section [pid]")
-    loop, parameters = read_loop_sections(table, plant, path)
+    centre = command_centre(plant, parameters or plant.parameters)
+    loop, own = read_loop_sections(table, plant, path, centre)
     weights, limits = _read_objective(table, path), _read_requirements(table, loop, path)
     spec = construct_at(lambda: specify_limits(limits, weights), f"{path}: [minimise] and [limits]")
     section = table.get("scenarios", {}), str(path)
@@ -127,10 +139,12 @@ def read_tuning(path: str | Path, plant: System) -> Tuning:
     references = _references(table, loop, path)
     max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
     accept = _read_accept(table.get(ACCEPT_KEY, TUNING_KEYS[ACCEPT_KEY].usual), f"{path}: {ACCEPT_KEY}")
-    return Tuning(loop, references, parameters, spec, scenarios, validation, method, max_steps, accept)
+    return Tuning(loop, references, own, spec, scenarios, validation, method, max_steps, accept, centre)
 
 
-def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") -> None:
+def write_tuned(
+    path: str | Path, source: str | Path, result: "TuningResult", wire: Mapping[str, str] | None = None
+) -> None:
     """Write a tuning's file with the gains found: the user's text and comments, [certified], [status], [provenance].
 
     Parameters
@@ -140,6 +154,8 @@ def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") ->
     source : str or Path
         The tuning.toml that the result was made from.
     result : TuningResult
+    wire : mapping of str to str, optional
+        `Tuning.wire`.
 
     Raises
     ------
@@ -156,6 +172,8 @@ def write_tuned(path: str | Path, source: str | Path, result: "TuningResult") ->
         document["certified"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
     else:
         status["gains"] = f"as in {Path(source).name}: not tuned"
+    if wire:
+        document["wire"] = toml_table(wire)
     document["status"] = toml_table(status)
     document["provenance"] = toml_table(plain_value(result.provenance))
     write_text(path, tomlkit.dumps(document))

@@ -10,7 +10,6 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import names
-from pneuopt.identification.command_centre import centre_command
 from pneuopt.identification.repairs import repair_log
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import estimate_noise, noise_level
@@ -52,8 +51,7 @@ def check_logs(
         system.check_log(experiment.trajectory, name)
         _check_channels(system, experiment, name, known)
         _check_conditions(system, experiment, parameters, name)
-        own = centre_command(system, replace(experiment, name=name), parameters)
-        out.append(repair_log(system, own)[0])
+        out.append(repair_log(system, replace(experiment, name=name))[0])
     return _fill_noise(system, out)
 
 

@@ -17,6 +17,7 @@ from pneuopt.dynamics.excitation import Lack
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.runnable import HasSystem, check_smooth
 from pneuopt.identification.checks import check_free, check_logs
+from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import check_content
 from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
@@ -95,6 +96,7 @@ def identifiability(
     model = as_estimation_model(system)
     check_smooth(model)
     logs = check_logs(model, experiments, parameters)
+    parameters = find_centre(model, logs, parameters)
     check_free(logs, parameters)
     check_content(model, logs)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, method or LeastSquares())

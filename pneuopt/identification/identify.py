@@ -22,6 +22,7 @@ from pneuopt.identification.checks import (
     log_remarks,
     outputs_in_log,
 )
+from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import check_content
 from pneuopt.identification.identifiability import leans_on_prior, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly
@@ -125,6 +126,7 @@ def identify(
     if estimate_noise:
         experiments = [replace(e, noise={}) for e in experiments]
     given, experiments = experiments, check_logs(model, experiments, parameters)
+    parameters = find_centre(model, experiments, parameters)
     check_free(experiments, parameters)
     accepted = check_content(model, experiments)
     log_warnings = accepted + emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
@@ -189,7 +191,8 @@ def validate(
     import pandas as pd
 
     model = as_estimation_model(system)
-    logs, fixed = check_logs(model, experiments, parameters), _fixed_parameters(model, parameters)
+    logs = check_logs(model, experiments, parameters)
+    fixed = _fixed_parameters(model, find_centre(model, logs, parameters))
     rows = []
     for experiment in logs:
         free = _predict_log(model, experiment, fixed)
@@ -221,8 +224,8 @@ def predict(
     """
     model = as_estimation_model(system)
     check_argument("experiment", experiment, Experiment, "an Experiment, as read_log(path) gives it")
-    log = check_logs(model, experiment, parameters)[0]
-    return _predict_log(model, log, _fixed_parameters(model, parameters), window)
+    (log,) = logs = check_logs(model, experiment, parameters)
+    return _predict_log(model, log, _fixed_parameters(model, find_centre(model, logs, parameters)), window)
 
 
 def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSet:

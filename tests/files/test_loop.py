@@ -9,10 +9,12 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form, SeriesForm, to_parallel
 from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder
+from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning, write_tuned
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
 from pneuopt.models.linear import SecondOrder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.result import TuningResult
@@ -121,3 +123,44 @@ def test_an_encoder_is_what_the_controller_reads(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=said):
             read_tuning(written(tmp_path, sections), drive)
+
+
+LIMITED = """[pid]
+sample_time = "2 ms"
+Kp = { value = "2 V*s/m", lower = "1 V*s/m", upper = "3 V*s/m", free = true }
+limits = ["0 V", "10 V"]
+[[reference]]
+step = "0.1 m/s"
+horizon = "1 s"
+"""
+VALVE_DRIVE = PneumaticDrive()
+AT_5_06_V = VALVE_DRIVE.parameters.with_values({"valve.centre": 5.06})
+
+
+def test_limits_on_the_wire_become_limits_about_the_valves_centre(tmp_path: Path) -> None:
+    path = written(tmp_path, LIMITED)
+    task = read_tuning(path, VALVE_DRIVE.system(), AT_5_06_V)
+    ends = [task.parameters.value(n) for n in ("pid.lower", "pid.upper")]
+    assert ends == pytest.approx([-5.06, 4.94])
+    usual = read_tuning(path, VALVE_DRIVE.system())
+    assert [usual.parameters.value(n) for n in ("pid.lower", "pid.upper")] == [0.0, 10.0]
+    table = pd.DataFrame()
+    result = TuningResult(task.parameters, table, table, table, table, (), Status(Code.CONVERGED), {}, {})
+    write_tuned(tmp_path / "tuned.toml", path, result, task.wire)
+    written_file = read_toml(tmp_path / "tuned.toml").unwrap()
+    assert written_file["wire"] == {"centre": "5.06 V"}
+    assert written_file["pid"]["limits"] == ["0 V", "10 V"]
+    assert read_tuning(tmp_path / "tuned.toml", VALVE_DRIVE.system(), AT_5_06_V).parameters == task.parameters
+    write_tuned(tmp_path / "tuned.toml", tmp_path / "tuned.toml", result, usual.wire)
+    assert "wire" not in read_toml(tmp_path / "tuned.toml")
+
+
+def test_limits_beside_the_valves_centre_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, LIMITED.replace('["0 V", "10 V"]', '["-5 V", "5 V"]'))
+    with pytest.raises(InputError) as error:
+        read_tuning(path, VALVE_DRIVE.system(), AT_5_06_V)
+    said = (
+        "limits: the valve's centre, 5.06 V, does not lie between -5 V and 5 V; write what the wire may carry, limits ="
+    )
+    assert said in str(error.value)
+    assert read_tuning(path, VALVE_DRIVE.system()).parameters.value("pid.lower") == -5

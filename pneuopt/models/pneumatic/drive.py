@@ -32,7 +32,15 @@ from pneuopt.quantities.trajectories import Trajectory
 SIDES = ("a", "b")
 PRESSURE_SIGNALS = tuple(Quantity(f"pressure_{side}", "Pa(a)", nominal=5e5) for side in SIDES)
 _VALVE = FinalElement(
-    "valve", "spool", "air", "valve.span", "valve.dead_zone", "valve.bandwidth", "valve.spool", names(PRESSURE_SIGNALS)
+    name="valve",
+    moving_part="spool",
+    medium="air",
+    limit="valve.span",
+    dead_zone="valve.dead_zone",
+    bandwidth="valve.bandwidth",
+    stroke="valve.spool",
+    pushing=names(PRESSURE_SIGNALS),
+    centre="valve.centre",
 )
 _AXIS = Axis(noun="piston", final_element=_VALVE)
 
@@ -44,8 +52,8 @@ class PneumaticDrive:
     .. math:: M \dot v = A_a p_a - A_b p_b - (A_a - A_b) p_o - F_f - F_L + F_{stop}
 
     States: position [m] from the end where chamber a is smallest, speed, pressure_a and pressure_b (absolute), with
-    `Thermal` chambers temperature_a and temperature_b, then the valve's and the friction's. Input: valve_voltage [V], a
-    deviation from the valve's centre; positive drives forwards. Outputs: position, speed, pressure_a, pressure_b.
+    `Thermal` chambers temperature_a and temperature_b, then the valve's and the friction's. Input: valve_voltage [V],
+    which drives forwards above valve.centre (0 V by default). Outputs: position, speed, pressure_a, pressure_b.
 
     Parameters
     ----------
@@ -276,7 +284,9 @@ class PneumaticDrive:
         inner = {f"friction.{q.name}": ca.SX.sym(q.name) for q in self.friction.states}
         known = {**given, **warm, **inner}
         x = {n: known.get(n, ca.SX(0)) for n in names(self.states)}
-        rates, _ = self._rhs(ca.SX(0), x, {VALVE_VOLTAGE.name: given["valve.spool"] * p["valve.span"]}, p)
+        rates, _ = self._rhs(
+            ca.SX(0), x, {VALVE_VOLTAGE.name: p["valve.centre"] + given["valve.spool"] * p["valve.span"]}, p
+        )
         z, zdot = stack(inner), stack({n: rates[n] for n in inner})
         steady = ca.substitute(-ca.solve(ca.jacobian(zdot, z), zdot), z, 0) if inner else z
         found = [ca.vertcat(*(rates[n] for n in BALANCE_RATES)), stack(x)]

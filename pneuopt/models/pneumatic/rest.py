@@ -88,7 +88,7 @@ def solve_steady_motion(glide: MotionBalance, p: ParameterSet, pressure_b: float
         spool, a, b = _solve_balance(glide, p)
     else:
         spool, a, b = 0.0, _balance_pressure_a(glide, p, pressure_b), pressure_b
-    return glide.states(spool, a, b), spool * p.value("valve.span")
+    return glide.states(spool, a, b), p.value("valve.centre") + spool * p.value("valve.span")
 
 
 def _check_motion(p: ParameterSet, speed: float, pressure_b: float | None) -> None:

@@ -41,7 +41,8 @@ class Flows(NamedTuple):
 class ProportionalValve:
     r"""A 5/3 proportional valve: positive voltage opens supply to port a and port b to exhaust.
 
-    The spool's position x is a fraction of its half travel, 1 at the voltage `span`, where it stops. Each edge opens by
+    The spool's position x is a fraction of its half travel: 0 at the voltage `centre`, 1 at `span` above it, where it
+    stops. Each edge opens by
 
     .. math:: o(x) = \tfrac12 \left[(x - x_0) + \sqrt{(x - x_0)^2 + \delta^2}\right] + leak
 
@@ -67,7 +68,7 @@ class ProportionalValve:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Parameters: conductance of an open edge, flow law, geometry and lag of the spool, span of the command."""
+        """Parameters: conductance of an open edge, flow law, the spool's geometry and lag, the command's centre and span."""
         lag = {
             "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True, meaning="corner frequency of the spool's lag"),
             "damping": Parameter(0.7, "1", 0.1, 5.0, log=True, meaning="damping ratio of the spool's lag"),
@@ -86,6 +87,7 @@ class ProportionalValve:
                 meaning="rounding of the edges, a fraction of half the travel",
             ),
             "leak": Parameter(0.0, "1", 0.0, 0.2, meaning="opening of a closed edge, a fraction of the full one"),
+            "centre": Parameter(0.0, "V", -100.0, 100.0, meaning="command at which the valve is closed, 5 V of 0-10 V"),
             "span": Parameter(5.0, "V", 0.1, 100.0, meaning="command from the centre to full opening"),
         }
         conductance = ParameterSet(
@@ -159,4 +161,4 @@ def opening(x: ca.SX, p: Symbols) -> ca.SX:
 
 
 def _spool_command(voltage: ca.SX, p: Symbols) -> ca.SX:
-    return ca.fmax(-1, ca.fmin(1, voltage / p["span"]))
+    return ca.fmax(-1, ca.fmin(1, (voltage - p["centre"]) / p["span"]))

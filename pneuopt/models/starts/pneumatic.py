@@ -9,7 +9,7 @@ search finds the valve with the best balance of forces. Friction is then the sam
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,11 +37,17 @@ AirForce = Callable[[Mapping[str, Any], Any, Any], Any]
 VALVE_CONDUCTANCE, VALVE_LEAK = "valve.conductance", "valve.leak"
 # Values of the valve's shape that are tried where they are free [1].
 VALVE_SHAPE_GRID = {"valve.critical_ratio": (0.15, 0.3, 0.45), "valve.dead_zone": (0.0, 0.02, 0.05, 0.1, 0.2)}
+CENTRE, SPAN = "valve.centre", "valve.span"
+CENTRE_SHIFTS = (-0.02, 0.0, 0.02)  # that are tried where the centre is free [half travels]
 LEAK_GRID = (0.003, 0.01, 0.03, 0.1)  # leaks that are tried where no pressure is logged [1]
 CONDUCTANCE_FACTORS = 2.0 ** np.arange(-1, 5)  # conductances tried there, over `PneumaticLog.min_conductance`
 MIN_LEAK = 1e-4  # least leak of a start [1]: at zero the search would begin on a bound
-# First steps of the refinement: factors on conductance and leak, then differences of critical ratio and dead zone.
-REFINEMENT_STEPS = {VALVE_CONDUCTANCE: 1.4, VALVE_LEAK: 1.8, "valve.critical_ratio": 0.08, "valve.dead_zone": 0.02}
+# First steps of the refinement: factors on conductance and leak, then differences of critical ratio, dead zone [1] and
+# centre [V].
+REFINEMENT_STEPS = {
+    **{VALVE_CONDUCTANCE: 1.4, VALVE_LEAK: 1.8},
+    **{"valve.critical_ratio": 0.08, "valve.dead_zone": 0.02, CENTRE: 0.1},
+}
 GRID_REFINEMENTS = 5  # refinements, each with half the step of the last
 
 
@@ -87,6 +93,7 @@ class PneumaticLog:
     def __init__(self, log: Log, simulator_for: Callable[[tuple[str, ...]], AirSimulator], push: AirForce) -> None:
         self.measured, self.parameters = log.measured, log.parameters
         self._simulator_for, self._air_force = simulator_for, push
+        self._air_by_centre: dict[float, dict[str, Array]] = {}
         position, speed, self._acceleration = filter_motion(self.measured)
         if "position" not in self.measured:
             position = position + self._start_position(position)
@@ -132,16 +139,15 @@ class PneumaticLog:
         """
         unit, leak = 1e-8, 0.01  # the rates are linear in both, so any two values give the columns
         probes = [{**shape, VALVE_CONDUCTANCE: c, VALVE_LEAK: x} for c, x in ((1e-12, 0.0), (unit, 0.0), (unit, leak))]
-        closed, edges, leaking = self._pressure_rates(probes)
+        air = self._air_states(shape.get(CENTRE, self.parameters.value(CENTRE)))
+        closed, edges, leaking = self._pressure_rates(probes, air)
         columns = np.stack([edges - closed, (leaking - edges) / leak], axis=-1) / unit
         return columns, np.column_stack([filter_channel(self.measured, n, 1) for n in self.logged_pressures]) - closed
 
-    def _pressure_rates(self, valves: Sequence[ValveValues]) -> Array:
+    def _pressure_rates(self, valves: Sequence[ValveValues], air: Mapping[str, Array]) -> Array:
         """Rates of the logged pressures with each of several valves [Pa/s], shape (len(valves), n, m)."""
-        given = self._known_signals.with_columns(self._default_air_states)
-        rates = self._simulator_for((*self.known_states, *self._default_air_states)).pressure_rates(
-            given, self._with_valves(valves)
-        )
+        given = self._known_signals.with_columns(air)
+        rates = self._simulator_for((*self.known_states, *air)).pressure_rates(given, self._with_valves(valves))
         return rates[:, :, [PRESSURE_NAMES.index(n) for n in self.logged_pressures]]
 
     def min_conductance(self) -> float:
@@ -151,10 +157,11 @@ class PneumaticLog:
         area = math.pi / 4 * self.parameters.value("cylinder.bore") ** 2
         return max(area * fastest * 0.5 / (REFERENCE_DENSITY * gas), 1e-10)
 
-    @functools.cached_property
-    def _default_air_states(self) -> dict[str, Array]:
-        """States that are not logged, with the given values of the valve."""
-        return self._simulate_air([{}])[0]
+    def _air_states(self, centre: float) -> dict[str, Array]:
+        """States that are not logged, of which the spool follows the centre; else with the given values of the valve."""
+        if centre not in self._air_by_centre:
+            self._air_by_centre[centre] = self._simulate_air([{CENTRE: centre}])[0]
+        return self._air_by_centre[centre]
 
     def _simulate_air(self, valves: Sequence[ValveValues]) -> list[dict[str, Array]]:
         return self._simulator_for(tuple(self.known_states)).simulate_states(
@@ -168,18 +175,24 @@ class PneumaticLog:
         ]
 
 
+def valve_shapes(parameters: ParameterSet, free: Collection[str]) -> dict[str, tuple[float, ...]]:
+    """Values to try of what is free of the valve's shape: critical ratio, dead zone and centre."""
+    around = tuple(parameters.value(CENTRE) + shift * parameters.value(SPAN) for shift in CENTRE_SHIFTS)
+    return {n: tried for n, tried in {**VALVE_SHAPE_GRID, CENTRE: around}.items() if n in free}
+
+
 def _estimate_valve(friction: FrictionModel, runs: Mapping[str, PneumaticLog]) -> dict[str, float]:
     """Estimates of the free parameters among conductance, leak, critical ratio and dead zone."""
     parameters = next(iter(runs.values())).parameters
     free = [
         n
-        for n in (VALVE_CONDUCTANCE, VALVE_LEAK, *VALVE_SHAPE_GRID)
+        for n in (VALVE_CONDUCTANCE, VALVE_LEAK, *VALVE_SHAPE_GRID, CENTRE)
         if any(n in run.parameters.free_names for run in runs.values())
     ]
     if not free:
         return {}
     if any(run.logged_pressures for run in runs.values()):
-        shapes = {n: tried for n, tried in VALVE_SHAPE_GRID.items() if n in free}
+        shapes = valve_shapes(parameters, free)
         best = _search_values(
             shapes, parameters, lambda values: [_fit_valve_to_pressures(runs, free, v)[1] for v in values]
         )

@@ -17,7 +17,7 @@ import numpy as np
 from pneuopt.dynamics.hooks import Log
 from pneuopt.models.starts.following import PRESSURE_NAMES
 from pneuopt.models.starts.friction import filter_channel
-from pneuopt.models.starts.pneumatic import VALVE_SHAPE_GRID, PneumaticLog
+from pneuopt.models.starts.pneumatic import PneumaticLog, valve_shapes
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.units import ATMOSPHERE
 
@@ -144,9 +144,9 @@ def _shift_zero(log: Log, remedy: ZeroShift) -> Log:
 
 def _valve_shapes(log: Log) -> Iterator[dict[str, float]]:
     """Values of the valve's shape parameters to try, where they are free."""
-    free = [n for n in VALVE_SHAPE_GRID if n in log.parameters.free_names]
-    for values in itertools.product(*(VALVE_SHAPE_GRID[n] for n in free)):
-        yield dict(zip(free, values, strict=True))
+    tried = valve_shapes(log.parameters, log.parameters.free_names)
+    for values in itertools.product(*tried.values()):
+        yield dict(zip(tried, values, strict=True))
 
 
 def _regression_residual(columns: Array, wanted: Array) -> float:
