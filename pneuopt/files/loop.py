@@ -49,7 +49,7 @@ def read_loop_sections(
     path : str or Path
         What the messages of errors begin with.
     centre : float
-        Of the plant's valve [the command's unit]; the limits in the file are those of the wire, the loop's are about it.
+        Of the plant's valve [the command's unit]; limits in the file are those of the wire, the loop's are about it.
 
     Returns
     -------

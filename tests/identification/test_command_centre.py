@@ -1,4 +1,4 @@
-"""A valve's command that was logged from 0 to 10 V: the centre is found, and estimated; one about 0 V stays as it is."""
+"""A valve's command that was logged from 0 to 10 V: the centre is found, and estimated; one about 0 V stays."""
 
 import warnings
 
@@ -100,8 +100,8 @@ def simulated(centre: float) -> tuple[po.System, po.ParameterSet, po.Experiment]
 
 def test_the_centre_is_estimated_with_the_rest_and_predicts_the_log() -> None:
     system, truth, log = simulated(5.06)
+    given = truth.with_values({CENTRE: 0.0, "valve.dead_zone": 0.0, "friction.viscous": 50.0})
     with pytest.warns(po.PhysicsWarning, match="closed near 5 V"):
-        given = truth.with_values({CENTRE: 0.0, "valve.dead_zone": 0.0, "friction.viscous": 50.0})
         fit = po.identify(system, [log], given.freed("valve.dead_zone", "friction.viscous"))
     for name in (CENTRE, "valve.dead_zone", "friction.viscous"):
         row = fit.estimates.loc[name]

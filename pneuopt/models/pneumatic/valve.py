@@ -68,7 +68,7 @@ class ProportionalValve:
 
     @property
     def parameters(self) -> ParameterSet:
-        """Parameters: conductance of an open edge, flow law, the spool's geometry and lag, the command's centre and span."""
+        """Parameters: conductance of an open edge, flow law, spool's geometry and lag, command's centre and span."""
         lag = {
             "bandwidth": Parameter(80.0, "Hz", 1.0, 2000.0, log=True, meaning="corner frequency of the spool's lag"),
             "damping": Parameter(0.7, "1", 0.1, 5.0, log=True, meaning="damping ratio of the spool's lag"),

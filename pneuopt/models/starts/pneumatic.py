@@ -45,8 +45,8 @@ MIN_LEAK = 1e-4  # least leak of a start [1]: at zero the search would begin on 
 # First steps of the refinement: factors on conductance and leak, then differences of critical ratio, dead zone [1] and
 # centre [V].
 REFINEMENT_STEPS = {
-    **{VALVE_CONDUCTANCE: 1.4, VALVE_LEAK: 1.8},
-    **{"valve.critical_ratio": 0.08, "valve.dead_zone": 0.02, CENTRE: 0.1},
+    VALVE_CONDUCTANCE: 1.4, VALVE_LEAK: 1.8,
+    "valve.critical_ratio": 0.08, "valve.dead_zone": 0.02, CENTRE: 0.1,
 }
 GRID_REFINEMENTS = 5  # refinements, each with half the step of the last
 
@@ -158,7 +158,7 @@ class PneumaticLog:
         return max(area * fastest * 0.5 / (REFERENCE_DENSITY * gas), 1e-10)
 
     def _air_states(self, centre: float) -> dict[str, Array]:
-        """States that are not logged, of which the spool follows the centre; else with the given values of the valve."""
+        """States that are not logged, with this centre, which the spool follows, and the other given values."""
         if centre not in self._air_by_centre:
             self._air_by_centre[centre] = self._simulate_air([{CENTRE: centre}])[0]
         return self._air_by_centre[centre]
