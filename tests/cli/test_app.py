@@ -371,3 +371,19 @@ def test_impossible_hardware_is_refused_with_its_line(folder: Path) -> None:
     result = run("simulate cylinder.toml speed.toml")
     assert result.exit_code == 2
     assert result.stderr.startswith('error: cylinder.toml:5: [cylinder] rod = "40 mm" is impossible; a rod is thinner')
+
+
+def test_a_valve_for_0_to_10_V_is_simulated_as_one_about_zero_and_written_as_its_wire_carries(folder: Path) -> None:
+    (folder / "cylinder.toml").write_text(CYLINDER.replace("80 %", "30 %"), encoding="utf-8")
+    add("cylinder.toml", '[valve]\ncentre = "5.5 V"\n')
+    (folder / "wire.toml").write_text(SPEED_LOOP.replace('["-5 V", "5 V"]', '["0 V", "10 V"]'), encoding="utf-8")
+    assert run("simulate cylinder.toml wire.toml -o wire_run.csv --json wire.json").exit_code == 0
+    (folder / "cylinder.toml").write_text(CYLINDER.replace("80 %", "30 %"), encoding="utf-8")
+    (folder / "about.toml").write_text(SPEED_LOOP.replace('["-5 V", "5 V"]', '["-5.5 V", "4.5 V"]'), encoding="utf-8")
+    assert run("simulate cylinder.toml about.toml -o about_run.csv --json about.json").exit_code == 0
+    wire, about = (read_log(f"{name}_run.csv").trajectory for name in ("wire", "about"))
+    assert np.ptp(about["valve_voltage"]) > 1
+    np.testing.assert_allclose(wire["valve_voltage"], 5.5 + about["valve_voltage"], atol=1e-6)
+    np.testing.assert_array_equal(wire["position"], about["position"])
+    shown = [json.loads(Path(f"{name}.json").read_text(encoding="utf-8"))["certified"] for name in ("wire", "about")]
+    assert shown[0] == shown[1]

@@ -45,8 +45,11 @@ MIN_LEAK = 1e-4  # least leak of a start [1]: at zero the search would begin on 
 # First steps of the refinement: factors on conductance and leak, then differences of critical ratio, dead zone [1] and
 # centre [V].
 REFINEMENT_STEPS = {
-    VALVE_CONDUCTANCE: 1.4, VALVE_LEAK: 1.8,
-    "valve.critical_ratio": 0.08, "valve.dead_zone": 0.02, CENTRE: 0.1,
+    VALVE_CONDUCTANCE: 1.4,
+    VALVE_LEAK: 1.8,
+    "valve.critical_ratio": 0.08,
+    "valve.dead_zone": 0.02,
+    CENTRE: 0.1,
 }
 GRID_REFINEMENTS = 5  # refinements, each with half the step of the last
 
