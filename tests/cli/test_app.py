@@ -382,7 +382,7 @@ def test_a_valve_for_0_to_10_V_is_simulated_as_one_about_zero_and_written_as_its
     (folder / "about.toml").write_text(SPEED_LOOP.replace('["-5 V", "5 V"]', '["-5.5 V", "4.5 V"]'), encoding="utf-8")
     assert run("simulate cylinder.toml about.toml -o about_run.csv --json about.json").exit_code == 0
     wire, about = (read_log(f"{name}_run.csv").trajectory for name in ("wire", "about"))
-    assert np.ptp(about["valve_voltage"]) > 1
+    assert np.ptp(about["valve_voltage"]) > 0.4
     np.testing.assert_allclose(wire["valve_voltage"], 5.5 + about["valve_voltage"], atol=1e-6)
     np.testing.assert_array_equal(wire["position"], about["position"])
     shown = [json.loads(Path(f"{name}.json").read_text(encoding="utf-8"))["certified"] for name in ("wire", "about")]
