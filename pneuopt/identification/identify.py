@@ -14,6 +14,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
+from pneuopt.identification.budget import CpuBudget, CpuBudgetSpent
 from pneuopt.identification.checks import (
     as_experiments,
     check_free,
@@ -47,7 +48,7 @@ from pneuopt.identification.windows import check_window, fit_in_windows, run_fre
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array, Mask
-from pneuopt.quantities.errors import ConvergenceError
+from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
@@ -79,6 +80,7 @@ def identify(
     window: float | None = None,
     accept: Sequence[str] = (),
     start: IdentificationResult | None = None,
+    cpu_seconds: float = math.inf,
     throw: bool = True,
 ) -> IdentificationResult:
     """Fit the free parameters and every log's start state to the logs; no guess is needed from the user.
@@ -106,6 +108,8 @@ def identify(
     start : IdentificationResult, optional
         A fit of these logs with a model that has the same states, from which the search begins; by default the model's
         own starts.
+    cpu_seconds : float
+        CPU time after which the searches end; the best so far is returned, marked `Code.INTERRUPTED`.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
 
@@ -116,11 +120,13 @@ def identify(
     Raises
     ------
     InputError
-        If logs, system and parameters do not fit together; the message names log, channel or parameter.
+        If logs, system and parameters do not fit together; the message names log, channel or parameter. If the CPU
+        time is over before the first fit.
     ConvergenceError
         If no candidate start converged; the error's `solution` is the result, marked.
     """
     method, model = method or LeastSquares(), as_estimation_model(system)
+    budget = CpuBudget(cpu_seconds, method.progress)
     check_smooth(model)
     experiments = tuple(e.accepting(*accept) for e in as_experiments(experiments))
     if estimate_noise:
@@ -135,30 +141,41 @@ def identify(
         model,
         tuple(experiments),
         model.parameters | parameters,
-        method,
+        replace(method, progress=budget) if math.isfinite(cpu_seconds) else method,
         noise_is_stated=stated,
         window=math.inf if window is None else window,
     )
     if window is not None:
         check_window(problem)
+    try:
+        result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
+    except CpuBudgetSpent:
+        raise InputError(f"{cpu_seconds:g} CPU seconds were over before the first fit; give more") from None
+    result = replace(result, status=budget.assess(result.status))
+    if log_warnings:
+        result = replace(result, status=result.status.with_remedies(*log_warnings))
+    if throw and not result.status.converged:
+        raise ConvergenceError(f"identification {result.status}", result)
+    return result
+
+
+def _fit_and_review(
+    problem: EstimationProblem, loss: Loss | None, start: IdentificationResult | None, *, estimate_noise: bool
+) -> IdentificationResult:
+    """Choose widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
+    window = problem.window
     problem, widths = choose_widths(problem)
     if start is None:
         held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
     else:
         began = fit_holding_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
-    chosen = None if window is None else ChosenWindow(window, window, window, fit.stats["gap_share"])
+    chosen = ChosenWindow(window, window, window, fit.stats["gap_share"]) if math.isfinite(window) else None
     if windowed := fit_in_windows(held, fit):
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
     result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths, window=chosen)
-    if chosen:
-        result = replace(result, status=result.status.with_details(str(chosen)))
-    if log_warnings:
-        result = replace(result, status=result.status.with_remedies(*log_warnings))
-    if throw and not result.status.converged:
-        raise ConvergenceError(f"identification {result.status}", result)
-    return result
+    return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
 
 
 def validate(
