@@ -3,14 +3,22 @@
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.columns import CHANNELS, read_channels
+from pneuopt.logs.frames import frame_table
+from pneuopt.logs.plant_channels import Plant, plant_channels
+from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.intersample import Intersample, usual_intersample
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +87,51 @@ class Experiment:
         object.__setattr__(self, "noise", dict(self.noise))
         object.__setattr__(self, "conditions", dict(self.conditions))
 
+    @classmethod
+    def from_frame(
+        cls,
+        frame: "pd.DataFrame",
+        *,
+        units: Mapping[str, str] | None = None,
+        columns: Mapping[str, str | bool | Mapping[str, str | float]] | None = None,
+        name: str = "frame",
+        plant: Plant | None = None,
+        ambient_pressure: float = ATMOSPHERE,
+    ) -> "Experiment":
+        """Take a log from a pandas DataFrame, as `read_log` takes it from a file.
+
+        Parameters
+        ----------
+        frame : DataFrame
+            Its columns are called like channels, with their units ("position [mm]") or without. Its index is the time
+            if it holds dates or durations, or is named so; dates count from the first.
+        units : mapping of str to str, optional
+            Units of columns whose name says none: {"time": "s", "position": "mm"}.
+        columns, plant, ambient_pressure
+            As for `read_log`.
+        name : str
+            What tables and messages call it.
+
+        Returns
+        -------
+        Experiment
+
+        Raises
+        ------
+        LogError, UnitError, UnknownNameError
+            As `read_log` does; rows are counted from 1.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> frame = pd.DataFrame({"time": range(10), "position [mm]": range(10)})
+        >>> Experiment.from_frame(frame, units={"time": "ms"}).trajectory["position"][2].item()
+        0.002
+        """
+        table = frame_table(frame, units or {}, name)
+        with count_gauge_from(ambient_pressure):
+            return experiment_from_table(table, columns or {}, f"{name}: columns", plant, name)
+
     def unit(self, channel: str) -> str:
         """The SI unit of a channel; empty where nothing says it."""
         return self.units.get(channel) or CHANNELS.get(channel, "")
@@ -105,6 +158,39 @@ class Experiment:
     def with_conditions(self, conditions: Mapping[str, float]) -> "Experiment":
         """Override the named parameters [SI] in this log, by copy."""
         return replace(self, conditions={**self.conditions, **conditions})
+
+
+def experiment_from_table(
+    table: Table, columns: Mapping[str, Any], where: str, plant: Plant | None, name: str
+) -> Experiment:
+    """Give the columns of a table their meaning.
+
+    Parameters
+    ----------
+    table : Table
+    columns : mapping
+        Channel to column, as in a sidecar's [columns]; the table's names say the others.
+    where : str
+        Where `columns` comes from, for messages.
+    plant : System, optional
+        Its signals are channels, too.
+    name : str
+        Of the experiment.
+
+    Returns
+    -------
+    Experiment
+
+    Raises
+    ------
+    LogError, UnitError, UnknownNameError
+        As `read_channels` does.
+    """
+    own = {} if plant is None else plant_channels(plant)
+    values, remarks = read_channels(table, columns, where, {**CHANNELS, **own})
+    trajectory = Trajectory(values.pop("time"), values)
+    units = {n: unit for n, unit in own.items() if n in trajectory and CHANNELS.get(n) != unit}
+    return Experiment(trajectory, name=name, units=units, remarks=remarks)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
@@ -173,7 +259,7 @@ def resample(experiment: Experiment, step: float) -> Experiment:
     # A grid point that rounding puts just before its sample still belongs to that sample.
     held = np.searchsorted(old.t, grid + 1e-9 * step, side="right") - 1
     runs = {n: experiment.intersample.get(n) or usual_intersample(n, experiment.unit(n)) for n in old}
-    values = {n: np.interp(grid, old.t, c) if runs[n] is Intersample.LINEAR else c[held] for n, c in old.values.items()}
+    values = {n: np.interp(grid, old.t, old[n]) if runs[n] is Intersample.LINEAR else old[n][held] for n in old}
     return replace(experiment, trajectory=Trajectory(grid, values))
 
 

@@ -1,19 +1,27 @@
-"""Reader of MATLAB's .mat logs, versions 4 to 7: one vector a channel, or a structure of vectors."""
+"""Reader of MATLAB's .mat logs, versions 4 to 7: vectors, structures of them, Simulink's and dSPACE's structures."""
 
 import io
-from collections.abc import Mapping, Sequence
-from functools import partial
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pneuopt.logs.table import Table
-from pneuopt.quantities.arrays import Array
+from pneuopt.logs.arrays import array_table, damage
+from pneuopt.logs.table import Table, check_columns
 from pneuopt.quantities.errors import LogError, require
 
 _STRUCTURE_REMEDY = "in MATLAB, save('run.mat', '-struct', 'S') with S a structure of vectors; of a table T, "
 _STRUCTURE_REMEDY += "S = table2struct(T, 'ToScalar', true)"
+MAX_DEPTH = 4
+"""Structures in structures [1]: dSPACE's have 2; more depth finds numbers that are settings."""
+
+
+class _Column(NamedTuple):
+    name: str
+    values: Any
+    unit: str = ""
 
 
 def read_table(path: Path, raw: bytes) -> Table:
@@ -24,8 +32,9 @@ def read_table(path: Path, raw: bytes) -> Table:
     path : Path
         For messages.
     raw : bytes
-        Its vectors of real numbers are columns, and so are those in its structures, by the name of their field; NaN is
-        a missing sample. Whatever else the file holds is left alone.
+        Its vectors of real numbers are columns, and so are those in its structures, by the name of their field. In a
+        structure array, as Simulink's ("Structure With Time") and dSPACE's, each element is a column by its `label` or
+        `Name`, and their time is in seconds. NaN is a missing sample. Whatever else the file holds is left alone.
 
     Returns
     -------
@@ -37,43 +46,66 @@ def read_table(path: Path, raw: bytes) -> Table:
     LogError
         If the file is not a .mat file of these versions, or holds no vector.
     """
-    columns = [(name, value) for name, value in _flatten(_load(path, raw)) if _is_vector(value)]
+    columns = [column for column in _columns(_load(path, raw)) if _is_vector(column.values)]
     require(bool(columns), f"{path}: no vector of numbers; {_STRUCTURE_REMEDY}", LogError)
-    return Table(path, [name for name, _ in columns], 1, partial(_read_columns, path, dict(columns)))
+    names = [column.name for column in columns]
+    check_columns(path, names)
+    units = {column.name: column.unit for column in columns if column.unit}
+    return array_table(path, {column.name: column.values for column in columns}, units)
 
 
 def _load(path: Path, raw: bytes) -> Mapping[str, Any]:
     from scipy.io import loadmat
 
+    file: Any = io.BytesIO(raw)  # which the types do not know
     try:
-        file: Any = io.BytesIO(raw)  # which the types do not know
-        return loadmat(file, squeeze_me=True)
+        with warnings.catch_warnings(action="ignore"):
+            return loadmat(file, squeeze_me=True)
     except NotImplementedError:
         remedy = "in MATLAB, save it with the option '-v7'"
         raise LogError(f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}") from None
     except Exception as error:  # scipy raises whatever a damaged file makes it raise
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise LogError(f"{path}: cannot be read as a .mat file ({reason}); save the log again") from None
+        raise damage(path, "a .mat file", error) from None
 
 
-def _flatten(variables: Mapping[str, Any]) -> list[tuple[str, Any]]:
+def _columns(variables: Mapping[str, Any]) -> Iterator[_Column]:
     """Variables by name, and in place of a structure its fields."""
-    found: list[tuple[str, Any]] = []
     for name, value in variables.items():
-        if isinstance(value, np.ndarray) and value.dtype.names and value.shape == ():
-            found += [(field, value[field].item()) for field in value.dtype.names]
-        elif not name.startswith("__"):  # loadmat's own, such as "__header__"
-            found.append((name, value))
-    return found
+        if not name.startswith("__"):  # loadmat's own, such as "__header__"
+            yield from _flatten(_Column(name, value), 0)
+
+
+def _flatten(column: _Column, depth: int) -> Iterator[_Column]:
+    value = column.values
+    fields = value.dtype.names if isinstance(value, np.ndarray) else None
+    if not fields:
+        yield column
+        return
+    if depth == MAX_DEPTH or value.ndim > 1:
+        return
+    for element in np.atleast_1d(value):
+        signal = _signal(column.name, element, fields)
+        if signal is not None:
+            yield signal
+        elif value.ndim == 0:
+            for field in fields:
+                unit = "s" if field == "time" and "signals" in fields else ""  # Simulink's
+                yield from _flatten(_Column(field, element[field], unit), depth + 1)
+
+
+def _signal(name: str, element: Any, fields: tuple[str, ...]) -> _Column | None:
+    """One signal of Simulink's structure with time (values, label) or of dSPACE's (Data, Name, Unit)."""
+    for values, label in (("values", "label"), ("Data", "Name")):
+        if values in fields and label in fields:
+            said, unit = str(element[label]), str(element["Unit"]) if "Unit" in fields else ""
+            is_time = name == "X" and not _is_text(element[label])
+            return _Column("time" if is_time else said, element[values], "s" if is_time else unit.strip("[]"))
+    return None
+
+
+def _is_text(value: Any) -> bool:
+    return str(value) not in {"", "[]"}
 
 
 def _is_vector(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiub"
-
-
-def _read_columns(path: Path, columns: Mapping[str, Array], names: Sequence[str]) -> dict[str, Array]:
-    for name in names[1:]:
-        n, first = columns[name].size, columns[names[0]].size
-        text = f"{path}: column {name!r} has {n} samples, column {names[0]!r} has {first}; export them at one rate"
-        require(n == first, text, LogError)
-    return {name: columns[name].astype(float) for name in names}

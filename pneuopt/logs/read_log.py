@@ -3,35 +3,21 @@
 import hashlib
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from pneuopt.logs.budget import MAX_NESTING, MAX_SIDECAR_BYTES, read_bytes
-from pneuopt.logs.columns import CHANNELS, read_channels
-from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.experiments import Experiment, experiment_from_table
+from pneuopt.logs.plant_channels import Plant
 from pneuopt.logs.readers import read_table
 from pneuopt.logs.sidecar_keys import ACCEPTED_CHECKS, INTERSAMPLE_KEY, SIDECAR_KEYS
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value
-
-
-class Plant(Protocol):
-    """What a log's reader asks of a plant, say a `System`."""
-
-    @property
-    def inputs(self) -> tuple[Quantity, ...]:
-        """Signals that drive it."""
-        ...
-
-    @property
-    def outputs(self) -> tuple[Quantity, ...]:
-        """Signals that sensors show."""
-        ...
 
 
 def read_log(
@@ -47,7 +33,8 @@ def read_log(
     Parameters
     ----------
     path : str or Path
-        Its suffix says the format: text (.csv, .txt, .tsv, .dat), .parquet or .mat (up to version 7). In a text, a
+        Its suffix says the format: text (.csv, .txt, .tsv, .dat), LabVIEW's .lvm, MATLAB's .mat (up to version 7), or,
+        with the extra of that name, .xlsx, .tdms, .parquet and, with the extra mdf, .mf4 and .mdf. In a text, a
         comma, semicolon, tab or white space separates the columns; the decimal mark is a point or a comma; an empty
         cell or NaN is a missing sample; rows above the one that names the columns are metadata, and one below it may
         hold their units. The time may be stamps (ISO 8601, 12.03.2026 10:00:00,5, a time of day), which count from
@@ -79,17 +66,17 @@ def read_log(
     sha256 = hashlib.sha256(raw).hexdigest()
     side, sections = _read_sidecar(path, sidecar)
     entries, where = (columns, "columns") if columns is not None else (sections.get("columns", {}), f"{side}: columns")
-    units = {} if plant is None else _plant_channels(plant)
-    channels = {**CHANNELS, **units}
     with count_gauge_from(ambient_pressure):
-        values, remarks = read_channels(read_table(path, raw), entries, where, channels)
+        run = experiment_from_table(read_table(path, raw), entries, where, plant, path.stem)
         conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
-    trajectory = Trajectory(values.pop("time"), values)
-    noise = _read_noise(sections.get("noise", {}), trajectory, f"{side}: noise", channels)
-    own = {n: unit for n, unit in units.items() if n in trajectory and CHANNELS.get(n) != unit}
-    between = _read_intersample(sections.get("intersample", {}), trajectory, f"{side}: intersample")
-    accept = tuple(sections.get(ACCEPTED_CHECKS, ()))
-    return Experiment(trajectory, noise, conditions, path.stem, sha256, own, between, accept=accept, remarks=remarks)
+    return replace(
+        run,
+        noise=_read_noise(sections.get("noise", {}), run, f"{side}: noise"),
+        conditions=conditions,
+        sha256=sha256,
+        intersample=_read_intersample(sections.get("intersample", {}), run.trajectory, f"{side}: intersample"),
+        accept=tuple(sections.get(ACCEPTED_CHECKS, ())),
+    )
 
 
 def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping[str, Any]]:
@@ -122,18 +109,10 @@ def _parse_toml(path: Path, raw: bytes) -> dict[str, Any]:
         raise LogError(f"{path}: not valid TOML: {error}") from None
 
 
-def _plant_channels(plant: Plant) -> dict[str, str]:
-    """The channels that a plant's log may hold: its signals, and the references of its outputs."""
-    references = {f"{q.name}_reference": q.unit for q in plant.outputs}
-    return {**{q.name: q.unit for q in (*plant.inputs, *plant.outputs)}, **references}
-
-
-def _read_noise(
-    entries: Mapping[str, Any], trajectory: Trajectory, where: str, channels: Mapping[str, str]
-) -> dict[str, float]:
-    check_names("channel", entries, trajectory, where)
+def _read_noise(entries: Mapping[str, Any], run: Experiment, where: str) -> dict[str, float]:
+    check_names("channel", entries, run.trajectory, where)
     # A noise is a difference, so a pressure's takes no (a) or (g).
-    return {c: read_value(v, channels[c].partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}
+    return {c: read_value(v, run.unit(c).partition("(")[0], where=f"{where}.{c}") for c, v in entries.items()}
 
 
 def _read_intersample(entries: Mapping[str, Any], trajectory: Trajectory, where: str) -> dict[str, Intersample]:

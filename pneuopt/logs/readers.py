@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from pneuopt.logs import csv, mat, parquet
+from pneuopt.logs import csv, lvm, mat, mdf, parquet, tdms, xlsx
 from pneuopt.logs.table import Table
 from pneuopt.quantities.errors import LogError, require
 
@@ -14,6 +14,11 @@ READERS: Mapping[str, Callable[[Path, bytes], Table]] = {
     ".dat": csv.read_table,
     ".parquet": parquet.read_table,
     ".mat": mat.read_table,
+    ".lvm": lvm.read_table,
+    ".xlsx": xlsx.read_table,
+    ".tdms": tdms.read_table,
+    ".mf4": mdf.read_table,
+    ".mdf": mdf.read_table,
 }
 """The suffix of a file, in lower case, to the function that reads it."""
 

@@ -48,11 +48,14 @@ class Table:
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        n = len(self.names)
-        require(
-            n <= MAX_COLUMNS, f"{self.path}: {n} columns are more than {MAX_COLUMNS}; export fewer channels", LogError
-        )
-        for name, uses in Counter(filter(None, self.names)).items():
-            require(uses == 1, f"{self.path}: two columns are named {name[:MAX_NAME]!r}; rename one", LogError)
-            text = f"{self.path}: the name of column {name[:20]!r}... has {len(name)} characters; shorten it"
-            require(len(name) <= MAX_NAME, text, LogError)
+        check_columns(self.path, self.names)
+
+
+def check_columns(path: Path | str, names: Sequence[str]) -> None:
+    """Refuse two columns of the same name, and more columns, or longer names, than a log has."""
+    n = len(names)
+    require(n <= MAX_COLUMNS, f"{path}: {n} columns are more than {MAX_COLUMNS}; export fewer channels", LogError)
+    for name, uses in Counter(filter(None, names)).items():
+        require(uses == 1, f"{path}: two columns are named {name[:MAX_NAME]!r}; rename one", LogError)
+        text = f"{path}: the name of column {name[:20]!r}... has {len(name)} characters; shorten it"
+        require(len(name) <= MAX_NAME, text, LogError)

@@ -1,4 +1,4 @@
-"""Writes the same log as twenty loggers and programs write it: ``python tests/logs/styles.py FOLDER``.
+"""Writes the same log as twenty loggers and programs write it as text: ``python tests/logs/styles.py FOLDER``.
 
 The log: 40 samples, one every 20 ms, of a position, a valve voltage and a chamber's pressure.
 """

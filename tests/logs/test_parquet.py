@@ -1,4 +1,3 @@
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +5,7 @@ import pandas as pd
 import pytest
 
 from pneuopt.logs.read_log import read_log
-from pneuopt.quantities.errors import InputError, LogError
+from pneuopt.quantities.errors import LogError
 
 TIME = 0.1 * np.arange(12)
 
@@ -36,10 +35,3 @@ def test_text_is_left_alone_where_it_is_not_used_and_refused_where_it_is(tmp_pat
     assert read_log(path).trajectory.names == ("position",)
     with pytest.raises(LogError, match=r"row 2, column 'note': 'good' is not a number, as the column's type is"):
         read_log(path, columns={"time": "time [s]", "force": {"column": "note", "unit": "N"}})
-
-
-def test_without_pyarrow_the_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = written(tmp_path, **{"position [mm]": TIME})
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"Parquet needs pyarrow; run: pip install 'pneuopt\[logs\]'"):
-        read_log(path)

@@ -14,7 +14,7 @@ from pneuopt.quantities.errors import LogError, UnknownNameError
 
 Columns = Mapping[str, Sequence[float]]
 N = 12
-TIME = [0.1 * k for k in range(N)]
+TIME = [k / 10 for k in range(N)]
 LOG: Columns = {"time_s": TIME, "position_mm": [float(k * k) for k in range(N)], "U_valve": [0.5 * k for k in range(N)]}
 SIDECAR = """
 [columns]
@@ -43,6 +43,40 @@ def write_mat(path: Path, columns: Columns) -> None:
     savemat(path, {name: np.array(values)[:, None] for name, values in columns.items()}, appendmat=False)
 
 
+def write_lvm(path: Path, columns: Columns) -> None:
+    head = "LabVIEW Measurement\t\nX_Columns\tOne\n***End_of_Header***\t\n\nChannels\t2\n***End_of_Header***\t\n"
+    rows = ("\t".join("" if np.isnan(v) else repr(v) for v in row) for row in zip(*columns.values(), strict=True))
+    names = ["X_Value", *[name for name in columns if name != "time_s"]]
+    path.write_text(head + "\n".join(["\t".join(names), *rows]) + "\n", encoding="utf-8")
+
+
+def write_xlsx(path: Path, columns: Columns) -> None:
+    import openpyxl
+
+    book = openpyxl.Workbook()
+    book.active.append(list(columns))
+    for row in zip(*columns.values(), strict=True):
+        book.active.append([None if np.isnan(v) else v if np.isfinite(v) else str(v) for v in row])
+    book.save(path)
+
+
+def write_tdms(path: Path, columns: Columns) -> None:
+    from nptdms import ChannelObject, TdmsWriter
+
+    with TdmsWriter(path) as writer:
+        writer.write_segment([ChannelObject("Log", name, np.array(values)) for name, values in columns.items()])
+
+
+def write_mdf(path: Path, columns: Columns) -> None:
+    from asammdf import MDF, Signal
+
+    time = np.array(columns["time_s"])
+    signals = [Signal(np.array(v), time, name=name) for name, v in columns.items() if name != "time_s"]
+    with MDF(version="3.30" if path.suffix == ".mdf" else "4.10") as file:
+        file.append(signals, common_timebase=True)
+        file.save(path, overwrite=True)
+
+
 WRITERS: dict[str, Callable[[Path, Columns], None]] = {
     ".csv": write_text,
     ".txt": write_text,
@@ -50,9 +84,16 @@ WRITERS: dict[str, Callable[[Path, Columns], None]] = {
     ".dat": write_text,
     ".parquet": write_parquet,
     ".mat": write_mat,
+    ".lvm": write_lvm,
+    ".xlsx": write_xlsx,
+    ".mf4": write_mdf,
+    ".mdf": write_mdf,
+    ".tdms": write_tdms,
 }
-FIRST_ROWS = dict.fromkeys((".csv", ".txt", ".tsv", ".dat"), 2)
+FIRST_ROWS = {**dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".xlsx"), 2), ".lvm": 8}
 """The row number of a format's first sample, where it is not 1."""
+TIME_NAMES = dict.fromkeys((".lvm", ".mf4", ".mdf"), "time")
+"""What the column of the time is called, where the format does not name it."""
 
 
 @pytest.fixture(params=sorted(READERS))
@@ -64,7 +105,8 @@ def written(folder: Path, suffix: str, columns: Columns, sidecar: str = "") -> P
     path = folder / f"run{suffix}"
     WRITERS[suffix](path, columns)
     if sidecar:
-        path.with_suffix(".toml").write_text(sidecar, encoding="utf-8")
+        text = sidecar.replace("time_s", TIME_NAMES.get(suffix, "time_s"))
+        path.with_suffix(".toml").write_text(text, encoding="utf-8")
     return path
 
 
@@ -115,6 +157,7 @@ def test_a_bad_cell_is_named_by_row_and_column(
     columns = {name: list(values) for name, values in LOG.items()}
     columns[column][5] = sample
     path = written(tmp_path, suffix, columns)
+    said = said.replace("time_s", TIME_NAMES.get(suffix, "time_s"))
     with pytest.raises(LogError, match=said.format(row=FIRST_ROWS.get(suffix, 1) + 5)) as error:
         read_log(path)
     assert str(error.value).startswith(f"{path}: ")
@@ -122,8 +165,9 @@ def test_a_bad_cell_is_named_by_row_and_column(
 
 def test_a_column_that_is_not_there_is_named(tmp_path: Path, suffix: str) -> None:
     path = written(tmp_path, suffix, LOG)
+    time = TIME_NAMES.get(suffix, "time_s")
     with pytest.raises(UnknownNameError, match=r"unknown column 'position'; did you mean 'position_mm'\?"):
-        read_log(path, columns={"time": "time_s", "position": {"column": "position", "unit": "mm"}})
+        read_log(path, columns={"time": time, "position": {"column": "position", "unit": "mm"}})
 
 
 @pytest.mark.parametrize("raw", [b"", b"\x00\x01\xffno log at all\n" * 40], ids=["empty", "noise"])
@@ -138,7 +182,7 @@ def test_a_file_that_is_not_of_its_format_is_refused_in_one_line(tmp_path: Path,
     assert ";" in message, "the message ends with a remedy"
 
 
-@pytest.mark.parametrize(("name", "shown"), [("run.xlsx", "'.xlsx'"), ("run", "a name without suffix")])
+@pytest.mark.parametrize(("name", "shown"), [("run.xls", "'.xls'"), ("run", "a name without suffix")])
 def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path: Path, name: str, shown: str) -> None:
     (tmp_path / name).write_text("time_s,position_mm\n", encoding="utf-8")
     with pytest.raises(LogError) as error:
