@@ -24,6 +24,7 @@ from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.convergence import MAX_GAP_SHARE
+from pneuopt.shooting.free_run import close_gaps
 from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.solution import Fit
 
@@ -133,10 +134,12 @@ def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
     Returns
     -------
     tuple of Trajectory
-        With what is not finite where the model diverges.
+        The outputs, and the states where the run took all samples in a row; not finite where the model diverges.
     """
     if not problem.system.states:
         return fit.trajectories
+    if math.isinf(problem.window) and fit.optimum is not None and (y := close_gaps(fit.optimum)) is not None:
+        return fit.optimum.equations.segments.output_trajectories(y)
     whole = replace(problem, window=math.inf, method=replace(problem.method, segment_time=math.inf))
     segments = segment(whole.transcription(whole.start_from(fit)))
     q = np.array([p.value for p in segments.transcription.parameters.values()])

@@ -263,7 +263,7 @@ def second_order_correction(equations: NormalEquations, step: Array, moved: Arra
     """
     segments, slopes, n = equations.segments, equations.linearisation, nodes.shape[1]
     excess = gaps - _promised_gaps(equations, _unknown_changes(equations, step, moved))
-    shift = _propagate_shifts(np.where(segments.linked[:, None, None], slopes.end_sensitivities[:, :, :n], 0.0), excess)
+    shift = propagate_shifts(np.where(segments.linked[:, None, None], slopes.end_sensitivities[:, :, :n], 0.0), excess)
     return np.asarray(nodes + shift * segments.nominal)
 
 
@@ -342,7 +342,7 @@ def _promised_gaps(equations: NormalEquations, change: Array) -> Array:
     return np.where(segments.linked[:, None], promised, 0.0)
 
 
-def _propagate_shifts(own: Array, excess: Array) -> Array:
+def propagate_shifts(own: Array, excess: Array) -> Array:
     """Shifts s of the nodes with s[0] = 0 and s[i + 1] = own[i] s[i] + excess[i], as one banded triangle."""
     m, n, _ = own.shape
     band = np.zeros((2 * n, m * n))

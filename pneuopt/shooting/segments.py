@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -162,14 +163,18 @@ class Segments:
     def trajectories(self, run: RolloutResult) -> tuple[Trajectory, ...]:
         """States and outputs at every sample of a run with states, one trajectory a phase."""
         assert run.x is not None
-        real = np.arange(self.t.shape[1]) < self.lengths[:, None]
-        out = []
+        own = names((*self.system.states, *self.system.outputs))
+        return self._as_trajectories(own, np.concatenate([run.x, run.y], axis=2))
+
+    def output_trajectories(self, y: Array) -> tuple[Trajectory, ...]:
+        """Outputs at every sample, shape (m, n, n_outputs), as one trajectory a phase."""
+        return self._as_trajectories(names(self.system.outputs), y)
+
+    def _as_trajectories(self, columns: Sequence[str], values: Array) -> tuple[Trajectory, ...]:
+        real, out = np.arange(self.t.shape[1]) < self.lengths[:, None], list[Trajectory]()
         for i, phase in enumerate(self.transcription.phases):
             rows = self.phase == i
-            x, y = (a[rows][real[rows]] for a in (run.x, run.y))
-            columns = dict(zip(names(self.system.states), x.T, strict=True))
-            columns |= dict(zip(names(self.system.outputs), y.T, strict=True))
-            out.append(Trajectory(phase.t, columns))
+            out.append(Trajectory(phase.t, dict(zip(columns, values[rows][real[rows]].T, strict=True))))
         return tuple(out)
 
 
