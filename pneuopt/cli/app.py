@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -74,6 +75,14 @@ def identify_command(
     select: Annotated[
         bool, typer.Option("--select", help="Compare friction models instead, and recommend one.")
     ] = False,
+    budget: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            help="CPU time after which the search ends with the best values so far.",
+            show_default="none",
+        ),
+    ] = inf,
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
@@ -81,9 +90,10 @@ def identify_command(
         from pneuopt.cli.identify import run_identify, run_select
         from pneuopt.cli.shared import Outputs
 
-        run = run_select if select else run_identify
-        files = _expand_patterns(logs)
-        raise typer.Exit(run(drive, files, Outputs(output, json, plot), window, quiet, accept or ()))
+        given = drive, _expand_patterns(logs), Outputs(output, json, plot), window, quiet, accept or ()
+        require(budget > 0, f"--budget {budget:g}: give the CPU seconds that the search may take")
+        require(budget == inf or not select, "--budget limits one fit: leave it out with --select")
+        raise typer.Exit(run_select(*given) if select else run_identify(*given, budget))
 
 
 @app.command("tune")

@@ -1,5 +1,6 @@
 """`pneuopt identify` and `pneuopt simulate --log`: from logs to parameters, and back to logs."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -53,7 +54,13 @@ REFUSAL_FIGURE = "refused"
 
 
 def run_identify(
-    drive: Path, logs: Sequence[Path], outputs: Outputs, window: float | None, quiet: bool, accept: Sequence[str] = ()
+    drive: Path,
+    logs: Sequence[Path],
+    outputs: Outputs,
+    window: float | None,
+    quiet: bool,
+    accept: Sequence[str] = (),
+    budget: float = math.inf,
 ) -> int:
     """Identify from logs; returns the exit status."""
     outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE)
@@ -66,7 +73,9 @@ def run_identify(
         warn(f"before the fit: {sentence}")
     with _draw_refusal(outputs), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
-        result = identify(system, experiments, parameters, method=method, window=window, throw=False)
+        result = identify(
+            system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
+        )
     console = make_console()
     show_status(console, result.status)
     show_estimates(console, result.estimates, result.widths)

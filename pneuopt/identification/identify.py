@@ -14,7 +14,6 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
-from pneuopt.identification.budget import CpuBudget, CpuBudgetSpent
 from pneuopt.identification.checks import (
     as_experiments,
     check_free,
@@ -48,11 +47,12 @@ from pneuopt.identification.windows import check_window, fit_in_windows, run_fre
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array, Mask
-from pneuopt.quantities.errors import ConvergenceError, InputError
+from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.budget import CpuBudget
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.shooting.solution import Fit
 
@@ -109,7 +109,8 @@ def identify(
         A fit of these logs with a model that has the same states, from which the search begins; by default the model's
         own starts.
     cpu_seconds : float
-        CPU time after which the searches end; the best so far is returned, marked `Code.INTERRUPTED`.
+        CPU time of this process after which the search ends [s], within an iteration, with the best values so far; the
+        status then says so first, and is `Code.BUDGET`.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
 
@@ -120,13 +121,13 @@ def identify(
     Raises
     ------
     InputError
-        If logs, system and parameters do not fit together; the message names log, channel or parameter. If the CPU
-        time is over before the first fit.
+        If logs, system and parameters do not fit together; the message names log, channel or parameter.
     ConvergenceError
         If no candidate start converged; the error's `solution` is the result, marked.
     """
     method, model = method or LeastSquares(), as_estimation_model(system)
-    budget = CpuBudget(cpu_seconds, method.progress)
+    if math.isfinite(cpu_seconds):
+        method = replace(method, budget=CpuBudget(cpu_seconds))
     check_smooth(model)
     experiments = tuple(e.accepting(*accept) for e in as_experiments(experiments))
     if estimate_noise:
@@ -141,17 +142,13 @@ def identify(
         model,
         tuple(experiments),
         model.parameters | parameters,
-        replace(method, progress=budget) if math.isfinite(cpu_seconds) else method,
+        method,
         noise_is_stated=stated,
         window=math.inf if window is None else window,
     )
     if window is not None:
         check_window(problem)
-    try:
-        result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
-    except CpuBudgetSpent:
-        raise InputError(f"{cpu_seconds:g} CPU seconds were over before the first fit; give more") from None
-    result = replace(result, status=budget.assess(result.status))
+    result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
     if log_warnings:
         result = replace(result, status=result.status.with_remedies(*log_warnings))
     if throw and not result.status.converged:
@@ -175,6 +172,8 @@ def _fit_and_review(
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
     result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths, window=chosen)
+    if problem.method.budget is not None:
+        result = replace(result, status=problem.method.budget.name_end(result.status))
     return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
 
 

@@ -23,6 +23,7 @@ from pneuopt.identification.result import ChosenWidth
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
+from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.search import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
@@ -90,7 +91,7 @@ def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[
     problem : EstimationProblem
         With these widths.
     chosen : tuple of ChosenWidth
-        Empty where all are stated, or the model has none.
+        Empty where all are stated, the model has none, or the CPU budget ends before that.
 
     Raises
     ------
@@ -101,7 +102,10 @@ def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[
     if not open_names:
         return problem, ()
     given = problem.parameters
-    best, too_stiff = _race_widths(problem, open_names)
+    try:
+        best, too_stiff = _race_widths(problem, open_names)
+    except BudgetSpentError:
+        return problem, ()
     edits = {n: replace(given[n], value=v, source=CHOSEN_WIDTH) for n, v in best.widths.items() if v != given.value(n)}
     chosen = (ChosenWidth(n, v, given[n].unit, given.value(n), n in too_stiff) for n, v in best.widths.items())
     return replace(problem, parameters=given | ParameterSet(edits)), tuple(chosen)
@@ -229,6 +233,8 @@ class _Race:
         transcription = problem.transcription(problem.candidates()[0])
         fit = solve_least_squares(transcription, method)
         if fit.status.code is Code.INTERRUPTED:
+            if method.budget is not None:
+                method.budget.check()
             raise KeyboardInterrupt
         too_stiff = fit.stats["iterations"] == 0 and _is_too_stiff(transcription, method)
         cost = inf if too_stiff or not fit.stats["cost"] < inf else fit.stats["cost"]

@@ -19,6 +19,7 @@ class Code(Enum):
     DIVERGED = "the iteration left the region where the model is defined"
     NOT_CERTIFIED = "the independent simulation does not confirm the claim"
     INTERRUPTED = "interrupted"
+    BUDGET = "the CPU budget is spent"
 
 
 @dataclass(frozen=True)

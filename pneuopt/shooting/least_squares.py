@@ -8,6 +8,7 @@ as single shooting does, which fails there (problems/speed/benchmark_identificat
 from dataclasses import dataclass, field
 
 from pneuopt.quantities.status import ProgressCallback
+from pneuopt.shooting.budget import CpuBudget
 from pneuopt.shooting.search import Search
 from pneuopt.shooting.segments import segment
 from pneuopt.shooting.solution import Fit
@@ -52,6 +53,8 @@ class LeastSquares:
         States whose rate holds no free parameter keep their gaps this much smaller.
     progress : callable, optional
         Receives one line of text an iteration.
+    budget : CpuBudget, optional
+        Ends the search as Ctrl-C does, before the iteration that comes next.
     """
 
     stages: tuple[Stage, ...] = (
@@ -67,6 +70,7 @@ class LeastSquares:
     tolerance: float = 0.1
     kinematic: float = 0.01
     progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
+    budget: CpuBudget | None = field(default=None, repr=False, compare=False)
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:

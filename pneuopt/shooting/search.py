@@ -263,6 +263,8 @@ class Search:
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
         for _ in range(iterations):
+            if self.method.budget is not None:
+                self.method.budget.check()
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
                 self._correct_residuals(self.stage.refine * self.substeps)
                 descent.objective = self._objective()

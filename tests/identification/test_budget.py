@@ -1,61 +1,64 @@
-"""The CPU time that an identification may take."""
+"""A CPU budget ends a search with the best values so far, and the status says so first."""
 
-import sys
-import time
+import itertools
+import math
 
 import numpy as np
 import pytest
 
-from pneuopt.identification.budget import CpuBudgetSpent
 from pneuopt.identification.identify import identify
-from pneuopt.logs.experiments import Experiment
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Stribeck
+from pneuopt.models.friction import Coulomb
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.quantities.trajectories import Trajectory
+from tests.identification.test_identify import FREE, pushed
 
-identify_module = sys.modules[identify.__module__]
-SYSTEM = ForceDrive(Stribeck()).system()
-FREE = ("friction.coulomb", "friction.viscous")
-
-
-def another_plants_log() -> tuple[Experiment, ParameterSet]:
-    """A drive that no friction explains: it is pulled back, too."""
-    t = np.arange(600) * 1e-3
-    force = 60 * np.sin(2 * np.pi * 4 * t)
-    position = 0.02 * np.sin(2 * np.pi * 4 * t - 2.5) + 0.002 * np.sin(2 * np.pi * 17 * t)
-    return Experiment(Trajectory(t, {"force": force, "position": position}), {"position": 1e-6}), SYSTEM.parameters
+DRIVE = ForceDrive(Coulomb())
+PARAMETERS = DRIVE.parameters.freed(*FREE)
 
 
-def clock(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
-    """A CPU clock that a look at it moves on [s]."""
-    seconds = iter(np.arange(0.0, 1e6, step))
-    monkeypatch.setattr(time, "process_time", lambda: float(next(seconds)))
+def fit(budget: float, parameters: ParameterSet = PARAMETERS) -> IdentificationResult:
+    return identify(DRIVE, [pushed(Coulomb())], parameters, cpu_seconds=budget, throw=False)
 
 
-def test_when_the_cpu_time_is_over_the_best_so_far_is_handed_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, given = another_plants_log()
-    clock(monkeypatch, 0.1)
-    fit = identify(SYSTEM, log, given.freed(*FREE), cpu_seconds=1.0, accept=["work"], throw=False)
-    assert fit.status.code is Code.INTERRUPTED
-    assert fit.status.verdict.startswith("1 CPU seconds were over: the best ")
-    assert "give more CPU seconds, or a part of the logs" in fit.status.sentences
-    assert "run again for an answer" not in fit.status.sentences
-    clock(monkeypatch, 0.1)
-    with pytest.raises(ConvergenceError, match="1 CPU seconds were over"):
-        identify(SYSTEM, log, given.freed(*FREE), cpu_seconds=1.0, accept=["work"])
+def test_a_spent_budget_leaves_the_best_values_and_says_so_first() -> None:
+    result = fit(1e-9)
+    assert result.status.code is Code.BUDGET
+    assert not result.status.converged
+    assert result.status.verdict.startswith("the CPU budget of 1e-09 s is spent")
+    assert str(result.status).startswith("NOT converged (the CPU budget is spent)")
+    assert np.isfinite(result.estimates["value"]).all()
+    assert result.estimates["ci_low"].isna().all()
+    assert result.widths == ()
 
 
-def test_no_time_at_all_and_too_little_for_a_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, given = another_plants_log()
+def test_a_search_begins_again_where_a_budget_has_ended_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = itertools.count()  # seconds that pass with each reading
+    monkeypatch.setattr("pneuopt.shooting.budget.time.process_time", lambda: float(next(clock)))
+    stated = PARAMETERS.with_values({"friction.smoothing": 1.1e-3})  # no width is left to choose before the search
+    ended = fit(4.0, stated)
+    monkeypatch.undo()
+    assert ended.status.code is Code.BUDGET
+    assert ended.stats["iterations"] == 2
+    again = identify(DRIVE, [pushed(Coulomb())], stated, start=ended, throw=False)
+    assert again.status.converged
+    assert again.estimates["value"]["friction.coulomb"] == pytest.approx(30, rel=0.05)
+
+
+def test_a_budget_that_suffices_changes_nothing() -> None:
+    with_budget, without = fit(1e3), fit(math.inf)
+    assert with_budget.status == without.status
+    assert (with_budget.estimates["value"] == without.estimates["value"]).all()
+
+
+def test_a_spent_budget_is_no_convergence() -> None:
+    with pytest.raises(ConvergenceError, match="CPU budget of 1e-09 s") as caught:
+        identify(DRIVE, [pushed(Coulomb())], PARAMETERS, cpu_seconds=1e-9)
+    assert isinstance(caught.value.solution, IdentificationResult)
+
+
+def test_a_budget_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="cpu_seconds must be positive, got 0"):
-        identify(SYSTEM, log, given.freed(*FREE), cpu_seconds=0.0)
-
-    def interrupted(*_: object, **__: object) -> None:
-        raise CpuBudgetSpent
-
-    monkeypatch.setattr(identify_module, "fit_from_starts", interrupted)
-    with pytest.raises(InputError, match="1 CPU seconds were over before the first fit; give more"):
-        identify(SYSTEM, log, given.freed(*FREE), cpu_seconds=1.0, accept=["work"])
+        fit(0.0)
