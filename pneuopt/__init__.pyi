@@ -63,6 +63,7 @@ from .evaluation.scenarios import Factor, apply_scenario, corners, draws, sample
 from .files.drive import read_drive, write_fit
 from .files.tuning import read_tuning, write_tuned
 from .identification.compare_logs import LogComparison, compare_logs
+from .identification.examination import examine_logs
 from .identification.identifiability import identifiability
 from .identification.identify import identify, predict, validate
 from .identification.losses import Huber, SoftL1
@@ -70,6 +71,7 @@ from .identification.profiles import Profile, profile
 from .identification.propagation import PropagatedValue, propagate_error
 from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
+from .logs.checks.findings import LogFinding
 from .logs.experiments import Experiment, differentiate, resample, split
 from .logs.read_log import read_log
 from .models import catalog
@@ -180,6 +182,7 @@ __all__ = [
     "Load",
     "LoadDependent",
     "LogComparison",
+    "LogFinding",
     "LuGre",
     "Margins",
     "Mark",
@@ -248,6 +251,7 @@ __all__ = [
     "dither_effect",
     "draws",
     "evaluate",
+    "examine_logs",
     "expected_plants",
     "find_limit_cycle",
     "frequency_response",

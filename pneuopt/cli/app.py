@@ -69,7 +69,8 @@ def identify_command(
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="CHECK", help="Logs are right: motion, speed, work, command, scale, pressures; repeatable."
+            metavar="CHECK",
+            help="Logs are right: motion, speed, work, command, scale, jumps, stops, mass, pressures; repeatable.",
         ),
     ] = None,
     select: Annotated[

@@ -23,10 +23,13 @@ from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
+from pneuopt.identification.examination import QUIET_CHECKS, examine_logs
 from pneuopt.identification.identifiability import identifiability
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.identification.select_model import select_model
+from pneuopt.logs.checks.findings import LogFinding
+from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.declaration import Drive
@@ -63,13 +66,14 @@ def run_identify(
     budget: float = math.inf,
 ) -> int:
     """Identify from logs; returns the exit status."""
-    outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE)
+    outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS)
     model, parameters = _read_free_drive(drive)
     system = model.system()
     experiments = _read_experiments(logs, system, parameters, accept)
     with _draw_refusal(outputs):
         before = identifiability(system, experiments, parameters).sentences
-    for sentence in before:
+    found = examine_logs(system, experiments, parameters)
+    for sentence in (*before, *(f"{note.log}: {note.message}" for note in found if note.check in QUIET_CHECKS)):
         warn(f"before the fit: {sentence}")
     with _draw_refusal(outputs), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
@@ -92,7 +96,7 @@ def run_identify(
     if outputs.output is not None:
         writers[outputs.output] = partial(write_fit, outputs.output, drive, result)
     if outputs.plot is not None:
-        writers |= figure_writers(outputs.plot, _fit_figures(system, result, experiments))
+        writers |= figure_writers(outputs.plot, _fit_figures(system, result, experiments, found))
     return finish(outputs, writers, tables | stats_and_provenance(result), result.status)
 
 
@@ -193,7 +197,7 @@ def _verdict_record(verdict: Verdict | None) -> dict[str, Any]:
 
 
 def _fit_figures(
-    system: System, result: IdentificationResult, experiments: Sequence[Experiment]
+    system: System, result: IdentificationResult, experiments: Sequence[Experiment], found: Sequence[LogFinding]
 ) -> dict[str, "Figure"]:
     figures = {
         "": plot_fit(result, experiments),
@@ -203,4 +207,4 @@ def _fit_figures(
         figures["friction"] = plot_friction(system, result, experiments)
     if result.estimates["stderr"].notna().any():
         figures["correlation"] = plot_correlation(result)
-    return figures
+    return figures | {finding.check: plot_finding(finding) for finding in reversed(found) if finding.evidence}

@@ -98,7 +98,7 @@ def identifiability(
     logs = check_logs(model, experiments, parameters)
     parameters = find_centre(model, logs, parameters)
     check_free(logs, parameters)
-    check_content(model, logs)
+    check_content(model, logs, parameters)
     problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, method or LeastSquares())
     return verdict_from_sensitivities(problem, problem.candidates()[0])
 

@@ -103,8 +103,8 @@ def identify(
         Cut the logs into windows of this time [s], each with a start state of its own; by default only where the model
         does not follow whole logs, and of the length that gives the narrowest intervals (`result.window`).
     accept : sequence of str
-        Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "scale",
-        "pressures". What these find stands in the status.
+        Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "scale", "jumps",
+        "stops", "mass", "pressures". What these find stands in the status.
     start : IdentificationResult, optional
         A fit of these logs with a model that has the same states, from which the search begins; by default the model's
         own starts.
@@ -135,7 +135,7 @@ def identify(
     given, experiments = experiments, check_logs(model, experiments, parameters)
     parameters = find_centre(model, experiments, parameters)
     check_free(experiments, parameters)
-    accepted = check_content(model, experiments)
+    accepted = check_content(model, experiments, parameters)
     log_warnings = accepted + emit_log_warnings(model, experiments, parameters) + log_remarks(model, given, experiments)
     stated = all(channel in e.noise for e in given for channel in outputs_in_log(model, e))
     problem = EstimationProblem(

@@ -3,11 +3,15 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+from pneuopt.logs.checks.balance import check_mass, check_offset
+from pneuopt.logs.checks.end_stops import check_end_stops
 from pneuopt.logs.checks.findings import PISTON, LogFinding, StatedAxis
+from pneuopt.logs.checks.jumps import check_jumps
 from pneuopt.logs.checks.sensors import check_pressures, check_sampling
 from pneuopt.logs.checks.signs import check_command, check_position_speed, check_work_sign
 from pneuopt.logs.checks.standstill import check_has_motion, check_scale
 from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.noise import noise_level
 
 
 def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFinding, ...]:
@@ -25,8 +29,9 @@ def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFindi
     tuple of LogFinding
         Faults first: nothing moves; a channel is constant; position and speed disagree in sign or unit; the force, or
         the pressures, brake the motion on balance, which no drive does; the piston runs against the valve's command, or
-        to and fro without one; a pressure is a vacuum, or above the supply.
-        Then notes: jitter, a clipped sensor, a coarse resolution.
+        to and fro without one; it jumps, or rests at a stop that the model lacks; force and acceleration are those of
+        another mass than is stated; a pressure is a vacuum, or above the supply.
+        Then notes: a constant force that is not stated; jitter, a clipped sensor, a coarse resolution.
 
     Examples
     --------
@@ -40,9 +45,19 @@ def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFindi
     >>> print(finding.check, finding.message.partition("(")[0], finding.message.partition(": ")[2], sep="; ")
     work; the force brakes the motion on balance ; change the sign of 'force'
     """
+    experiment = _with_noise(experiment, axis)
     named = ((name, finding) for name, check in CHECKS.items() for finding in check(experiment, axis))
     found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
     return tuple(sorted(found, key=lambda f: not f.fault))
+
+
+def _with_noise(experiment: Experiment, axis: StatedAxis) -> Experiment:
+    """The log with the noise of its motion, which several checks need."""
+    log, found = experiment.trajectory, dict[str, float]()
+    for name in (axis.position, axis.speed):
+        if name in log and name not in experiment.noise:
+            found[name] = noise_level(log[name], log.t)
+    return experiment.with_noise({name: level for name, level in found.items() if level > 0})
 
 
 CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {
@@ -51,6 +66,10 @@ CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {
     "work": check_work_sign,
     "command": check_command,
     "scale": check_scale,
+    "jumps": check_jumps,
+    "stops": check_end_stops,
+    "mass": check_mass,
+    "offset": check_offset,
     "pressures": check_pressures,
     "sampling": check_sampling,
 }

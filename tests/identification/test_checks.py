@@ -128,9 +128,9 @@ def test_a_log_that_contradicts_itself_is_refused() -> None:
 
 def test_a_still_window_among_moving_ones_is_no_fault() -> None:
     still = log_with(position=np.full(100, 0.5))
-    check_content(RIG.system(), [log_with(), replace(still, name="b")])
+    check_content(RIG.system(), [log_with(), replace(still, name="b")], RIG.parameters)
     with pytest.raises(LogError, match="b: 'position' is constant"):
-        check_content(RIG.system(), [replace(still, name="b")])
+        check_content(RIG.system(), [replace(still, name="b")], RIG.parameters)
 
 
 def test_what_a_model_doubts_is_warned_of_and_stands_in_the_status() -> None:
@@ -158,18 +158,18 @@ def braked(accept: tuple[str, ...] = ()) -> Experiment:
 def test_a_refusal_names_its_check_and_is_overridden_by_that_name() -> None:
     system = RIG.system()
     with pytest.raises(LogError, match=r"if the log is right, accept = \['work'\] in its sidecar, or --accept work"):
-        check_content(system, [braked()])
-    (told,) = check_content(system, [braked(("work",))])
+        check_content(system, [braked()], RIG.parameters)
+    (told,) = check_content(system, [braked(("work",))], RIG.parameters)
     assert told.startswith("run: accepted as right: the force brakes the motion on balance")
     with pytest.raises(LogError, match="brakes the motion"):
-        check_content(system, [braked(("speed",))])
+        check_content(system, [braked(("speed",))], RIG.parameters)
     fit = identify(system, braked(), RIG.parameters.freed("friction.coulomb"), accept=["work"], throw=False)
     assert "accepted as right" in fit.status.message
 
 
 def test_an_unknown_check_is_named() -> None:
     with pytest.raises(UnknownNameError, match=r"run: accept: unknown check 'werk'; did you mean 'work'"):
-        check_content(RIG.system(), [braked(("werk",))])
+        check_content(RIG.system(), [braked(("werk",))], RIG.parameters)
 
 
 def test_a_sidecar_accepts_checks_by_name(tmp_path: Path) -> None:

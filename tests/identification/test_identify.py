@@ -17,7 +17,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Asymmetric, Coulomb, FrictionModel, LuGre, PressureDependent, Stribeck
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ConvergenceError
+from pneuopt.quantities.errors import ConvergenceError, LogError
 from pneuopt.quantities.intersample import Intersample, usual_intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code
@@ -158,7 +158,10 @@ def test_conditions_and_own_values_of_each_log() -> None:
     off = deviations(result, truth)
     assert max(off.values()) < 4, off
     assert result.parameters.value("load.force") == free.value("load.force")
-    wrong = identify(ForceDrive(Coulomb()).system(), [b.with_conditions({"load.mass": 2.0})], free, throw=False)
+    light = b.with_conditions({"load.mass": 2.0})
+    with pytest.raises(LogError, match=r"those of (5\.9|6\.0)\d kg, [\d.]+ times the stated load\.mass of 2 kg"):
+        identify(ForceDrive(Coulomb()).system(), [light], free)
+    wrong = identify(ForceDrive(Coulomb()).system(), [light], free, accept=["mass"], throw=False)
     assert wrong.stats["chi_square_ratio"] > 100
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pneuopt.logs.checks.findings import PISTON
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
@@ -28,6 +29,17 @@ def only(log: Experiment, *channels: str) -> Experiment:
     return log.select(channels)
 
 
+def stopped() -> Experiment:
+    """It runs into a stop at 0.13 m, against which the force then pushes."""
+    x, push = RIGHT["position"], RIGHT["force"]
+    return swing(position=np.minimum(x, 0.13), force=np.where(x > 0.13, 250.0, push))
+
+
+def jumped() -> Experiment:
+    """The position is 50 mm off from 1.5 s to 1.6 s."""
+    return only(swing(position=RIGHT["position"] + 0.05 * ((T > 1.5) & (T < 1.6))), "position", "force")
+
+
 RIGHT = swing().trajectory
 BAD_LOGS = {
     "motion": only(swing(position=0.1 + 1e-5 * np.random.default_rng(1).standard_normal(T.size)), "position", "force"),
@@ -35,7 +47,13 @@ BAD_LOGS = {
     "work": only(swing(force=-RIGHT["force"]), "position", "force"),
     "command": only(swing(valve_voltage=-RIGHT["speed"]), "position", "valve_voltage"),
     "scale": only(swing(position=1e3 * RIGHT["position"]), "position", "force"),
+    "jumps": jumped(),
+    "stops": only(stopped(), "position", "force"),
+    "mass": swing(),
+    "offset": swing(force=RIGHT["force"] + 20.0),
     "pressures": only(swing(pressure_b=RIGHT["pressure_b"] - 4.3e5), "position", "pressure_b"),
     "sampling": only(swing(position=np.round(RIGHT["position"] / 5e-3) * 5e-3), "position"),
 }
 """By the name of the check."""
+STATED = {"mass": PISTON._replace(inertia=10.0), "offset": PISTON._replace(constant=0.0, offset_parameter="load.force")}
+"""What is stated beside a log, where the check needs it: `swing` is of 2.65 kg without a load."""

@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pneuopt.logs.checks.findings import PISTON
 from pneuopt.logs.doctor import CHECKS, examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
-from tests.logs.bad_logs import BAD_LOGS, T, swing
+from tests.logs.bad_logs import BAD_LOGS, STATED, T, swing
 
 DATA = Path(__file__).parents[2] / "data"
 
@@ -26,7 +27,7 @@ def test_a_sound_log_has_no_findings() -> None:
 def test_every_check_has_a_log_that_trips_it_alone_and_shows_why() -> None:
     assert list(BAD_LOGS) == list(CHECKS)
     for name, log in BAD_LOGS.items():
-        (finding,) = examine(log)
+        (finding,) = examine(log, STATED.get(name, PISTON))
         assert (finding.check, finding.log) == (name, "swing")
         shown = finding.evidence
         assert shown is not None, name

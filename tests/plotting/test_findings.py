@@ -3,16 +3,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pneuopt.logs.checks.findings import PISTON
 from pneuopt.logs.doctor import CHECKS, examine
 from pneuopt.plotting import plot_finding
 from pneuopt.quantities.errors import InputError
-from tests.logs.bad_logs import BAD_LOGS
+from tests.logs.bad_logs import BAD_LOGS, STATED
 from tests.plotting.fits import line, texts
 
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_every_finding_is_drawn_with_names_and_units(check: str) -> None:
-    finding = examine(BAD_LOGS[check])[0]
+    finding = examine(BAD_LOGS[check], STATED.get(check, PISTON))[0]
     figure = plot_finding(finding)
     assert finding.evidence is not None
     panels = finding.evidence.panels

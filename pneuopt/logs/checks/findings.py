@@ -1,5 +1,6 @@
 """`LogFinding`: one thing about a log, with the signals that show it; `StatedAxis`: what is known of the axis."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,11 +26,36 @@ class StatedAxis(NamedTuple):
     position, speed : str
     push : str
         The force or torque that drives the axis, positive in the direction of positive speed.
+    forces : mapping of str to float
+        The force on the body per unit of each channel that pushes it; empty where a channel is not logged, or a factor
+        is not known.
+    constant : float
+        The force that no channel gives, as of a weight; NaN where a free parameter stands in it.
+    inertia : float
+        As stated; NaN where it is free.
+    inertia_name, inertia_unit, force_unit : str
+    offset_parameter : str
+        The parameter that takes a constant force.
+    stops : tuple of float
+        Positions at which the model has end stops.
     """
 
     position: str = "position"
     speed: str = "speed"
     push: str = "force"
+    forces: Mapping[str, float] = {"force": 1.0}
+    constant: float = math.nan
+    inertia: float = math.nan
+    inertia_name: str = "mass"
+    inertia_unit: str = "kg"
+    force_unit: str = "N"
+    offset_parameter: str = ""
+    stops: tuple[float, ...] = ()
+
+    def net_force(self, channels: Mapping[str, Array]) -> Array:
+        """The force on the body without friction, from channels; the constant counts as zero where it is unknown."""
+        total = sum((weight * channels[n] for n, weight in self.forces.items()), np.zeros(1))
+        return np.asarray(total + (0.0 if math.isnan(self.constant) else self.constant))
 
 
 PISTON = StatedAxis()

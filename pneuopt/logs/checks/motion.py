@@ -71,10 +71,10 @@ def window_mean(v: Array, half: int, simpson: bool) -> Array:
     return out
 
 
-def sensor_lags(t: Array) -> list[int]:
-    """Lags [samples] between two sensors that count as one instant, both ways."""
+def sensor_lags(t: Array, count: int = 4) -> list[int]:
+    """Lags [samples] between two sensors that count as one instant, as many each way as there are samples for."""
     most = min(math.ceil(MAX_SENSOR_LAG / float(np.median(np.diff(t)))), t.size // 10)
-    steps = sorted({round(k * most / 4) for k in range(5)})
+    steps = sorted({round(k * most / count) for k in range(count + 1)})
     return [*(-k for k in reversed(steps[1:])), *steps]
 
 

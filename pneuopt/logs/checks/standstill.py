@@ -9,6 +9,7 @@ from pneuopt.logs.checks.findings import PISTON, Evidence, LogFinding, Panel, St
 from pneuopt.logs.checks.motion import MEAN_BLOCKS, motion_speed
 from pneuopt.logs.checks.signs import MIN_SPEED_CORRELATION
 from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.noise import find_resolution
 from pneuopt.quantities.arrays import Array
 
 MAX_WHITE_LAG = 20
@@ -58,7 +59,7 @@ def _is_motionless(y: Array, noise: float) -> bool:
     size = y.size // MEAN_BLOCKS
     means = y[: MEAN_BLOCKS * size].reshape(MEAN_BLOCKS, size).mean(axis=1)
     is_small = float(means.std()) < 3 * noise / math.sqrt(size) and float(y.std()) < 2 * noise
-    flickers = float(np.ptp(y)) <= STILL_STEPS * math.sqrt(12) * noise
+    flickers = float(np.ptp(y)) <= STILL_STEPS * find_resolution(y)
     return is_small and (flickers or float(np.max(np.abs(_autocorrelation(y)))) < MIN_SPEED_CORRELATION)
 
 
