@@ -21,7 +21,7 @@ from pneuopt.quantities.errors import LogError, require
 
 MAX_ROWS = 2**20
 """Rows of a sheet [1]: Excel's own bound."""
-_STAMP = "0:00:00"  # what a date looks like where only its being one counts
+_SHOWN_DATE = "0:00:00"  # what a date looks like where only its being one counts
 
 
 class _Date(float):
@@ -118,7 +118,7 @@ def _without_tail(row: list[Any]) -> list[Any]:
 
 def _show(cell: Any) -> str:
     if isinstance(cell, _Date):
-        return _STAMP
+        return _SHOWN_DATE
     return "" if cell is None else str(cell).strip()
 
 
