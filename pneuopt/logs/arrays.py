@@ -1,6 +1,5 @@
-"""Columns that a file holds as arrays: numbers, or times, as floats; and the library that reads such a file."""
+"""Columns that a file holds as arrays: numbers, or times, as floats."""
 
-import importlib
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from pneuopt.logs.budget import check_cells
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import InputError, LogError, require
+from pneuopt.quantities.errors import LogError, require
 
 
 def array_table(
@@ -36,26 +35,6 @@ def array_table(
     """
     stamps = frozenset(name for name, column in columns.items() if np.asarray(column).dtype.kind in "Mm")
     return Table(path, list(columns), 1, partial(_read_columns, path, columns), units, stamps, tuple(remarks))
-
-
-def import_extra(module: str, package: str, path: Path | str, kind: str, extra: str) -> Any:
-    """Import the library that reads a kind of file, or say how to get it.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise InputError(f"{path}: {kind} needs {package}; run: pip install 'pneuopt[{extra}]'") from None
-
-
-def damage(path: Path, kind: str, error: Exception) -> LogError:
-    """What to say where a library fails on a file, whatever it raises."""
-    reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-    return LogError(f"{path}: cannot be read as {kind} ({reason}); save the log again, or export it as CSV")
 
 
 def _read_columns(path: Path | str, columns: Mapping[str, Any], names: Sequence[str]) -> dict[str, Array]:

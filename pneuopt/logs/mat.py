@@ -1,14 +1,14 @@
 """Reader of MATLAB's .mat logs, versions 4 to 7: vectors, structures of them, Simulink's and dSPACE's structures."""
 
 import io
-import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pneuopt.logs.arrays import array_table, damage
+from pneuopt.logs.arrays import array_table
+from pneuopt.logs.libraries import foreign_code
 from pneuopt.logs.table import Table, check_columns
 from pneuopt.quantities.errors import LogError, require
 
@@ -58,14 +58,13 @@ def _load(path: Path, raw: bytes) -> Mapping[str, Any]:
     from scipy.io import loadmat
 
     file: Any = io.BytesIO(raw)  # which the types do not know
-    try:
-        with warnings.catch_warnings(action="ignore"):
+    with foreign_code(path, "a .mat file"):
+        try:
             return loadmat(file, squeeze_me=True)
-    except NotImplementedError:
-        remedy = "in MATLAB, save it with the option '-v7'"
-        raise LogError(f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}") from None
-    except Exception as error:  # scipy raises whatever a damaged file makes it raise
-        raise damage(path, "a .mat file", error) from None
+        except NotImplementedError:
+            remedy = "in MATLAB, save it with the option '-v7'"
+            raise LogError(f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}") from None
+    raise AssertionError  # the context lets no error pass
 
 
 def _columns(variables: Mapping[str, Any]) -> Iterator[_Column]:

@@ -1,20 +1,18 @@
 """Reader of ASAM's measurement data format (.mf4, .mdf); needs asammdf, the extra `mdf`."""
 
 import io
-import logging
-import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pneuopt.logs.arrays import array_table, damage, import_extra
+from pneuopt.logs.arrays import array_table
 from pneuopt.logs.budget import check_cells
 from pneuopt.logs.layout import plain_unit
+from pneuopt.logs.libraries import foreign_code, import_extra
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
@@ -45,29 +43,13 @@ def read_table(path: Path, raw: bytes) -> Table:
     InputError
         If asammdf is not installed.
     """
-    with _library(path) as asammdf, asammdf.MDF(io.BytesIO(raw)) as file:
+    asammdf = import_extra("asammdf", "asammdf", path, "MDF", "mdf")
+    with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as file:
         places = _places(file)
         units = {name: _unit(file, place) for name, place in places.items()}
     names = [TIME, *(name for name in places if name.casefold() != TIME)]
     said = {name: unit for name, unit in units.items() if unit}
-    return Table(path, names, 1, partial(_read_columns, path, raw, places), {**said, TIME: "s"})
-
-
-@contextmanager
-def _library(path: Path) -> Iterator[Any]:
-    """Asammdf, whose complaints on a damaged file become ours."""
-    with warnings.catch_warnings(action="ignore"):
-        asammdf = import_extra("asammdf", "asammdf", path, "MDF", "mdf")  # its message is no complaint on the file
-        logger = logging.getLogger("asammdf")
-        said, logger.disabled = logger.disabled, True
-        try:
-            yield asammdf
-        except LogError:
-            raise
-        except Exception as error:  # asammdf raises whatever a damaged file makes it raise
-            raise damage(path, "MDF", error) from None
-        finally:
-            logger.disabled = said
+    return Table(path, names, 1, partial(_read_columns, path, raw, places, asammdf), {**said, TIME: "s"})
 
 
 def _places(file: Any) -> dict[str, tuple[int, int]]:
@@ -87,9 +69,11 @@ def _unit(file: Any, place: tuple[int, int]) -> str:
     return plain_unit(said) or said
 
 
-def _read_columns(path: Path, raw: bytes, places: dict[str, tuple[int, int]], names: Sequence[str]) -> dict[str, Array]:
+def _read_columns(
+    path: Path, raw: bytes, places: dict[str, tuple[int, int]], asammdf: Any, names: Sequence[str]
+) -> dict[str, Array]:
     channels = [name for name in names if name != TIME]
-    with _library(path) as asammdf, asammdf.MDF(io.BytesIO(raw)) as file:
+    with foreign_code(path, "MDF"), asammdf.MDF(io.BytesIO(raw)) as file:
         check_cells(path, max(file.groups[places[n][0]].channel_group.cycles_nr for n in channels), len(names))
         signals = {name: file.get(group=places[name][0], index=places[name][1]) for name in channels}
     times = [signal.timestamps for signal in signals.values()]

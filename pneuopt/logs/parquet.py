@@ -6,9 +6,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pneuopt.logs.arrays import array_table, damage, import_extra
+from pneuopt.logs.arrays import array_table
 from pneuopt.logs.budget import check_cells
 from pneuopt.logs.layout import plain_unit
+from pneuopt.logs.libraries import foreign_code, import_extra
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError
@@ -55,13 +56,8 @@ def _parquet_file(path: Path, raw: bytes) -> "Iterator[pq.ParquetFile]":
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        with pq.ParquetFile(pa.BufferReader(raw)) as file:
-            yield file
-    except LogError:
-        raise
-    except Exception as error:  # of a damaged file, more than Arrow's own
-        raise damage(path, "Parquet", error) from None
+    with foreign_code(path, "Parquet"), pq.ParquetFile(pa.BufferReader(raw)) as file:
+        yield file
 
 
 def _read_columns(path: Path, raw: bytes, names: Sequence[str]) -> dict[str, Array]:

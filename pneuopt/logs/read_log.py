@@ -91,7 +91,7 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
     is_list = isinstance(accept, list) and all(isinstance(name, str) for name in accept)
     require(
         is_list,
-        f'{side}: {ACCEPTED_CHECKS} must list checks, as {ACCEPTED_CHECKS} = ["work"]; got {accept!r}',
+        f'{side}: {ACCEPTED_CHECKS} must list checks, as {ACCEPTED_CHECKS} = ["work"]; got {str(accept)[:60]!r}',
         LogError,
     )
     for key, section in ((key, section) for key, section in sections.items() if key != ACCEPTED_CHECKS):

@@ -1,7 +1,6 @@
 """Reader of National Instruments' TDMS logs; needs npTDMS, the extra `tdms`."""
 
 import io
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -10,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from pneuopt.logs.arrays import array_table, damage, import_extra
+from pneuopt.logs.arrays import array_table
 from pneuopt.logs.budget import check_cells
 from pneuopt.logs.layout import plain_unit
+from pneuopt.logs.libraries import foreign_code, import_extra
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
@@ -45,18 +45,13 @@ def read_table(path: Path, raw: bytes) -> Table:
         If npTDMS is not installed.
     """
     nptdms = import_extra("nptdms", "npTDMS", path, "TDMS", "tdms")
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            listed = nptdms.TdmsFile.read_metadata(io.BytesIO(raw))
-            check_cells(path, sum(len(channel) for group in listed.groups() for channel in group.channels()), 1)
-            file = nptdms.TdmsFile.read(io.BytesIO(raw))
-            channels = _by_name(file)
-            columns = {name: channel[:] for name, channel in channels.items()}
-            grids = {name: grid for name, channel in channels.items() if (grid := _grid(channel)) is not None}
-    except LogError:
-        raise
-    except Exception as error:  # npTDMS raises whatever a damaged file makes it raise
-        raise damage(path, "TDMS", error) from None
+    with foreign_code(path, "TDMS"):
+        listed = nptdms.TdmsFile.read_metadata(io.BytesIO(raw))
+        check_cells(path, sum(len(channel) for group in listed.groups() for channel in group.channels()), 1)
+        file = nptdms.TdmsFile.read(io.BytesIO(raw))
+        channels = _by_name(file)
+        columns = {name: channel[:] for name, channel in channels.items()}
+        grids = {name: grid for name, channel in channels.items() if (grid := _grid(channel)) is not None}
     units = {name: unit for name, channel in channels.items() if (unit := _unit(channel))}
     if not grids or any(name.casefold() == "time" for name in columns):
         return array_table(path, columns, units)

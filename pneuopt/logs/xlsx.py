@@ -1,7 +1,6 @@
 """Reader of Excel's workbooks (.xlsx): the first sheet with names and samples; needs openpyxl, the extra `xlsx`."""
 
 import io
-import warnings
 import zipfile
 from collections.abc import Sequence
 from functools import partial
@@ -10,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pneuopt.logs.arrays import damage, import_extra
 from pneuopt.logs.budget import MAX_BYTES, MAX_COLUMNS, check_cells
 from pneuopt.logs.layout import MAX_HEAD_ROWS, find_layout, has_table
+from pneuopt.logs.libraries import foreign_code, import_extra
 from pneuopt.logs.stamps import is_stamp, seconds_from_first
 from pneuopt.logs.table import Table
 from pneuopt.logs.text_cells import MISSING
@@ -52,13 +51,8 @@ def read_table(path: Path, raw: bytes) -> Table:
         If openpyxl is not installed.
     """
     openpyxl = import_extra("openpyxl", "openpyxl", path, "an Excel workbook", "xlsx")
-    try:
-        with warnings.catch_warnings(action="ignore"):  # of what a sheet holds beside its cells
-            sheets = _read_sheets(path, raw, openpyxl)
-    except LogError:
-        raise
-    except Exception as error:  # openpyxl raises whatever a damaged file makes it raise
-        raise damage(path, "an Excel workbook", error) from None
+    with foreign_code(path, "an Excel workbook"):
+        sheets = _read_sheets(path, raw, openpyxl)
     shown = {title: [[_show(cell) for cell in row] for row in rows[:MAX_HEAD_ROWS]] for title, rows in sheets.items()}
     title = next((title for title, rows in shown.items() if has_table(rows)), next(iter(sheets), ""))
     require(any(shown.values()), f"{path}: no sheet holds cells; it has to name the columns in a row", LogError)
