@@ -1,4 +1,4 @@
-"""The command line: `pneuopt identify | tune | simulate | study | keys | info`.
+"""The command line: `pneuopt init | identify | tune | simulate | study | keys | info`.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 130
 interrupted. Each command imports what it needs, so that `--help` waits for no heavy import.
@@ -52,6 +52,25 @@ def options(
 
         typer.echo(f"pneuopt {__version__}")
         raise typer.Exit
+
+
+@app.command("init")
+def init_command(
+    kind: Annotated[
+        str | None, typer.Argument(metavar="[KIND]", help="What drives the load: pneumatic, force, rotary or linear.")
+    ] = None,
+    size: Annotated[str | None, typer.Option(help="Of the catalogue: s25, s32 or s40.")] = None,
+    cylinder: Annotated[str | None, typer.Option(help="Of the catalogue, by its bore: 25, 32 or 40.")] = None,
+    valve: Annotated[str | None, typer.Option(help="Of the catalogue, by its l/min: 350, 700 or 1400.")] = None,
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where to write.")] = Path(),
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
+) -> None:
+    """Write a first drive.toml, tuning.toml, study.toml, rig.toml and log.toml, with every key explained."""
+    with _report_errors():
+        from pneuopt.cli.init import run_init
+
+        parts = {"size": size, "cylinder": cylinder, "valve": valve}
+        raise typer.Exit(run_init(kind, folder, parts, force))
 
 
 @app.command("identify")

@@ -120,8 +120,9 @@ def limit_key(name: str) -> Key:
     kind = REQUIREMENTS_BY_KEY[name]
     bound, unit = kind.metric.sense.value, kind.metric.unit
     usual = StepEnvelope.max if name == "step_envelope" else None
-    keys = {bound: Key("the bound", unit=unit, usual=usual), **EXTRA_KEYS.get(name, {})}
-    return Key(first_sentence(kind), Takes.PARAMETER, unit, keys=keys)
+    example = '"5 %"' if kind.metric.percent else "1.5" if unit == "1" else f'"1 {unit}"'
+    keys = {bound: Key("the bound", unit=unit, usual=usual, example=example), **EXTRA_KEYS.get(name, {})}
+    return Key(first_sentence(kind), Takes.PARAMETER, unit, keys=keys, example="" if "{" in unit else example)
 
 
 def signal_units(command: str, measured: str, position: str = "m") -> dict[str, str]:

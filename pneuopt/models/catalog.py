@@ -1,6 +1,6 @@
 """Drives with cited numbers, built afresh at each call; a range in brackets is the published one."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import pi
 
@@ -9,6 +9,7 @@ from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.models.pneumatic.gas import IsentropicNozzle, Smoothing, conductance_of_area
 from pneuopt.models.pneumatic.valve import ProportionalValve, Spool
+from pneuopt.quantities.errors import check_names
 from pneuopt.quantities.parameters import ParameterSet
 
 DriveSet = tuple[PneumaticDrive, ParameterSet]
@@ -42,6 +43,45 @@ def s40() -> DriveSet:
     [40-180 N s/m].
     """
     return _catalogue_drive((0.040, 0.016, 0.5), 15.0, 60e-6, 5.5e-8, (40.0, 65.0, 0.025, 8e4, 400.0, 110.0))
+
+
+SIZES: Mapping[str, Callable[[], DriveSet]] = {"s25": s25, "s32": s32, "s40": s40}
+"""Drives of catalogue sizes by name."""
+CYLINDERS: Mapping[str, str] = {"25": "s25", "32": "s32", "40": "s40"}
+"""By bore [mm] the size whose cylinder has it."""
+VALVES: Mapping[str, str] = {"350": "s25", "700": "s32", "1400": "s40"}
+"""By nominal flow [l/min(ANR)] the size whose valve has it."""
+
+
+def catalogue_values(size: str, cylinder: str | None = None, valve: str | None = None) -> ParameterSet:
+    """Parameters of a size with the cylinder or the valve of another.
+
+    Parameters
+    ----------
+    size, cylinder, valve : str
+        Of `SIZES`, `CYLINDERS`, `VALVES`.
+
+    Returns
+    -------
+    ParameterSet
+        Those of the catalogue, each with its source.
+
+    Raises
+    ------
+    UnknownNameError
+        If the catalogue has no such part.
+    """
+    found = ParameterSet()
+    for what, name, known, sections in (
+        ("size", size, {n: n for n in SIZES}, ""),
+        ("cylinder", cylinder, CYLINDERS, "cylinder."),
+        ("valve", valve, VALVES, "valve."),
+    ):
+        if name is not None:
+            check_names(what, [name], known, "catalogue")
+            own = SIZES[known[name]]()[1]
+            found |= own.select(n for n, p in own.items() if n.startswith(sections) and p.source == CATALOGUE_SOURCE)
+    return found
 
 
 def r25(lugre: bool = False) -> DriveSet:

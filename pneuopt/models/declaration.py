@@ -5,7 +5,7 @@ A key of a section either chooses how the drive is built (a `Key`, declared here
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
 from pneuopt.dynamics.system import System
@@ -115,6 +115,43 @@ class Structure:
 
 
 @dataclass(frozen=True)
+class FirstFiles:
+    """What a new user's files begin with: a drive of that kind, and a loop that controls its usual values.
+
+    Parameters
+    ----------
+    options : mapping
+        Sections of the drive's file with the keys that choose how it is built.
+    unknowns : tuple of str
+        Parameters that logs usually give.
+    gains : mapping of str to (float, float, float)
+        Of a parallel PID: value, lower and upper bound [SI].
+    limit : float
+        Largest command [its unit].
+    dither : (float, float), optional
+        Frequency [Hz] and largest amplitude [the command's unit].
+    steps : tuple of float
+        Heights of the references [unit of the measured signal].
+    horizon : float
+        Of each step [s].
+    swept : str
+        Parameter over which a study goes.
+    values : mapping of str to float
+        Parameters that are not as the model has them [SI].
+    """
+
+    options: Sections
+    unknowns: tuple[str, ...]
+    gains: Mapping[str, tuple[float, float, float]]
+    limit: float
+    dither: tuple[float, float] | None
+    steps: tuple[float, ...]
+    horizon: float
+    swept: str
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class DriveKind:
     """A row of the registry of drives: how a file describes such a drive.
 
@@ -132,6 +169,8 @@ class DriveKind:
     aliases : tuple of Alias
     any_friction : bool
         Whether ``replace(drive, friction=...)`` works with every friction law.
+    first : FirstFiles, optional
+        What `pneuopt init` writes for it; None: it writes nothing.
     """
 
     name: str
@@ -139,3 +178,4 @@ class DriveKind:
     build: Callable[[Structure], Drive]
     aliases: tuple[Alias, ...] = ()
     any_friction: bool = True
+    first: FirstFiles | None = None

@@ -9,9 +9,9 @@ import casadi as ca
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.models.axis_rest import with_rest
-from pneuopt.models.declaration import DriveKind
+from pneuopt.models.declaration import DriveKind, FirstFiles
 from pneuopt.models.friction import FrictionModel, law_inputs
-from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
+from pneuopt.models.friction_section import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.needs import LOAD_EXCITATION, RIG_EXCITATION
 from pneuopt.models.starts.friction import force_starts, motion_starts
@@ -140,6 +140,16 @@ FORCE_KIND = DriveKind(
     ForceDrive.kind,
     {"load": LOAD_KEYS, "friction": FRICTION_KEYS, "ambient": {}},
     lambda structure: ForceDrive(read_friction(structure), Load(**structure.options("load"))),
+    first=FirstFiles(
+        options={"friction": {"model": "stribeck"}},
+        unknowns=("load.mass", "load.force", *STRIBECK_UNKNOWNS),
+        gains={"Kp": (400, 20, 2000), "Ki": (4000, 100, 1e5), "Kd": (0, 0, 5), "Tf": (5e-3, 2e-3, 0.05)},
+        limit=250.0,
+        dither=(100.0, 60.0),
+        steps=(0.05, 0.25),
+        horizon=0.6,
+        swept="load.mass",
+    ),
 )
 MOTION_KIND = DriveKind(
     MotionDrive.kind,

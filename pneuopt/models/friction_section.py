@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from pneuopt.models.declaration import Structure
-from pneuopt.models.friction import FrictionModel
+from pneuopt.models.friction import FrictionModel, Stribeck
 from pneuopt.models.friction_laws import FRICTION_LAWS, FRICTION_WRAPPERS
 from pneuopt.quantities.errors import check_names
 from pneuopt.quantities.keys import Key, Takes, choice, flag
@@ -16,6 +16,10 @@ FRICTION_KEYS: Mapping[str, Key] = {
         for name, wrapper in FRICTION_WRAPPERS.items()
     },
 }
+
+
+STRIBECK_UNKNOWNS = tuple(f"friction.{n}" for n in Stribeck().start.unknowns)
+"""Parameters of the usual law that logs give, as a drive names them."""
 
 
 def read_friction(structure: Structure) -> FrictionModel:

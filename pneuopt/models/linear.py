@@ -15,7 +15,7 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
-from pneuopt.models.declaration import DriveKind, Structure
+from pneuopt.models.declaration import DriveKind, FirstFiles, Structure
 from pneuopt.models.drive import FORCE, POSITION, SPEED
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
@@ -228,6 +228,16 @@ LINEAR_KIND = DriveKind(
     },
     _build_plant,
     any_friction=False,
+    first=FirstFiles(
+        options={"plant": {"model": "second_order"}},
+        unknowns=("plant.gain", "plant.natural_frequency", "plant.damping"),
+        gains={"Kp": (1, 0.1, 20), "Ki": (5, 0.5, 200), "Kd": (0, 0, 2), "Tf": (0.01, 5e-3, 0.1)},
+        limit=5.0,
+        dither=None,
+        steps=(0.1, 0.25),
+        horizon=1.5,
+        swept="plant.gain",
+    ),
 )
 
 

@@ -9,9 +9,9 @@ import casadi as ca
 from pneuopt.dynamics.hooks import Axis, Log, Start
 from pneuopt.dynamics.system import Symbols, System, define
 from pneuopt.models.axis_rest import with_rest
-from pneuopt.models.declaration import DriveKind
+from pneuopt.models.declaration import DriveKind, FirstFiles
 from pneuopt.models.friction import Coulomb, FrictionModel
-from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
+from pneuopt.models.friction_section import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.needs import load_excitation
 from pneuopt.models.starts.friction import force_starts
 from pneuopt.quantities.errors import ModelError, require
@@ -165,5 +165,17 @@ def _turning_run(run: Trajectory) -> Trajectory:
 
 
 ROTARY_KIND = DriveKind(
-    RotaryDrive.kind, {"load": {}, "friction": FRICTION_KEYS}, lambda structure: RotaryDrive(read_friction(structure))
+    RotaryDrive.kind,
+    {"load": {}, "friction": FRICTION_KEYS},
+    lambda structure: RotaryDrive(read_friction(structure)),
+    first=FirstFiles(
+        options={"friction": {"model": "stribeck"}},
+        unknowns=("load.inertia", "load.torque", *STRIBECK_UNKNOWNS),
+        gains={"Kp": (0.04, 2e-3, 0.2), "Ki": (0.4, 0.01, 10), "Kd": (0, 0, 5e-4), "Tf": (5e-3, 2e-3, 0.05)},
+        limit=2.5,
+        dither=(100.0, 0.6),
+        steps=(5.0, 25.0),
+        horizon=0.6,
+        swept="load.inertia",
+    ),
 )

@@ -137,7 +137,7 @@ def argument_meanings(kind: type) -> dict[str, str]:
 def _plain(sentence: str) -> str:
     """Without markup, unit and full stop, and small where it begins with a whole word."""
     words = re.sub(r" \[[^]]*\]$", "", sentence.removesuffix(".").replace("`", ""))
-    return words[:1].lower() + words[1:] if re.match(r"[A-Z][a-z]( |[a-z])", words) else words
+    return words[:1].lower() + words[1:] if re.match(r"[A-Z][a-z]+ (?!=)", words) else words
 
 
 def parameter_key(parameter: Parameter, condition: str = "") -> Key:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from pneuopt.models.declaration import Alias, DriveKind, Structure
-from pneuopt.models.friction_section import FRICTION_KEYS, read_friction
+from pneuopt.models.declaration import Alias, DriveKind, FirstFiles, Structure
+from pneuopt.models.friction_section import FRICTION_KEYS, STRIBECK_UNKNOWNS, read_friction
 from pneuopt.models.load import LOAD_KEYS, Load
 from pneuopt.models.pneumatic.chamber import ChamberModel, Polytropic, Thermal
 from pneuopt.models.pneumatic.cylinder import Cylinder
@@ -97,5 +97,16 @@ PNEUMATIC_KIND = DriveKind(
             "l/min(ANR)",
             '"700 l/min(ANR)"',
         ),
+    ),
+    first=FirstFiles(
+        options={"friction": {"model": "stribeck"}},
+        unknowns=("valve.conductance", "valve.dead_zone", *STRIBECK_UNKNOWNS),
+        gains={"Kp": (0.5, 0.05, 4), "Ki": (5, 0.5, 60), "Kd": (0, 0, 0.15), "Tf": (5e-3, 2e-3, 0.02)},
+        limit=5.0,
+        dither=(100.0, 1.5),
+        steps=(0.1, 0.25),
+        horizon=0.45,
+        swept="load.mass",
+        values={"cylinder.start": 0.25},
     ),
 )

@@ -1,0 +1,239 @@
+"""The first files of a new user: a drive, a tuning, a study, a rig and a log's sidecar, every key in them."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.dynamics.excitation import DEFAULT_WIDTH
+from pneuopt.files.drive import FIT_SECTIONS
+from pneuopt.files.drive_keys import default_parameters, drive_keys
+from pneuopt.files.loop_parameters import tuning_keys
+from pneuopt.files.rig import RIG_KEYS
+from pneuopt.files.schema import json_schema
+from pneuopt.files.study import STUDY_KEYS
+from pneuopt.files.template import Template
+from pneuopt.files.tuning import TUNED_SECTIONS
+from pneuopt.files.tuning_keys import signal_units
+from pneuopt.logs.sidecar_keys import SIDECAR_KEYS
+from pneuopt.models.catalog import CATALOGUE_SOURCE
+from pneuopt.models.declaration import DriveKind, FirstFiles, Structure
+from pneuopt.models.drive_kinds import DRIVE_KINDS
+from pneuopt.quantities.errors import check_names
+from pneuopt.quantities.keys import Key
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.units import write_value
+
+SAMPLE_TIME = 1e-3  # [s] of a first controller, where no log shows one: a usual one; drives with slower ones say so
+BAND, OVERSHOOT, SENSITIVITY = "2 %", "5 %", 1.6  # what a first tuning asks for: usual, and within reach of most drives
+SWEEP = (0.8, 1.0, 1.2)  # of a first study's parameter, times its value: near enough that one design may hold
+_DIGITS = 6
+
+
+def first_kinds() -> dict[str, FirstFiles]:
+    """The kinds of drive for which there are first files."""
+    return {name: kind.first for name, kind in DRIVE_KINDS.items() if kind.first is not None}
+
+
+def first_files(
+    name: str,
+    known: ParameterSet,
+    columns: Mapping[str, str],
+    *,
+    log: str = "log",
+    sample_time: float = SAMPLE_TIME,
+    source: Sequence[str] = (),
+) -> dict[str, str]:
+    """The texts of the files, by their names within a folder.
+
+    Parameters
+    ----------
+    name : str
+        Of a kind of drive.
+    known : ParameterSet
+        Values of the drive's parameters that are known, of a catalogue; each has its source.
+    columns : mapping of str to str
+        What the sidecar states, by channel: '"t [ms]"'; none: the log's header says it.
+    log : str
+        The log's name without its suffix.
+    sample_time : float
+        Of the controller [s].
+    source : sequence of str
+        Lines at the drive's top that say where its values come from.
+
+    Raises
+    ------
+    UnknownNameError
+        If there are no first files for that kind.
+    """
+    check_names("kind", [name], first_kinds(), "init")
+    kind, first = DRIVE_KINDS[name], first_kinds()[name]
+    defaults = default_parameters(kind, first.options)
+    values = defaults | defaults.with_values(first.values) | known.select(n for n in known if n in defaults)
+    plant = kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
+    loop = ClosedLoop(plant, PID(sample_time))
+    templates = {
+        "drive": _drive_template(kind, first, values, source),
+        "tuning": _tuning_template(loop, first, values),
+        "study": _study_template(loop, first, values),
+        "rig": _rig_template(loop),
+        "sidecar": _sidecar_template(loop, first, values, columns, log),
+    }
+    results = {"drive": FIT_SECTIONS, "tuning": TUNED_SECTIONS}
+    files = {f"{log if n == 'sidecar' else n}.toml": t.render() for n, t in templates.items()}
+    schemas = {t.schema: json_schema(f"pneuopt {n}", t.sections, results.get(n, ())) for n, t in templates.items()}
+    return files | {path: json.dumps(schema, indent=1, ensure_ascii=False) + "\n" for path, schema in schemas.items()}
+
+
+def _schema_path(name: str) -> str:
+    return f"schemas/{name}.json"
+
+
+def _drive_template(kind: DriveKind, first: FirstFiles, values: ParameterSet, source: Sequence[str]) -> Template:
+    sections = {n: replace(key, keys=dict(key.keys)) for n, key in drive_keys(kind.name).items()}
+    stated = {"drive.kind": f'"{kind.name}"'}
+    stated |= {f"{section}.{key}": f'"{word}"' for section, keys in first.options.items() for key, word in keys.items()}
+    for name, p in values.items():
+        section, _, key = name.partition(".")
+        declared = sections[section].keys[key]
+        if declared.source != DEFAULT_WIDTH:  # a stated width is not chosen by the logs any more
+            keys = {**sections[section].keys, key: _with_source(declared, p)}
+            sections[section] = replace(sections[section], keys=keys)
+            stated[name] = _value_text(p, free=True) if name in first.unknowns else _value_text(p)
+    title = (
+        f"A {kind.name} drive: its hardware. Put in what you know; what is free is identified from logs:",
+        f"    pneuopt identify drive.toml LOG -o fit.toml      ({', '.join(first.unknowns[:2])}, ... are free)",
+        "Lines that begin with # say what else there is; without the # they count.",
+        *source,
+    )
+    return Template(title, sections, stated, schema=_schema_path("drive"))
+
+
+def _with_source(key: Key, parameter: Parameter) -> Key:
+    return replace(key, source="catalogue" if parameter.source == CATALOGUE_SOURCE else key.source)
+
+
+def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> Template:
+    command, measured = loop.command.unit, loop.feedback.unit
+    given = loop.parameters.with_values({f"pid.{n}": value for n, (value, _, _) in first.gains.items()})
+    given = given.with_bounds({f"pid.{n}": (low, high) for n, (_, low, high) in first.gains.items()})
+    limit = write_value(first.limit, command)
+    sample_time = write_value(loop.pid.sample_time or 0.0, "s", _DIGITS)
+    stated = {"pid.form": '"parallel"', "pid.sample_time": _quote(sample_time)}
+    stated |= {f"pid.{n}": _value_text(given[f"pid.{n}"], free=True, bounds=True) for n in first.gains}
+    stated["pid.limits"] = f'["-{limit}", "{limit}"]'
+    if first.dither is not None:
+        frequency, most = first.dither
+        stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz"))}
+        ends = {"amplitude": 0.0, "offset": -most}
+        free = {n: Parameter(0.0, command, lower, most) for n, lower in ends.items()}
+        stated |= {f"dither.{n}": _value_text(p, free=True, bounds=True) for n, p in free.items()}
+    stated["minimise.settling_time"] = f'{{ band = "{BAND}", weight = 1.0 }}'
+    stated |= {"limits.overshoot": _quote(OVERSHOOT), "limits.max_sensitivity": f"{SENSITIVITY:g}"}
+    examples = {"loop.measured": _quote(loop.feedback.name), "loop.actuated": _quote(loop.command.name)}
+    horizon = _quote(write_value(first.horizon, "s"))
+    steps = [{"step": _quote(write_value(step, measured)), "horizon": horizon} for step in first.steps]
+    title = (
+        f"A PID of the {loop.feedback.name}, tuned together with what else is free in this file:",
+        "    pneuopt tune fit.toml tuning.toml -o tuned.toml      (or drive.toml, where there is no fit yet)",
+        "Lines that begin with # say what else there is; without the # they count.",
+    )
+    return Template(
+        title,
+        tuning_keys(command, measured),
+        stated,
+        {"reference": steps},
+        signal_units(command, measured, _position_unit(loop)),
+        examples,
+        _tuning_names(loop, first, values),
+        _schema_path("tuning"),
+    )
+
+
+def _tuning_names(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> dict[str, str]:
+    """Entries that stand for what a user names."""
+    swept, output = values[first.swept], loop.plant.outputs[0]
+    tenth = _value_text(replace(swept, value=0.1 * swept.value))
+    return {
+        "reference.start": f'{output.name} = "0 {output.unit}"',
+        "reference.disturbance": f'"{first.swept}" = {tenth}',
+        "scenarios.corners": f'"{first.swept}" = "30 %"',
+        "scenarios.samples": f'"{first.swept}" = "30 %"',
+        "scenarios.tolerances": '"pid.Kp" = "1 %"',
+    }
+
+
+def _study_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> Template:
+    swept = values[first.swept]
+    axis = ", ".join(_value_text(replace(swept, value=share * swept.value)) for share in SWEEP)
+    stated = {"study.drive": '"drive.toml"', "study.tuning": '"tuning.toml"', f'axes."{first.swept}"': f"[{axis}]"}
+    limits, unit = {"lower": 0.5 * first.limit, "upper": first.limit}, loop.command.unit
+    ends = {f"pareto.{n}": _quote(write_value(limit, unit)) for n, limit in limits.items()}
+    title = (
+        "How the loop does on other plants; name fit.toml and tuned.toml, once there are such:",
+        "    pneuopt study study.toml -o cases.csv --plot map.png",
+        "[pareto] asks for a front instead; leave out [axes] and [metrics] then.",
+    )
+    names = {"axes": '"supply.pressure" = { from = "5 bar(g)", to = "7 bar(g)", steps = 3 }'}
+    names = names if "supply.pressure" in values else {"axes": '"pid.Kp" = { from = 0.5, to = 1.5, steps = 3 }'}
+    return Template(title, STUDY_KEYS, stated, examples=ends, names=names, schema=_schema_path("study"))
+
+
+def _rig_template(loop: ClosedLoop) -> Template:
+    output = loop.plant.outputs[0]
+    title = (
+        "What the hardware has and its model has not; a design is certified on it, too:",
+        "    pneuopt tune fit.toml tuning.toml --rig rig.toml",
+        "All of it is optional: without any, the drive sticks and slips, and no more.",
+    )
+    return Template(
+        title,
+        RIG_KEYS,
+        names={"sensors": f'{output.name} = {{ noise = "0.001 {output.unit}" }}'},
+        schema=_schema_path("rig"),
+    )
+
+
+def _sidecar_template(
+    loop: ClosedLoop, first: FirstFiles, values: ParameterSet, columns: Mapping[str, str], log: str
+) -> Template:
+    signals, channels = (*loop.plant.inputs, *loop.plant.outputs), SIDECAR_KEYS["columns"].keys
+    own = next((q for q in signals if q.name not in channels), None)
+    output, swept = loop.feedback, values[first.swept]
+    names = {
+        "noise": f'{output.name} = "0.001 {output.unit}"',
+        "conditions": f'"{first.swept}" = {_value_text(swept)}',
+        "intersample": f'{loop.command.name} = "held"',
+    }
+    names |= {} if own is None else {"columns": f'{own.name} = "{own.name} [{own.unit}]"'}
+    title = (
+        f"The sidecar of {log}.csv (or .mat, ...): what the log's columns are. It has the log's name.",
+        'A column may be a table, too: { column = "U valve", unit = "V", centre = "5 V", scale = "1 V/V" }.',
+        "Without [columns] the header says it: position [mm], or position_mm.",
+    )
+    stated = {f"columns.{channel}": text for channel, text in columns.items()}
+    return Template(title, SIDECAR_KEYS, stated, names=names, schema=_schema_path("sidecar"))
+
+
+def _position_unit(loop: ClosedLoop) -> str:
+    units = {q.name: q.unit for q in loop.plant.outputs}
+    return "m" if loop.plant.axis is None else units.get(loop.plant.axis.position, "m")
+
+
+def _value_text(p: Parameter, *, free: bool = False, bounds: bool = False) -> str:
+    """A parameter's value, or a table with its bounds where it is free."""
+    value = _number_text(p.value, p.unit)
+    if not free:
+        return value
+    ends = f", lower = {_number_text(p.lower, p.unit)}, upper = {_number_text(p.upper, p.unit)}" if bounds else ""
+    return f"{{ value = {value}{ends}, free = true }}"
+
+
+def _number_text(value: float, unit: str) -> str:
+    text = write_value(value, unit, _DIGITS)
+    return text if unit == "1" else _quote(text)
+
+
+def _quote(text: str) -> str:
+    return f'"{text}"'
