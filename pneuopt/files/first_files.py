@@ -9,7 +9,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.excitation import DEFAULT_WIDTH
 from pneuopt.files.drive import FIT_SECTIONS
 from pneuopt.files.drive_keys import default_parameters, drive_keys
-from pneuopt.files.loop_parameters import tuning_keys
+from pneuopt.files.loop_parameters import SAMPLE_TIME, tuning_keys
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.schema import json_schema
 from pneuopt.files.study import STUDY_KEYS
@@ -25,7 +25,6 @@ from pneuopt.quantities.keys import Key
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.units import write_value
 
-SAMPLE_TIME = 1e-3  # [s] of a first controller, where no log shows one: a usual one; drives with slower ones say so
 BAND, OVERSHOOT, SENSITIVITY = "2 %", "5 %", 1.6  # what a first tuning asks for: usual, and within reach of most drives
 SWEEP = (0.8, 1.0, 1.2)  # of a first study's parameter, times its value: near enough that one design may hold
 _DIGITS = 6
@@ -187,12 +186,9 @@ def _rig_template(loop: ClosedLoop) -> Template:
         "    pneuopt tune fit.toml tuning.toml --rig rig.toml",
         "All of it is optional: without any, the drive sticks and slips, and no more.",
     )
-    return Template(
-        title,
-        RIG_KEYS,
-        names={"sensors": f'{output.name} = {{ noise = "0.001 {output.unit}" }}'},
-        schema=_schema_path("rig"),
-    )
+    zero = f'"0 {output.unit}"'
+    sensor = f'{output.name} = {{ lag = "0 s", noise = {zero}, resolution = {zero} }}'
+    return Template(title, RIG_KEYS, names={"sensors": sensor}, schema=_schema_path("rig"))
 
 
 def _sidecar_template(

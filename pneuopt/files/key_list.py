@@ -149,12 +149,14 @@ def _drive_rows() -> Iterable[KeyRow]:
         section, _, rest = name.partition(".")
         known = {kind for kind, keys in kinds.items() if section in keys}
         units, usual = ({kind: text(key) for kind, key in own.items()} for text in (describe_unit, describe_usual))
+        condition = _join({kind: key.condition for kind, key in own.items()})
         only = tuple(own) if set(own) != known or (not rest and set(own) != set(kinds)) else ()
-        yield KeyRow("drive.toml", section, rest, next(iter(own.values())), _join(units), _join(usual), only)
+        key = replace(next(iter(own.values())), condition=condition)
+        yield KeyRow("drive.toml", section, rest, key, _join(units), _join(usual), only)
 
 
 def _join(texts: Mapping[str, str]) -> str:
     """One text, and of each kind that differs its own: "N; rotary: N*m"."""
     first = next(iter(texts.values()))
-    others = [f"{kind}: {text}" for kind, text in texts.items() if text != first]
-    return "; ".join([first, *others])
+    others = [f"{kind}: {text}" for kind, text in texts.items() if text not in (first, "")]
+    return "; ".join(filter(None, [first, *others]))

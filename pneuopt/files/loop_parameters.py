@@ -13,7 +13,8 @@ from pneuopt.files.tuning_keys import TUNING_KEYS
 from pneuopt.quantities.keys import Key, parameter_key
 from pneuopt.quantities.parameters import ParameterSet, Quantity
 
-SAMPLE_TIME = 1e-3  # [s], by which the usual values are shown that count in samples
+SAMPLE_TIME = 1e-3
+"""Of a first controller, and of usual values that count in samples [s]: a common one; longer ones slow a loop down."""
 _LIMITS = ("lower", "upper")  # parameters that a file states as a pair, limits
 
 

@@ -10,6 +10,7 @@ from pneuopt.quantities.keys import Key, Takes
 from pneuopt.quantities.units import read_value
 
 COMMENT_COLUMN, MAX_WIDTH = 44, 110  # characters: a comment begins there, or above its key where the line is too long
+_NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,7 @@ class Template:
     def _example_text(self, name: str, key: Key) -> str:
         if name in self.examples:
             return self.examples[name]
-        if key.takes in (Takes.TABLE, Takes.TABLES) or (
-            key.takes is Takes.PARAMETER and key.keys and "bounds" in key.keys
-        ):
+        if key.takes is Takes.TABLE or (key.takes is Takes.PARAMETER and len(key.keys) > 1):
             inner = [f"{n} = {self._example_text(f'{name}.{n}', known)}" for n, known in key.keys.items()]
             inner += [self.names[name]] if name in self.names else []
             return f"{{ {', '.join(inner)} }}"
@@ -120,7 +119,9 @@ def _words_of(unit: str) -> list[str]:
 
 
 def _comment(text: str) -> list[str]:
-    return [f"# {line}" for line in textwrap.wrap(text, MAX_WIDTH - 2, break_on_hyphens=False)]
+    whole = text.replace(" [", f"{_NO_BREAK}[")  # "# [s]" would look like a section
+    lines = textwrap.wrap(whole, MAX_WIDTH - 2, subsequent_indent="  ", break_on_hyphens=False)
+    return [f"# {line}".replace(_NO_BREAK, " ") for line in lines]
 
 
 def _line(entry: str, remark: str) -> list[str]:

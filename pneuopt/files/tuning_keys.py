@@ -76,7 +76,9 @@ REFERENCE_KEYS: Mapping[str, Key] = {
     "horizon": Key("end of the experiment", unit="s", required=True, example='"1 s"'),
     "initial": Key("value before the step", unit="{measured}", usual=Step.initial),
     "at": Key("when it steps", unit="s", usual=Step.at),
-    "scale": Key("for a disturbance alone: what fractions are of", unit="{difference}", example='"0.1 m/s"'),
+    "scale": Key(
+        "what fractions are of", unit="{difference}", example='"0.1 m/s"', condition="for a disturbance alone"
+    ),
     "start": table("what else is known of the plant at time 0", {}, others=_KNOWN, named="output"),
     "disturbance": table("what changes of the plant at that instant", {}, others=_PUSH, named="parameter or input"),
 }

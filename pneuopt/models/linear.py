@@ -208,6 +208,7 @@ def _signal(structure: Structure, key: str) -> Quantity:
     return Quantity(name, unit)
 
 
+_OWN_UNIT = "parameters then count in it"
 LINEAR_KIND = DriveKind(
     FirstOrder.kind,
     {
@@ -218,8 +219,12 @@ LINEAR_KIND = DriveKind(
             ),
             "input": Key("channel that drives the plant", Takes.TEXT, usual=VALVE_VOLTAGE.name),
             "output": Key("channel that answers", Takes.TEXT, usual=SPEED.name),
-            "input_unit": Key("unit of the input, where it is another: a transducer's", Takes.TEXT, example='"V"'),
-            "output_unit": Key("unit of the output, where it is another: a transducer's", Takes.TEXT, example='"V"'),
+            "input_unit": Key(
+                "unit of the input, of a transducer, say", Takes.TEXT, example='"V"', condition=_OWN_UNIT
+            ),
+            "output_unit": Key(
+                "unit of the output, of a transducer, say", Takes.TEXT, example='"V"', condition=_OWN_UNIT
+            ),
             "pade_order": Key(
                 "order of the dead time's approximant, 0 to 5; 3 with a dead time", Takes.COUNT, example="3"
             ),

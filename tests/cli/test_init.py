@@ -1,0 +1,242 @@
+"""`pneuopt init`: what it writes has every key, runs, and replaces nothing."""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pneuopt.cli.app import app
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.files.drive import read_drive
+from pneuopt.files.key_list import KeyRow, list_keys
+from pneuopt.files.rig import read_rig
+from pneuopt.files.study import read_axes, read_study
+from pneuopt.files.tuning import Tuning, read_tuning
+from pneuopt.logs.read_log import read_log
+from pneuopt.models.drive_kinds import DRIVE_KINDS
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import read_value
+
+KINDS = [name for name, kind in DRIVE_KINDS.items() if kind.first is not None]
+FILES = ["drive.toml", "tuning.toml", "study.toml", "rig.toml", "log.toml"]
+ENTRY = re.compile(r'(# )?("?[\w.]+"?) = (["\d{[-]|true|false).*')
+
+
+def run(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(words))
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.output
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place: Path = tmp_path_factory.mktemp(request.param)
+    code, output = run("init", request.param, "-o", str(place))
+    assert code == 0, output
+    return place
+
+
+def read_all(folder: Path) -> Tuning:
+    drive, given = read_drive(folder / "drive.toml")
+    tuning = read_tuning(folder / "tuning.toml", drive.system())
+    read_axes(read_study(folder / "study.toml"), given | tuning.parameters)
+    read_rig(folder / "rig.toml", drive, tuning.loop)
+    assert given.free_names
+    assert tuning.parameters.free_names
+    return tuning
+
+
+def test_what_it_writes_is_read(folder: Path) -> None:
+    tuning = read_all(folder)
+    assert isinstance(tuning.loop, ClosedLoop)
+    assert len(tuning.references) == 2
+
+
+def rows_of(file: str, kind: str) -> list[KeyRow]:
+    """The list's rows that concern a kind of drive."""
+    heads = {r.section: r.kinds for r in list_keys() if r.file == file and not r.name}
+    rows = [r for r in list_keys() if r.file == file]
+    return [r for r in rows if all(not kinds or kind in kinds for kinds in (r.kinds, heads.get(r.section, ())))]
+
+
+def sections(text: str) -> dict[str, list[str]]:
+    """The lines of each section, whether it is stated or a comment."""
+    found: dict[str, list[str]] = {"": []}
+    name = ""
+    for line in text.splitlines():
+        head = re.fullmatch(r"(?:# )?\[+([\w.]+)\]+", line)
+        name = head[1] if head else name
+        found.setdefault(name, []).append(line)
+    return found
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_key_stands_in_it(folder: Path, file: str) -> None:
+    text = (folder / file).read_text("utf-8")
+    lines, missing = sections(text), []
+    for row in rows_of(file, folder.name.rstrip("0123456789")):
+        key = row.name.rpartition(".")[2]
+        if row.section == "limits" and key in ("max", "min"):
+            continue  # a limit alone is written without them
+        where = text if "*" in row.name else "\n".join(lines.get(row.section, lines[""]))
+        if not (key.startswith("<") or not key or re.search(rf'(^|[ {{])"?{key}"? = ', where, re.MULTILINE)):
+            missing.append(row.full_name)
+        if not key and row.section not in lines and f"# {row.section} = " not in text:
+            missing.append(row.section)
+    assert missing == []
+
+
+def uncommented(path: Path) -> Iterator[tuple[str, str, str]]:
+    """Section, key and the text in which one more line counts, with its section's head and what that needs."""
+    lines = path.read_text("utf-8").splitlines()
+    head, needed = -1, dict[int, list[int]]()
+    for i, line in enumerate(lines):
+        head = i if re.match(r"(# )?\[+\w+\]+$", line) else head
+        if line.startswith("# ") and re.search(r"^# (gain|level|amplitude|width|kind|frequency|lag|model) = ", line):
+            needed.setdefault(head, []).append(i)
+    head = -1
+    for i, line in enumerate(lines):
+        head = i if re.match(r"(# )?\[+\w+\]+$", line) else head
+        entry = ENTRY.match(line)
+        if entry and entry[1]:
+            edited = {i, head, *needed.get(head, [])} - {-1}
+            text = "\n".join(t.removeprefix("# ") if k in edited else t for k, t in enumerate(lines))
+            yield lines[head].strip("# []") if head >= 0 else "", entry[2].strip('"'), text
+
+
+def refusal(read: Callable[[Path], Any], path: Path) -> list[str]:
+    try:
+        read(path)
+    except InputError as error:
+        return [str(error)]
+    return []
+
+
+def test_every_commented_line_counts_without_its_mark(folder: Path, tmp_path: Path) -> None:
+    """A line that its file, as it is, does not allow says its condition."""
+    kind, drive = folder.name.rstrip("0123456789"), read_drive(folder / "drive.toml")[0]
+    readers: dict[str, Callable[[Path], Any]] = {
+        "drive.toml": read_drive,
+        "tuning.toml": lambda path: read_tuning(path, drive.system()),
+        "study.toml": read_study,
+    }
+    refusals: list[str] = []
+    for file, read in readers.items():
+        conditions = {(r.section, r.name): r.key.condition for r in rows_of(file, kind)}
+        exclusive = {"sensor", "pareto"}
+        for section, key, text in uncommented(folder / file):
+            (tmp_path / file).write_text(text, encoding="utf-8")
+            allowed = bool(conditions.get((section, key))) or section in exclusive
+            refusals += [] if allowed else refusal(read, tmp_path / file)
+    assert not refusals, "\n".join(refusals)
+
+
+def test_a_schema_knows_what_the_file_says(folder: Path) -> None:
+    import tomllib
+
+    for file in FILES:
+        text = (folder / file).read_text("utf-8")
+        place = re.match("#:schema (.*)\n", text)
+        assert place is not None
+        schema = json.loads((folder / place[1]).read_text("utf-8"))
+        for name, entries in tomllib.loads(text).items():
+            known = schema["properties"][name]
+            known = known.get("items", known)
+            if isinstance(entries, dict):
+                assert set(known.get("required", [])) <= set(entries)
+                assert known["additionalProperties"] or set(entries) <= set(known["properties"])
+
+
+def test_the_loop_that_it_writes_runs(folder: Path) -> None:
+    code, output = run("simulate", str(folder / "drive.toml"), str(folder / "tuning.toml"))
+    assert code == 0, output
+    assert "SettlingTime" in output
+
+
+def write_log(folder: Path, path: Path) -> dict[str, float]:
+    """A log of the drive with some parameters off, driven by its command in steps; what was changed."""
+    drive, given = read_drive(folder / "drive.toml")
+    system = drive.system()
+    changed = {n: 1.2 * given.value(n) for n in given.free_names if given.value(n) > 0}
+    t = np.arange(0.0, 2.0, 1e-3)
+    command = system.inputs[0]
+    size = {"V": 0.4, "N": 120.0, "N*m": 1.2}[command.unit]
+    wave = size * np.sign(np.sin(2 * np.pi * 1.7 * t) + 0.3 * np.sin(2 * np.pi * 4.1 * t)) * (0.5 + 0.5 * np.sin(3 * t))
+    run = simulate(system, Trajectory(t, {command.name: wave}), given.with_values(changed))
+    names = [command, *system.outputs]
+    head = ",".join(["time [s]", *(f"{q.name} [{q.unit}]" for q in names)])
+    values = {**run.values, command.name: wave}
+    rows = np.column_stack([t, *(values[q.name] for q in names)])
+    path.write_text(head + "\n" + "\n".join(",".join(f"{v:.9g}" for v in row) for row in rows), encoding="utf-8")
+    return changed
+
+
+@pytest.mark.slow
+def test_a_log_is_identified_and_the_loop_tuned(folder: Path, tmp_path: Path) -> None:
+    fit, changed = tmp_path / "fit.toml", write_log(folder, tmp_path / "run.csv")
+    code, output = run("identify", str(folder / "drive.toml"), str(tmp_path / "run.csv"), "-o", str(fit))
+    assert code == 0, output
+    found = read_drive(fit)[1]
+    close = [n for n, value in changed.items() if abs(found.value(n) / value - 1) < 0.1]
+    assert len(close) >= 0.5 * len(changed), output
+    tuning = (folder / "tuning.toml").read_text("utf-8") + '[method]\nkind = "racing"\nmembers = 8\ntrials = 40\n'
+    (tmp_path / "tuning.toml").write_text(tuning, encoding="utf-8")
+    code, output = run("tune", str(fit), str(tmp_path / "tuning.toml"))
+    assert code == 0, output
+
+
+def test_old_files_stay_unless_forced(tmp_path: Path) -> None:
+    (tmp_path / "tuning.toml").write_text("# mine\n", encoding="utf-8")
+    code, output = run("init", "force", "-o", str(tmp_path))
+    assert (code, "--force replaces it" in output) == (2, True)
+    assert [p.name for p in tmp_path.iterdir()] == ["tuning.toml"]
+    assert (tmp_path / "tuning.toml").read_text("utf-8") == "# mine\n"
+    assert run("init", "force", "-o", str(tmp_path), "--force")[0] == 0
+    assert run("init", "force", "-o", str(tmp_path))[0] == 0  # the same text is no loss
+    read_all(tmp_path)
+
+
+def test_the_catalogue_gives_cylinder_and_valve(tmp_path: Path) -> None:
+    assert run("init", "pneumatic", "--size", "s25", "--valve", "1400", "-o", str(tmp_path))[0] == 0
+    given = read_drive(tmp_path / "drive.toml")[1]
+    assert (given.value("cylinder.bore"), given.value("valve.conductance")) == (0.025, 5.5e-8)
+    assert given["valve.rounding"].source.startswith("default")  # the logs choose it
+    assert "no single product" in (tmp_path / "drive.toml").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "say what drives the load: pneuopt init KIND"),
+        (["pneumtic"], "did you mean 'pneumatic'"),
+        (["motion"], "unknown kind 'motion'"),
+        (["force", "--size", "s25"], "--size is of the catalogue of pneumatic drives"),
+        (["pneumatic", "--valve", "100"], "catalogue: unknown valve '100'"),
+    ],
+)
+def test_what_cannot_be_written_is_said(words: list[str], message: str, tmp_path: Path) -> None:
+    code, output = run("init", *words, "-o", str(tmp_path / "new"))
+    assert (code, message in output) == (2, True), output
+    assert not (tmp_path / "new").exists()
+
+
+def test_units_of_examples_read(folder: Path) -> None:
+    for file in ("drive.toml", "tuning.toml"):
+        for value in re.findall(r'^#? ?\w+ = "([-\d.e+]+ [^"(]+)"', (folder / file).read_text("utf-8"), re.MULTILINE):
+            unit = value.partition(" ")[2]
+            read_value(value, unit)
+
+
+def test_the_sidecar_as_written_changes_nothing(folder: Path, tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("time [s],speed [m/s]\n" + "".join(f"{0.1 * i:.1f},{i}\n" for i in range(20)), encoding="utf-8")
+    alone = read_log(log).trajectory
+    (tmp_path / "log.toml").write_text((folder / "log.toml").read_text("utf-8"), encoding="utf-8")
+    assert list(read_log(log).trajectory.values) == list(alone.values)
