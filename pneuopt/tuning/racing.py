@@ -31,8 +31,9 @@ START_SHARES = (0.5, 0.35)
 # Shares of a start's trials over all bands, and over the nearest wider one. Less ends in the nearest optimum; more
 # leaves the band asked for too few.
 BAND_SHARES = (0.4, 0.25)
-# Generations over which the best merit must improve by this share for a phase to go on, and the spread of the whole
-# population, a share of its best, below which it ends. Shorter or larger ends a search that still advances.
+# Generations over which the best merit, or the median, must improve by this share for a phase to go on, and the spread
+# of the whole population, a share of its best, below which it ends. Shorter or larger ends a search that still
+# advances; so does to look at the best alone, which stands while the others catch up.
 PATIENCE, LEAST_PROGRESS, LEAST_SPREAD = 25, 1e-3, 1e-4
 # Members of the phase on fine samples. Fewer lose the optimum where coarse and fine samples rank points differently;
 # each more costs fine simulations.
@@ -40,9 +41,10 @@ FINE_MEMBERS = 20
 # Best points of the first start from which the second one begins, and its amplitudes, a share of their range: hardly
 # any dither, where optima lie that a population with dither does not see.
 FEW_BEST, NO_DITHER = 6, 0.02
-# Points, as far from each other as this share of a gain's range, that gradients improve at a time. Fewer or farther
-# ones miss basins; each more costs a descent, and closer ones end in the same point.
-POLISHED, MIN_DISTANCE = 4, 0.03
+# Points, as far from each other as this share of a gain's range, that gradients improve at a time, on whole responses:
+# cut ones end at other operating points, whose margins they meet. Fewer or farther points miss basins; each more costs
+# a descent, and closer ones end in the same point.
+POLISHED, MIN_DISTANCE = 2, 0.03
 AGREEMENT = 0.01  # relative difference of two starts' merits that count as one: larger ones hide a second optimum
 # Best merit after the wide bands, over that with which the first start ended, from which on a start is given up; and a
 # point's merit over the best, from which on gradients leave it. A smaller one gives up what gradients may still bring
@@ -51,9 +53,6 @@ LAGGING = 1.3
 # Best settling times, and shares of the horizon, that a race sees of each response, whichever is longer. Less takes for
 # settled what leaves the band later; more simulates what seldom changes a merit. Each new best is proved on the whole.
 CUT_SETTLING_TIMES, LEAST_CUT = 3.0, 0.15
-# Share of the horizon from which on gradients see whole responses. A cut one ends at another operating point, whose
-# margins they meet: on the drive of problems/shared/t32.py, cut at half, Ms 1.98 where the end of the whole has 2.11.
-LONGEST_POLISHED_CUT = 0.4
 # Trials for each free gain of a short search, unless the whole one has fewer. With 200 the smallest relaxation of one
 # gain's limit came out 4 % too large; more cost time where there are many gains.
 LEAST_SHORT_TRIALS = 400
@@ -308,7 +307,7 @@ class _RacingSearch:
             return population, merits
         chosen = _distinct_points(population[merits <= LAGGING * merits[0]])[:POLISHED]
         self.best = population[0].copy()
-        unit, count = self._polisher.improve(population[chosen], self._cut_simulator(simulator), iterations)
+        unit, count = self._polisher.improve(population[chosen], simulator, iterations)
         self.count += count
         found = Race(simulator, self._spec, self._scale).merits(self._space.from_unit(unit))[0]
         better = found < merits[chosen]
@@ -320,7 +319,7 @@ class _RacingSearch:
 
     def evolve(self, population: Array, phase: _Phase) -> tuple[Array, Array]:
         """Evolve a population through a phase; where it ends, the best first, and their merits."""
-        race, before, bests = Race(phase.simulator, self._spec, self._scale), self.count, list[float]()
+        race, before, stand = Race(phase.simulator, self._spec, self._scale), self.count, list[tuple[float, float]]()
         merits, worst = race.merits(self._space.from_unit(population))
         history = SuccessHistory(population, merits, self._rng)
         self.best, best = history.population[0].copy(), float(history.merits[0])
@@ -334,9 +333,9 @@ class _RacingSearch:
             if history.merits.min() < best:
                 best, self.best = float(history.merits.min()), history.population[np.argmin(history.merits)].copy()
                 self._cut(race)
-            bests.append(best)
+            stand.append((best, float(np.median(history.merits))))
             self._progress(f"{phase.name}, generation {number + 1}: best {best:.4g}")
-            if _is_done(bests, history.merits):
+            if _is_done(stand, history.merits):
                 break
         order = np.argsort(history.merits, kind="stable")
         return history.population[order], history.merits[order]
@@ -360,10 +359,6 @@ class _RacingSearch:
         settled = float(values.values["SettlingTime"][0])
         return max(CUT_SETTLING_TIMES * settled, LEAST_CUT * self._scale) if np.isfinite(settled) else np.inf
 
-    def _cut_simulator(self, simulator: Simulator) -> Simulator:
-        time = self._cut_time()
-        return simulator.cut(time) if time < LONGEST_POLISHED_CUT * self._scale else simulator
-
 
 def _distinct_points(unit: Array) -> Indices:
     """Indices of points in their order; one that lies close to one before it is left out."""
@@ -380,7 +375,9 @@ def _near(best: Array, others: Array, rng: np.random.Generator) -> Array:
     return np.where((np.arange(len(others)) % 2 == 0)[:, None], close, others)
 
 
-def _is_done(bests: Sequence[float], merits: Array) -> bool:
-    """Whether a population no longer advances: its best stands still, or all its members are alike."""
-    stands = len(bests) > PATIENCE and bests[-1] > bests[-1 - PATIENCE] * (1 - LEAST_PROGRESS)
+def _is_done(stand: Sequence[tuple[float, float]], merits: Array) -> bool:
+    """Whether a population no longer advances: its best and its median stand still, or all its members are alike."""
+    stands = len(stand) > PATIENCE and all(
+        now > before * (1 - LEAST_PROGRESS) for now, before in zip(stand[-1], stand[-1 - PATIENCE], strict=True)
+    )
     return stands or bool(np.ptp(merits) <= LEAST_SPREAD * abs(merits.min()))

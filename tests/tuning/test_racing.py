@@ -18,7 +18,7 @@ from pneuopt.tuning.merit import compute_merits
 from pneuopt.tuning.method import TuningTask
 from pneuopt.tuning.polish import Polish
 from pneuopt.tuning.race import Race
-from pneuopt.tuning.racing import Racing, RacingResult, run_racing
+from pneuopt.tuning.racing import PATIENCE, Racing, RacingResult, _is_done, run_racing
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 
@@ -112,9 +112,7 @@ def test_a_start_that_lags_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert phases[1][-1] == "fine samples"
 
 
-def test_gradients_see_fine_samples_and_cut_responses_only_where_that_saves_much(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_gradients_see_whole_responses_on_fine_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Coarse samples are gamed, and a response that is cut ends at another operating point, with other margins."""
     seen = list[tuple[float, float]]()
 
@@ -127,14 +125,19 @@ def test_gradients_see_fine_samples_and_cut_responses_only_where_that_saves_much
     _, simulator = posed(Dither(500.0))
     whole, fine = STEP.horizon, simulator.grids[0].spacing
     assert simulator.coarse(SPEC).grids[0].spacing > 1.5 * fine
-    monkeypatch.setattr("pneuopt.tuning.racing.CUT_SETTLING_TIMES", 0.0)
-    for least, expected in ((0.5, whole), (0.3, 0.3 * whole)):
-        monkeypatch.setattr("pneuopt.tuning.racing.LEAST_CUT", least)
-        seen.clear()
-        search(Racing(members=8, trials=60, polish=3), dither=Dither(500.0))
-        assert len(seen) >= 2
-        assert {spacing for _, spacing in seen} == {fine}
-        assert [end for end, _ in seen] == pytest.approx([expected] * len(seen), abs=fine)
+    monkeypatch.setattr("pneuopt.tuning.racing.CUT_SETTLING_TIMES", 0.0)  # trials see 15 % of the horizon
+    search(Racing(members=8, trials=60, polish=3), dither=Dither(500.0))
+    assert len(seen) >= 2
+    assert {spacing for _, spacing in seen} == {fine}
+    assert [end for end, _ in seen] == pytest.approx([whole] * len(seen), abs=fine)
+
+
+@pytest.mark.parametrize(("last", "ends"), [((1.0, 3.0), True), ((1.0, 2.99), False), ((0.99, 3.0), False)])
+def test_a_phase_ends_where_best_and_median_stand(last: tuple[float, float], ends: bool) -> None:
+    """A best one that stands alone is waited for: the others have not yet followed it."""
+    stand = [(1.0, 3.0)] * PATIENCE + [last]
+    assert _is_done(stand, np.array([1.0, 3.0])) == ends
+    assert not _is_done(stand[1:], np.array([1.0, 3.0]))
 
 
 def test_the_result_says_how_many_starts_agree() -> None:
