@@ -11,6 +11,7 @@ from pneuopt.dynamics.hooks import Log
 from pneuopt.dynamics.runnable import Fittable
 from pneuopt.dynamics.system import names
 from pneuopt.identification.repairs import repair_log
+from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import estimate_noise, noise_level
 from pneuopt.quantities.arguments import as_tuple, check_parameters
@@ -20,6 +21,14 @@ from pneuopt.quantities.parameters import ParameterSet
 # Factor [1] between a stated noise level and the one that the log shows: a smaller one doubts good estimates of short
 # logs and of noise that is not white, a larger one lets intervals through that are too narrow.
 MAX_NOISE_FACTOR = 3.0
+FOREIGN_CHANNELS = "channels"  # the name by which channels that no plant reads are accepted, and left out
+# What a fit cannot do without, by the names of the checks, and why no user can accept it.
+NEEDED = {
+    "length": "fewer hold no start state beside a parameter",
+    "inputs": "without it the equations cannot be computed",
+    "outputs": "without one there is nothing to compare",
+    "noise": "a constant channel shows none; state its [noise] in the sidecar",
+}
 SETPOINT_CHANNELS = (
     "speed_reference",
     "position_reference",
@@ -48,11 +57,24 @@ def check_logs(
         name = experiment.name or f"log {number}"
         name = name if name not in taken else f"{name} ({number})"
         taken.add(name)
+        check_accept(experiment, name)
         system.check_log(experiment.trajectory, name)
-        _check_channels(system, experiment, name, known)
-        _check_conditions(system, experiment, parameters, name)
-        out.append(repair_log(system, replace(experiment, name=name))[0])
+        read = experiment.trajectory.names
+        if FOREIGN_CHANNELS in experiment.accept:
+            read = tuple(n for n in read if n in known)
+        own = replace(experiment.select(read), name=name)
+        _check_channels(system, own, name, known)
+        _check_conditions(system, own, parameters, name)
+        out.append(repair_log(system, own)[0])
     return _fill_noise(system, out)
+
+
+def check_accept(experiment: Experiment, name: str) -> None:
+    """Check the names of what a log need not pass: each is a check, and one without which a fit is possible."""
+    for check in experiment.accept:
+        if check in NEEDED:
+            raise LogError(f"{name}: accept: {check!r} cannot be accepted: {NEEDED[check]}")
+    check_names("check", experiment.accept, (*CHECKS, FOREIGN_CHANNELS), f"{name}: accept")
 
 
 def check_free(experiments: Sequence[Experiment], parameters: ParameterSet) -> None:
@@ -82,7 +104,9 @@ def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence
     """What was mended in logs, and stated noise levels that the logs themselves do not show; a sentence each."""
     out: list[str] = []
     for log, named in zip(given, checked, strict=True):
-        out += repair_log(system, replace(log, name=named.name))[1]
+        if ignored := [n for n in log.trajectory if n not in named.trajectory]:
+            out.append(f"{named.name}: accepted: {', '.join(ignored)}, which the model does not read")
+        out += repair_log(system, replace(log.select(named.trajectory), name=named.name))[1]
         for channel in outputs_in_log(system, named):
             stated, found = log.noise.get(channel), estimate_noise(named.trajectory[channel], named.trajectory.t)
             shown, least = found.level, found.level / MAX_NOISE_FACTOR if found.is_white else 0.0
@@ -104,17 +128,19 @@ def _check_conditions(system: Fittable, experiment: Experiment, parameters: Para
 
 def _check_channels(system: Fittable, experiment: Experiment, name: str, known: set[str]) -> None:
     trajectory = experiment.trajectory
-    require(len(trajectory) >= 10, f"{name}: {len(trajectory)} samples are too short a log; at least 10", LogError)
+    short = f"{name}: {len(trajectory)} samples are too short a log; at least 10, for {NEEDED['length']}"
+    require(len(trajectory) >= 10, short, LogError)
     for q in system.inputs:
         needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
-        require(q.name in trajectory, needed + ", ".join(trajectory.names), LogError)
+        require(q.name in trajectory, f"{needed}{', '.join(trajectory.names)}; {NEEDED['inputs']}", LogError)
     for channel in trajectory:
-        remedy = "leave it out (Experiment.select, or the sidecar's [columns])"
+        remedy = "leave it out (Experiment.select, or the sidecar's [columns]), or accept = ['channels']"
         reads = ", ".join(sorted(n for n in known if not n.endswith("_reference")))
         message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
         require(channel in known, message, LogError)
     outputs = ", ".join(names(system.outputs))
-    require(bool(outputs_in_log(system, experiment)), f"{name}: none of the outputs is logged: {outputs}", LogError)
+    missing = f"{name}: none of the outputs is logged: {outputs}; {NEEDED['outputs']}"
+    require(bool(outputs_in_log(system, experiment)), missing, LogError)
     for channel in outputs_in_log(system, experiment):
         empty = f"{name}: channel {channel!r} holds no sample; leave it out"
         require(bool(np.isfinite(trajectory[channel]).any()), empty, LogError)
@@ -132,9 +158,7 @@ def _fill_noise(system: Fittable, experiments: Sequence[Experiment]) -> list[Exp
     pooled = {}
     for channel, levels in found.items():
         shown = [level for level in levels.values() if not math.isnan(level)]
-        constant = (
-            f"{next(iter(levels))}: channel {channel!r} is constant; leave it out, or log a run in which it moves"
-        )
+        constant = f"{next(iter(levels))}: channel {channel!r} is constant; leave it out, or state its [noise]"
         require(len(shown) > 0, constant, LogError)
         pooled[channel] = float(np.median(shown))
     return [

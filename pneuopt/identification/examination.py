@@ -8,9 +8,9 @@ from pneuopt.identification.checks import as_experiments, check_logs
 from pneuopt.identification.problem import as_estimation_model
 from pneuopt.identification.stated_axis import stated_axis
 from pneuopt.logs.checks.findings import LogFinding
-from pneuopt.logs.doctor import CHECKS, examine
+from pneuopt.logs.doctor import examine
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.errors import LogError, check_names
+from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
 
 QUIET_CHECKS = ("sampling",)
@@ -75,5 +75,4 @@ def check_content(system: Fittable, experiments: Sequence[Experiment], parameter
 
 def _find(system: Fittable, experiments: Iterable[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:
     for experiment in experiments:
-        check_names("check", experiment.accept, CHECKS, f"{experiment.name}: accept")
         yield from examine(experiment, stated_axis(system.plant, experiment, parameters))

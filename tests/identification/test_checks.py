@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pneuopt.dynamics.hooks import Log
+from pneuopt.identification.checks import NEEDED, check_logs, log_remarks
 from pneuopt.identification.examination import check_content
 from pneuopt.identification.identify import identify
 from pneuopt.logs.experiments import Experiment
@@ -169,7 +170,29 @@ def test_a_refusal_names_its_check_and_is_overridden_by_that_name() -> None:
 
 def test_an_unknown_check_is_named() -> None:
     with pytest.raises(UnknownNameError, match=r"run: accept: unknown check 'werk'; did you mean 'work'"):
-        check_content(RIG.system(), [braked(("werk",))], RIG.parameters)
+        check_logs(RIG.system(), [braked(("werk",))], RIG.parameters)
+
+
+@pytest.mark.parametrize("name", ["length", "inputs", "outputs", "noise"])
+def test_what_a_fit_cannot_do_without_is_not_accepted_and_it_is_said_why(name: str) -> None:
+    with pytest.raises(LogError, match=f"run: accept: '{name}' cannot be accepted: {NEEDED[name][:20]}"):
+        check_logs(RIG.system(), [braked((name,))], RIG.parameters)
+
+
+def test_a_channel_that_no_model_reads_is_left_out_by_name() -> None:
+    extra = log_with(temperature=np.full(100, 300.0))
+    with pytest.raises(LogError, match=r"cannot use channel 'temperature'.* or accept = \['channels'\]"):
+        check_logs(RIG.system(), extra, RIG.parameters)
+    accepting = extra.accepting("channels")
+    (checked,) = check_logs(RIG.system(), accepting, RIG.parameters)
+    assert checked.trajectory.names == ("force", "position")
+    (said,) = log_remarks(RIG.system(), [accepting], [checked])
+    assert said == "run 0: accepted: temperature, which the model does not read"
+
+
+def test_a_constant_channel_is_no_obstacle_where_its_noise_is_stated() -> None:
+    still = log_with(position=np.full(100, 3.0)).with_noise({"position": NOISE})
+    assert check_logs(RIG.system(), still, RIG.parameters)[0].noise == {"position": NOISE}
 
 
 def test_a_sidecar_accepts_checks_by_name(tmp_path: Path) -> None:

@@ -37,13 +37,13 @@ MIN_OFFSET_SHARE = 0.2
 """Offset over friction [1] that is worth a word: lower speaks of every sensor, higher passes what moves estimates."""
 MAX_NOISE_SHARE = 2e-3
 """Share of the accelerations' variance [1] that noise may have: higher makes masses small, lower blurs fast motion."""
-MIN_ROWS = 30
+MIN_HATS = 30
 """Windows each way [1] that a balance needs: fewer fit any mass."""
 MAX_PHASE_STEP = 0.25
 """Phase of the motion from sample to sample [rad]: higher leaves lags of a part of a sample, which look like a mass."""
 LAG_STEPS = 20
 """Lags each way that are tried: fewer leave a lag of milliseconds, which looks like a mass under viscous friction."""
-MAX_ROWS = 2000
+MAX_HATS = 2000
 """Windows that are used of a log [1]: more cost time and say the same."""
 
 
@@ -122,7 +122,7 @@ def force_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
     if rows is None:
         return None
     lags = [(lag, *_columns(rows, lag)) for lag in sensor_lags(rows.t, LAG_STEPS)]
-    if min(min(int((s > 0).sum()), int((s < 0).sum())) for _, _, s, _, _ in lags) < MIN_ROWS:
+    if min(min(int((s > 0).sum()), int((s < 0).sum())) for _, _, s, _, _ in lags) < MIN_HATS:
         return None
     if _rms(rows.acceleration) * (rows.t[1] - rows.t[0]) > MAX_PHASE_STEP * _rms(rows.speed):
         return None
@@ -191,7 +191,7 @@ def _columns(rows: _Rows, lag: int) -> tuple[Array, Array, Array, Array]:
     late, early = slice(max(lag, 0), n + min(lag, 0)), slice(max(-lag, 0), n - max(lag, 0))
     a, s, v, f = rows.acceleration[late], rows.direction[late], rows.speed[late], rows.force[early]
     used = np.flatnonzero((s != 0) & np.isfinite(a) & np.isfinite(v) & np.isfinite(f))
-    used = used[:: max(1, used.size // MAX_ROWS)]
+    used = used[:: max(1, used.size // MAX_HATS)]
     return a[used], s[used], v[used], f[used]
 
 
