@@ -57,12 +57,15 @@ def options(
 @app.command("init")
 def init_command(
     kind: Annotated[
-        str | None, typer.Argument(metavar="[KIND]", help="What drives the load: pneumatic, force, rotary or linear.")
+        str | None, typer.Argument(metavar="[KIND]", help="What drives the load: pneumatic, force, rotary, linear.")
     ] = None,
     size: Annotated[str | None, typer.Option(help="Of the catalogue: s25, s32 or s40.")] = None,
     cylinder: Annotated[str | None, typer.Option(help="Of the catalogue, by its bore: 25, 32 or 40.")] = None,
     valve: Annotated[str | None, typer.Option(help="Of the catalogue, by its l/min: 350, 700 or 1400.")] = None,
     folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where to write.")] = Path(),
+    log: Annotated[
+        Path | None, typer.Option("--from", metavar="LOG", help="Fill the sidecar of this log by what it shows.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
 ) -> None:
     """Write a first drive.toml, tuning.toml, study.toml, rig.toml and log.toml, with every key explained."""
@@ -70,7 +73,7 @@ def init_command(
         from pneuopt.cli.init import run_init
 
         parts = {"size": size, "cylinder": cylinder, "valve": valve}
-        raise typer.Exit(run_init(kind, folder, parts, force))
+        raise typer.Exit(run_init(kind, folder, parts, log, force))
 
 
 @app.command("identify")

@@ -1,66 +1,135 @@
 """The command `init`: the first files of a new user, each whole or not at all, none over an old one."""
 
-from collections.abc import Mapping
+import os
+import sys
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import typer
 
 from pneuopt.cli.exit_status import EXIT_SUCCESS
-from pneuopt.files.first_files import first_files, first_kinds
+from pneuopt.files.first_files import first_channels, first_files, first_kinds, sidecar_name
+from pneuopt.files.loop_parameters import SAMPLE_TIME
+from pneuopt.logs.budget import read_bytes
+from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
+from pneuopt.logs.readers import read_table
+from pneuopt.logs.table import Table
 from pneuopt.models.catalog import CATALOGUE_SOURCE, catalogue_values
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import check_output_paths, write_text
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.units import write_value
 
 USUAL_SIZE = "s32"  # of the catalogue: the middle one
 _CATALOGUE_KIND = "pneumatic"
+_SAMPLE_TIMES = (1e-4, 0.02)  # [s]: a controller's; a log with another step was not written by the controller
+_WIDTH = 80  # characters of a line on the screen
 
 
-def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], force: bool) -> int:
+@dataclass
+class Asker:
+    """Answers the doubts about a log: by the user on a terminal, else by the guess, which it keeps to be told."""
+
+    interactive: bool
+    assumed: list[str] = field(default_factory=list)
+
+    def __call__(self, question: Question) -> str:
+        """One of the question's options."""
+        if not self.interactive:
+            self.assumed.append(f"{question.channel}: {question.text} Taken: {question.options[0]}")
+            return question.options[0]
+        answer = ""
+        while answer not in question.options:
+            answer = typer.prompt(f"{question.text} ({' / '.join(question.options)})", default=question.options[0])
+        return answer
+
+
+def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], log: Path | None, force: bool) -> int:
     """Write the files and say which.
 
     Parameters
     ----------
     kind : str, optional
+        Without it, as the log's channels say.
     folder : Path
         Made where it is missing.
     parts : mapping of str to str or None
         "size", "cylinder" and "valve" of the catalogue.
+    log : Path, optional
+        Whose sidecar is filled.
     force : bool
         Whether old files may be replaced.
     """
-    kinds = ", ".join(first_kinds())
-    require(kind is not None, f"say what drives the load: pneuopt init KIND, one of {kinds}")
-    check_names("kind", [str(kind)], first_kinds(), "init")
-    known, source = _read_catalogue(str(kind), parts)
-    files = first_files(str(kind), known, {}, source=source)
-    write_files(folder, files, force)
-    _show_next(folder, files)
+    table = None if log is None else read_table(log, read_bytes(log))
+    kind = kind if table is None or kind is not None else _guess_kind(table)
+    require(kind is not None, f"say what drives the load: pneuopt init KIND, one of {', '.join(first_kinds())}")
+    name = str(kind)
+    check_names("kind", [name], first_kinds(), "init")
+    known, source = _read_catalogue(name, parts)
+    ask = Asker(sys.stdin.isatty() and sys.stdout.isatty())
+    guess = LogGuess((), (), SAMPLE_TIME) if table is None else guess_log(table, first_channels(name), ask)
+    columns = {column.channel: column.entry for column in guess.columns}
+    least, most = _SAMPLE_TIMES
+    sample_time = guess.sample_time if least <= guess.sample_time <= most else SAMPLE_TIME
+    files = first_files(
+        name,
+        known,
+        columns,
+        log=log.name if log else "log.csv",
+        sample_time=sample_time,
+        source=source,
+        doubts=ask.assumed,
+    )
+    write_files(_place_files(folder, files, log), force)
+    _show_files(folder, files, guess, ask.assumed, log)
     return EXIT_SUCCESS
 
 
-def write_files(folder: Path, files: Mapping[str, str], force: bool) -> None:
-    """Write files below a folder, all or none: an old one with another text is refused, unless forced.
+def write_files(files: Mapping[Path, str], force: bool) -> None:
+    """Write files, all or none: an old one with another text is refused, unless forced.
 
     Raises
     ------
     InputError
         Before the first is written, if one of them may not or cannot be.
     """
-    paths = {folder / name: text for name, text in files.items()}
-    for path, text in paths.items():
-        is_new = force or not path.exists() or path.read_bytes() == text.encode()
-        require(
-            is_new, f"{path}: is there already, and was left as it is; --force replaces it, -o names another folder"
-        )
-    for parent in dict.fromkeys(path.parent for path in paths):
+    for path, text in files.items():
+        is_new = force or not path.exists() or (path.is_file() and path.read_bytes() == text.encode())
+        require(is_new, f"{path}: is there already, and stays as it is; --force replaces it, -o names another folder")
+    for parent in dict.fromkeys(path.parent for path in files):
         try:
             parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             require(False, f"{parent}: the folder cannot be made ({error.strerror}); name another with -o")
-    check_output_paths(paths, [])
-    for path, text in paths.items():
+    check_output_paths(files, [])
+    for path, text in files.items():
         write_text(path, text)
+
+
+def _guess_kind(table: Table) -> str:
+    """What drives the load, by the channels that a log's columns may be."""
+    channels = {n: unit for kind in first_kinds() for n, unit in first_channels(kind).items()}
+    found = guess_channels(table.names, channels)
+    if "torque" in found or "angle" in found:
+        return "rotary"
+    if "valve_voltage" in found:
+        return "pneumatic" if {"pressure_a", "pressure_b"} & found.keys() else "linear"
+    message = f"{table.path}: its columns do not say what drives the load; say it before --from"
+    require("force" in found, f"{message}: pneuopt init KIND, one of {', '.join(first_kinds())}")
+    return "force"
+
+
+def _place_files(folder: Path, files: Mapping[str, str], log: Path | None) -> dict[Path, str]:
+    """Where each file goes: the sidecar beside its log, with the way from there to its schema."""
+    placed = {folder / name: text for name, text in files.items()}
+    if log is None:
+        return placed
+    side = sidecar_name(log.name)
+    text = placed.pop(folder / side)
+    schema = Path(os.path.relpath(folder, log.parent), "schemas", "sidecar.json").as_posix()
+    return placed | {log.with_suffix(".toml"): text.replace("schemas/sidecar.json", schema, 1)}
 
 
 def _read_catalogue(kind: str, parts: Mapping[str, str | None]) -> tuple[ParameterSet, tuple[str, ...]]:
@@ -75,10 +144,28 @@ def _read_catalogue(kind: str, parts: Mapping[str, str | None]) -> tuple[Paramet
     return known, (f"Values of the catalogue ({words}): {CATALOGUE_SOURCE}.",)
 
 
-def _show_next(folder: Path, files: Mapping[str, str]) -> None:
+def _show_files(
+    folder: Path, files: Mapping[str, str], guess: LogGuess, assumed: Sequence[str], log: Path | None
+) -> None:
+    """Say what was written, what was assumed, and what comes next."""
     names = [name for name in files if name.endswith(".toml")]
-    typer.echo(f"wrote {', '.join(names)} and schemas/ in {folder.resolve() if str(folder) == '.' else folder}")
-    typer.echo("Next: put what you know into drive.toml, then")
-    typer.echo("  pneuopt identify drive.toml LOG -o fit.toml      # logs whose headers say position [mm]")
+    _say(f"wrote {', '.join(names)} and schemas/" + ("" if folder == Path() else f" in {folder}"))
+    if log is not None:
+        for column in guess.columns:
+            unit = f" [{column.unit}]" if column.unit else ", time stamps"
+            centre = f", less {column.centre}" if column.centre else ""
+            _say(f"{column.channel}: column {column.column!r}{unit}{centre}", "  ")
+        if guess.unused:
+            _say(f"not read: {', '.join(guess.unused)}", "  ")
+        _say(f"a row every {write_value(guess.sample_time, 's')}", "  ")
+    for doubt in assumed:
+        _say(f"assumed, check it in [columns] of {sidecar_name(log.name) if log else ''}: {doubt}")
+    _say("Next: put what you know into drive.toml, then")
+    place = "LOG" if log is None else str(log)
+    typer.echo(f"  pneuopt identify drive.toml {place} -o fit.toml")
     typer.echo("  pneuopt tune fit.toml tuning.toml -o tuned.toml")
     typer.echo("What a key means: pneuopt keys KEY")
+
+
+def _say(text: str, indent: str = "") -> None:
+    typer.echo("\n".join(textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")))

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -16,11 +17,13 @@ from pneuopt.files.study import STUDY_KEYS
 from pneuopt.files.template import Template
 from pneuopt.files.tuning import TUNED_SECTIONS
 from pneuopt.files.tuning_keys import signal_units
+from pneuopt.logs.columns import CHANNELS
+from pneuopt.logs.plant_channels import plant_channels
 from pneuopt.logs.sidecar_keys import SIDECAR_KEYS
 from pneuopt.models.catalog import CATALOGUE_SOURCE
 from pneuopt.models.declaration import DriveKind, FirstFiles, Structure
 from pneuopt.models.drive_kinds import DRIVE_KINDS
-from pneuopt.quantities.errors import check_names
+from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.keys import Key
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.units import write_value
@@ -28,6 +31,7 @@ from pneuopt.quantities.units import write_value
 BAND, OVERSHOOT, SENSITIVITY = "2 %", "5 %", 1.6  # what a first tuning asks for: usual, and within reach of most drives
 SWEEP = (0.8, 1.0, 1.2)  # of a first study's parameter, times its value: near enough that one design may hold
 _DIGITS = 6
+_OTHER_FILES = ("drive", "tuning", "study", "rig")
 
 
 def first_kinds() -> dict[str, FirstFiles]:
@@ -40,9 +44,10 @@ def first_files(
     known: ParameterSet,
     columns: Mapping[str, str],
     *,
-    log: str = "log",
+    log: str = "log.csv",
     sample_time: float = SAMPLE_TIME,
     source: Sequence[str] = (),
+    doubts: Sequence[str] = (),
 ) -> dict[str, str]:
     """The texts of the files, by their names within a folder.
 
@@ -55,11 +60,13 @@ def first_files(
     columns : mapping of str to str
         What the sidecar states, by channel: '"t [ms]"'; none: the log's header says it.
     log : str
-        The log's name without its suffix.
+        The log's file name.
     sample_time : float
         Of the controller [s].
     source : sequence of str
         Lines at the drive's top that say where its values come from.
+    doubts : sequence of str
+        What the sidecar states without being sure: lines at its top.
 
     Raises
     ------
@@ -67,6 +74,8 @@ def first_files(
         If there are no first files for that kind.
     """
     check_names("kind", [name], first_kinds(), "init")
+    others = {sidecar_name(other) for other in _OTHER_FILES}
+    require(sidecar_name(log) not in others, f"{log}: rename it; {sidecar_name(log)} is the name of another file")
     kind, first = DRIVE_KINDS[name], first_kinds()[name]
     defaults = default_parameters(kind, first.options)
     values = defaults | defaults.with_values(first.values) | known.select(n for n in known if n in defaults)
@@ -77,12 +86,24 @@ def first_files(
         "tuning": _tuning_template(loop, first, values),
         "study": _study_template(loop, first, values),
         "rig": _rig_template(loop),
-        "sidecar": _sidecar_template(loop, first, values, columns, log),
+        "sidecar": _sidecar_template(loop, first, values, columns, log, doubts),
     }
     results = {"drive": FIT_SECTIONS, "tuning": TUNED_SECTIONS}
-    files = {f"{log if n == 'sidecar' else n}.toml": t.render() for n, t in templates.items()}
+    files = {sidecar_name(log if n == "sidecar" else n): t.render() for n, t in templates.items()}
     schemas = {t.schema: json_schema(f"pneuopt {n}", t.sections, results.get(n, ())) for n, t in templates.items()}
     return files | {path: json.dumps(schema, indent=1, ensure_ascii=False) + "\n" for path, schema in schemas.items()}
+
+
+def first_channels(name: str) -> dict[str, str]:
+    """The channels that a log of such a drive may hold, and their SI units."""
+    kind, first = DRIVE_KINDS[name], first_kinds()[name]
+    plant = kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
+    return {**CHANNELS, **plant_channels(plant)}
+
+
+def sidecar_name(log: str) -> str:
+    """The name of a log's sidecar."""
+    return Path(log).with_suffix(".toml").name
 
 
 def _schema_path(name: str) -> str:
@@ -192,7 +213,12 @@ def _rig_template(loop: ClosedLoop) -> Template:
 
 
 def _sidecar_template(
-    loop: ClosedLoop, first: FirstFiles, values: ParameterSet, columns: Mapping[str, str], log: str
+    loop: ClosedLoop,
+    first: FirstFiles,
+    values: ParameterSet,
+    columns: Mapping[str, str],
+    log: str,
+    doubts: Sequence[str],
 ) -> Template:
     signals, channels = (*loop.plant.inputs, *loop.plant.outputs), SIDECAR_KEYS["columns"].keys
     own = next((q for q in signals if q.name not in channels), None)
@@ -204,9 +230,10 @@ def _sidecar_template(
     }
     names |= {} if own is None else {"columns": f'{own.name} = "{own.name} [{own.unit}]"'}
     title = (
-        f"The sidecar of {log}.csv (or .mat, ...): what the log's columns are. It has the log's name.",
+        f"The sidecar of {log}: what the log's columns are. It has the log's name.",
         'A column may be a table, too: { column = "U valve", unit = "V", centre = "5 V", scale = "1 V/V" }.',
         "Without [columns] the header says it: position [mm], or position_mm.",
+        *(f"Assumed, check it: {doubt}" for doubt in doubts),
     )
     stated = {f"columns.{channel}": text for channel, text in columns.items()}
     return Template(title, SIDECAR_KEYS, stated, names=names, schema=_schema_path("sidecar"))

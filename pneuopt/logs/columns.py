@@ -136,7 +136,7 @@ def _columns_from_names(
 
 def _split_channel(name: str, channels: Mapping[str, str]) -> tuple[str, str]:
     """Split "position [mm]" or "position_mm" into channel and unit; ("", "") if it names no channel."""
-    bare, unit = _split_unit(name)
+    bare, unit = split_unit(name)
     plain = bare.casefold().replace(" ", "_")
     if plain in channels:
         return plain, unit
@@ -146,13 +146,14 @@ def _split_channel(name: str, channels: Mapping[str, str]) -> tuple[str, str]:
     return "", ""
 
 
-def _split_unit(name: str) -> tuple[str, str]:
+def split_unit(name: str) -> tuple[str, str]:
+    """Split "x [mm]" or "x (mm)" into the name and its unit, "" where it has none."""
     match = _BRACKETED_UNIT.fullmatch(name)
     return (match[1] or match[3], match[2] or match[4] or "") if match else (name, "")
 
 
 def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> None:
-    bare, unit = _split_unit(name)
+    bare, unit = split_unit(name)
     if name in table.stamps:
         return
     parts = bare.casefold().replace(" ", "_").split("_")[:MAX_NAME_PARTS]
@@ -172,7 +173,7 @@ def _resolve_column(table: Table, channel: str, entry: Any, where: str, channels
     check_names("key", column, COLUMN_KEYS, where)
     require(isinstance(column.get("column"), str), f'{where}: say which column: {{ column = "U valve" }}', LogError)
     name = column["column"]
-    bare, unit = _split_unit(name)
+    bare, unit = split_unit(name)
     if name not in table.names:
         name = bare
     if name not in table.names:

@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pneuopt.cli.app import app
+from pneuopt.cli.init import Asker
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive
@@ -18,6 +19,7 @@ from pneuopt.files.key_list import KeyRow, list_keys
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_study
 from pneuopt.files.tuning import Tuning, read_tuning
+from pneuopt.logs.guess import Question
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drive_kinds import DRIVE_KINDS
 from pneuopt.quantities.errors import InputError
@@ -240,3 +242,68 @@ def test_the_sidecar_as_written_changes_nothing(folder: Path, tmp_path: Path) ->
     alone = read_log(log).trajectory
     (tmp_path / "log.toml").write_text((folder / "log.toml").read_text("utf-8"), encoding="utf-8")
     assert list(read_log(log).trajectory.values) == list(alone.values)
+
+
+def write_foreign_log(path: Path, columns: str = "t_ms;U Ventil;x ist;p1 [bar];p2 [bar]") -> Path:
+    t = np.arange(0.0, 400.0, 2.0)
+    kinds = {
+        "t_ms": t, "U Ventil": 5 + np.sign(np.sin(t / 30)), "x ist": 150 + 20 * np.sin(t / 60),
+        "p1 [bar]": 4 + np.sin(t / 40), "p2 [bar]": 4 - np.sin(t / 40), "Kraft [N]": t, "M [N*m]": t, "v [m/s]": t,
+    }  # fmt: skip
+    rows = np.column_stack([kinds[name] for name in columns.split(";")])
+    path.write_text("\n".join([columns, *(";".join(f"{v:.6g}" for v in row) for row in rows)]), encoding="utf-8")
+    return path
+
+
+def test_a_log_fills_its_sidecar_and_says_what_was_assumed(tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv")
+    code, output = run("init", "--from", str(log), "-o", str(tmp_path / "files"))
+    assert code == 0, output
+    assert max(map(len, output.replace(str(tmp_path), "").splitlines())) <= 80
+    said = " ".join(output.split())
+    assert "valve_voltage: column 'U Ventil' [V], less 5 V" in said
+    assert "assumed, check it in [columns] of run.toml: position: 'x ist' reaches 170. In which unit? Taken: mm" in said
+    assert "# Assumed, check it: position:" in (tmp_path / "run.toml").read_text("utf-8")
+    drive, _ = read_drive(tmp_path / "files/drive.toml")
+    read = read_log(log, plant=drive.system()).trajectory
+    assert drive.kind == "pneumatic"
+    assert [float(read[n].max()) for n in ("position", "pressure_a")] == pytest.approx([0.17, 5e5], rel=1e-3)
+    tuning = read_tuning(tmp_path / "files/tuning.toml", drive.system())
+    assert tuning.loop.pid.sample_time == 2e-3
+    place = re.match("#:schema (.*)\n", (tmp_path / "run.toml").read_text("utf-8"))
+    assert place is not None
+    assert (tmp_path / place[1]).resolve() == (tmp_path / "files/schemas/sidecar.json").resolve()
+
+
+@pytest.mark.parametrize(
+    ("columns", "kind"),
+    [("t_ms;Kraft [N];x ist", "force"), ("t_ms;M [N*m]", "rotary"), ("t_ms;U Ventil;v [m/s]", "linear")],
+)
+def test_a_log_says_what_drives_the_load(columns: str, kind: str, tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv", columns)
+    assert run("init", "--from", str(log), "-o", str(tmp_path))[0] == 0
+    assert read_drive(tmp_path / "drive.toml")[0].kind == kind
+
+
+def test_a_log_that_does_not_is_met_with_a_question(tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv", "t_ms;x ist")
+    code, output = run("init", "--from", str(log))
+    assert (code, "do not say what drives the load; say it before --from" in output) == (2, True)
+    log = write_foreign_log(tmp_path / "drive.csv")
+    code, output = run("init", "--from", str(log), "-o", str(tmp_path))
+    assert (code, "rename it; drive.toml is the name of another file" in output) == (2, True)
+    assert not (tmp_path / "drive.toml").exists()
+
+
+def test_on_a_terminal_the_user_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    answers = iter(["furlong", "m"])
+
+    def prompt(text: str, default: str) -> str:
+        asked.append(f"{text} {default}")
+        return next(answers)
+
+    monkeypatch.setattr("pneuopt.cli.init.typer.prompt", prompt)
+    ask = Asker(interactive=True)
+    assert ask(Question("position", "In which unit?", ("mm", "m"))) == "m"
+    assert (asked, ask.assumed) == (["In which unit? (mm / m) mm"] * 2, [])
