@@ -33,6 +33,13 @@ FREE = ("friction.coulomb", "friction.static", "friction.stribeck_velocity", "fr
 VALVE = ("valve.conductance", "valve.leak")
 SAMPLE, SETTLING, PERIOD = 1e-3, 300, 10.0  # [s], samples before the log, [s] of reference until it repeats
 FINE, COARSE = 100, 10  # RK4 steps a sample: of an exact log, and of the simulation that is the unit of cost
+GAINS = po.ParameterSet(
+    {
+        "loop.gain": po.Parameter(4.0, "V/m"),
+        "loop.damping": po.Parameter(0.15, "V*s/m"),
+        "loop.limit": po.Parameter(0.6, "V"),
+    }
+)
 START = {"position": 0.1, "pressure_a": 3.5e5, "pressure_b": 4e5}
 
 
@@ -84,15 +91,29 @@ def reference(t: float) -> float:
 
 def exact(truth: po.ParameterSet, lugre: bool = False, *, seconds: float = 10.0, substeps: int = FINE) -> po.Trajectory:
     """The log without noise, and with speed, in fine RK4 steps: as exact as `generate`, and far faster (a test)."""
-    loop, rollout = sampled_loop(lugre)
     samples = round(seconds / SAMPLE)
     instants = np.arange(-SETTLING, samples) * SAMPLE
-    given = np.array([reference(t % PERIOD if t > 0 else 0.0) for t in instants.tolist()])[None, :, None]
-    start = np.array([[START.get(n, 0.0) for n in names(loop.states)]])
-    h = np.full((1, len(instants)), SAMPLE)
-    run = rollout.run(start, given, parameter_vector(loop.parameters, truth), instants[None], h, substeps=substeps)
-    columns = dict(zip(names(loop.outputs), run.y[0, SETTLING:].T.copy(), strict=True))
-    return po.Trajectory(np.arange(samples) * SAMPLE, columns)
+    given = np.array([reference(t % PERIOD if t > 0 else 0.0) for t in instants.tolist()])
+    run = run_loop(truth, given, SAMPLE, START, lugre, substeps=substeps).rows(SETTLING, SETTLING + samples)
+    return po.Trajectory(np.arange(samples) * SAMPLE, run.values)
+
+
+def run_loop(
+    truth: po.ParameterSet,
+    wanted: NDArray[np.float64],
+    sample: float,
+    start: Mapping[str, float],
+    lugre: bool = False,
+    *,
+    substeps: int = FINE,
+) -> po.Trajectory:
+    """Outputs of the sampled loop under a reference [m], in fine RK4 steps; `truth` may set the loop's gains."""
+    loop, rollout = sampled_loop(lugre)
+    instants = np.arange(len(wanted)) * sample
+    begin = np.array([[start.get(n, 0.0) for n in names(loop.states)]])
+    p, h = parameter_vector(loop.parameters, truth), np.full((1, len(wanted)), sample)
+    run = rollout.run(begin, wanted[None, :, None], p, instants[None], h, substeps=substeps)
+    return po.Trajectory(instants, dict(zip(names(loop.outputs), run.y[0].T.copy(), strict=True)))
 
 
 @functools.cache
@@ -104,16 +125,18 @@ def sampled_loop(lugre: bool = False) -> tuple[po.System, Rollout]:
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
         del u  # the reference moves only the command
         inside = ca.vertcat(*(x[n] for n in names(drive.states)))
-        rates, y = drive.ode(t, inside, x["valve_voltage"], ca.vertcat(*p.values()))
+        own = ca.vertcat(*(p[n] for n in drive.parameters))
+        rates, y = drive.ode(t, inside, x["valve_voltage"], own)
         found = dict(zip(names(drive.states), ca.vertsplit(rates), strict=True))
         shown = dict(zip(names(drive.outputs), ca.vertsplit(y), strict=True))
         return {**found, "valve_voltage": ca.SX(0)}, {**shown, "valve_voltage": x["valve_voltage"]}
 
     states, outputs = (*drive.states, command), (*drive.outputs, command)
-    loop = po.define(states, (wanted,), outputs, drive.parameters, rhs)
+    loop = po.define(states, (wanted,), outputs, drive.parameters | GAINS, rhs)
     t, x, u, p = (ca.SX.sym(n, loop.ode.size1_in(i)) for i, n in enumerate("txup"))
     position, speed = (x[names(states).index(n)] for n in ("position", "speed"))
-    u_next = ca.fmax(-0.6, ca.fmin(0.6, 4 * (u - position) - 0.15 * speed))
+    gain, damping, limit = (p[list(loop.parameters).index(n)] for n in GAINS)
+    u_next = ca.fmax(-limit, ca.fmin(limit, gain * (u - position) - damping * speed))
     update = ca.Function("update", [t, x, u, p], [ca.vertcat(x[:-1], u_next)])
     return loop, Rollout(Pieces(po.discretise(loop).step, update))
 

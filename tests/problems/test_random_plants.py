@@ -8,7 +8,7 @@ import pytest
 
 import pneuopt as po
 from problems.identify import random_plants
-from problems.shared import b32
+from problems.shared import b32, random_rig
 
 
 @pytest.mark.parametrize("kind", random_plants.KINDS)
@@ -47,6 +47,43 @@ def test_encoder_and_outliers() -> None:
     assert np.max(np.abs(steps - np.round(steps))) < 1e-6
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_rigs_of_other_kinds_move_as_they_are_called(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(random_rig, "LONG", 8.0)
+    rig = random_rig.draw(seed, random_plants.drawn("stribeck", seed))
+    log, stroke = random_rig.record(rig, seed), rig.truth.value("cylinder.stroke")
+    x = log.trajectory["position"]
+    assert rig.motion == random_rig.MOTIONS[seed]
+    assert dict(log.noise) == {}
+    assert 0.05 * stroke < x.min() < x.max() < 0.95 * stroke
+    assert np.ptp(x) > 0.1 * stroke
+    if rig.motion == "one way":
+        assert np.min(x - np.maximum.accumulate(x)) > -0.02 * stroke
+    if rig.motion == "hunting":
+        again = random_rig.draw(seed, random_plants.drawn("stribeck", seed))
+        assert again.truth.value("loop.gain") == rig.truth.value("loop.gain")
+        assert rig.truth.value("loop.damping") == 0
+
+
+def test_the_oscillation_is_that_of_the_speed() -> None:
+    t = np.arange(4000) * 1e-3
+    x = 0.1 * np.sin(2 * np.pi * 0.3 * t) + 0.02 * np.sin(2 * np.pi * 7 * t)
+    assert random_rig.oscillation(po.Experiment(po.Trajectory(t, {"position": x}))) == pytest.approx(7, abs=0.25)
+
+
+def test_what_a_fit_names_unidentifiable_is_no_lie() -> None:
+    columns = {
+        "converged": [1.0, 1.0, 1.0, 0.0],
+        "outside_unnamed": [0.5, 0.0, 3.0, 9.0],
+        "named": [0.0, 0.5, 0.0, 0.0],
+    }
+    rigs = pd.DataFrame(columns | {"cpu": [1.0, 1.0, 2.0, 30.0], "oscillation": 4.0, "motion": "hunting"})
+    claims = {c.name: c for c in random_plants._claims("other", rigs, held=True)}
+    assert (claims["other.right"].value, claims["other.right"].holds) == (50, False)
+    assert (claims["other.lies"].value, claims["other.lies"].holds) == (1, False)
+    assert not claims["other.worst_seconds"].holds
+
+
 def test_a_lie_is_counted() -> None:
     rows = {"converged": [1.0, 1.0, 0.0], "outside": [0.5, 3.0, 9.0], "percent": [0.1, 30.0, 80.0]}
     plants = pd.DataFrame({**rows, "simulations": [10.0, 20.0, 30.0], "cpu": [1.0, 2.0, 3.0]})
@@ -58,6 +95,6 @@ def test_a_lie_is_counted() -> None:
 
 @pytest.mark.slow
 def test_random_plants(tmp_path: Path) -> None:
-    rows = random_plants.main(4, out=tmp_path)
+    rows = random_plants.main(4, kinds=random_plants.KINDS, out=tmp_path)
     assert list(rows.loc[~rows["holds"].astype(bool), "name"]) == []
     assert len(pd.read_csv(tmp_path / "random_plants.csv")) == 8
