@@ -42,7 +42,7 @@ from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.expected_plants import expected_plants
 from pneuopt.evaluation.operating_points import worst_open_loop
-from pneuopt.files.drive import read_covariance, read_drive
+from pneuopt.files.drive import read_covariance, read_drive, read_estimates
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import Tuning, write_tuned
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
@@ -104,7 +104,9 @@ def _tune_task(
         parameters,
         minimise=task.specification,
         scenarios=task.scenarios(parameters),
-        plants=expected_plants(complete, covariance, scenarios=task.validation_scenarios(parameters)),
+        plants=expected_plants(
+            complete, covariance, estimates=read_estimates(fit), scenarios=task.validation_scenarios(parameters)
+        ),
         rig=None if rig is None else read_rig(rig, read_drive(fit)[0], task.loop),
         max_steps=task.max_steps,
         accept=task.accept,

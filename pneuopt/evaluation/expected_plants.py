@@ -1,14 +1,17 @@
 """`expected_plants`: the plants that a model may stand for, within what a fit leaves open and what hardware varies by.
 
-A parameter that a fit has estimated is drawn from the fit's covariance; of the others, those named in `TOLERANCES` vary
-by the usual tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
+A parameter that a fit has estimated is drawn from the fit's covariance, by Student's t where few degrees of freedom
+tell it; one that the fit gave a range in place of an interval is drawn from anywhere in that range. Of the others,
+those named in `TOLERANCES` vary by the usual tolerance of such hardware, and each tuned gain by `GAIN_TOLERANCE`.
 """
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import t
 
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, AxisNames, Factor, Scenarios, draws, tolerances
 from pneuopt.quantities.errors import require
@@ -39,8 +42,7 @@ TOLERANCES: Mapping[tuple[str, ...], float] = {
 # Share by which a controller's gain differs from the printed one: rounding to three digits, integer scaling in a PLC.
 GAIN_TOLERANCE = 0.01
 GAIN_PREFIXES = ("pid.", "feedforward.")
-# Standard deviations of a fit's estimate that count as its low and its high end: 95 % of the plants lie between.
-FIT_SPREAD = 1.96
+FIT_SHARE = 0.95  # of the plants [1] that lie between the low and the high end of a fit's estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ class ExpectedPlants:
     axes : tuple of PlantAxis
         What varies, without the parameters of the scenarios that a tuning knows already.
     from_fit : tuple of str
-        Parameters that are drawn from a fit's covariance.
+        Parameters that are drawn from a fit's covariance, or from its ranges.
     known : tuple of str
         Parameters that vary as the tuning's own scenarios have them.
     """
@@ -110,6 +112,7 @@ def expected_plants(
     parameters: ParameterSet,
     covariance: "pd.DataFrame | None" = None,
     *,
+    estimates: "pd.DataFrame | None" = None,
     scenarios: Scenarios = NO_SCENARIOS,
     count: int = PLANT_COUNT,
     seed: int = PLANT_SEED,
@@ -122,6 +125,9 @@ def expected_plants(
         Of plant and controller, as for `tune`: what is free counts as tuned.
     covariance : DataFrame, optional
         `IdentificationResult.covariance`, which also says which parameters the logs have identified.
+    estimates : DataFrame, optional
+        `IdentificationResult.estimates`: with its degrees of freedom the draws are as wide as the confidence intervals,
+        and a parameter that has a range in place of an interval is drawn from anywhere in it.
     scenarios : mapping of str to mapping, optional
         Plants that the design is meant for, the search's own or others from the same boxes: plant k differs from the
         model as the k-th of them does, over and above what else varies; after the last one comes the first.
@@ -142,18 +148,21 @@ def expected_plants(
     """
     require(count >= 1, f"count must be at least 1, got {count}")
     known = {n for values in scenarios.values() for n in values}
-    estimated = _select_estimates(parameters, covariance, known)
-    shares = _usual_tolerances(parameters, {*known, *(estimated.index if estimated is not None else ())})
+    estimated, dof = _select_estimates(parameters, covariance, known), _degrees_of_freedom(estimates)
+    ranges = _select_ranges(parameters, estimates, known)
+    from_fit = (*(map(str, estimated.index) if estimated is not None else ()), *ranges)
+    shares = _usual_tolerances(parameters, {*known, *from_fit})
     varied = tolerances(parameters, shares, count, seed=seed) if shares else {}
-    drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed)
+    drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed, dof=dof)
     own = list(scenarios.values()) or [{}]
     parts = zip(*((list(part.values()) or [{}] * count) for part in (varied, drawn)), strict=True)
-    plants = {f"plant {k + 1}": {**a, **b, **own[k % len(own)]} for k, (a, b) in enumerate(parts)}
+    wide = _draw_in_ranges(parameters, ranges, count, seed)
+    plants = {f"plant {k + 1}": {**a, **b, **wide[k], **own[k % len(own)]} for k, (a, b) in enumerate(parts)}
     axes = [_tolerance_axis(names, share) for names, share in shares.items()]
-    from_fit = tuple(estimated.index) if estimated is not None else ()
-    axes += [
-        _estimate_axis(parameters, n, float(estimated.loc[n, n]) ** 0.5) for n in from_fit if estimated is not None
-    ]
+    if estimated is not None:
+        deviations = dict(zip(map(str, estimated.index), np.sqrt(np.diag(estimated)).tolist(), strict=True))
+        axes += [_estimate_axis(parameters, n, s, dof.get(n, math.inf)) for n, s in deviations.items()]
+    axes += [_range_axis(parameters, n, *ends) for n, ends in ranges.items()]
     return ExpectedPlants(plants if axes or known else {}, tuple(axes), from_fit, tuple(sorted(known)))
 
 
@@ -166,6 +175,41 @@ def _select_estimates(
     spread = dict(zip(map(str, covariance.index), np.diag(covariance.to_numpy(dtype=float)).tolist(), strict=True))
     names = [n for n, v in spread.items() if n in parameters and n not in known and v > 0 and not parameters[n].free]
     return covariance.loc[names, names] if names else None
+
+
+def _degrees_of_freedom(estimates: "pd.DataFrame | None") -> dict[str, float]:
+    """The degrees of freedom of each estimate's variance, where a fit tells them."""
+    if estimates is None or "dof" not in estimates:
+        return {}
+    return {str(n): float(v) for n, v in estimates["dof"].items() if math.isfinite(v) and v > 0}
+
+
+def _select_ranges(
+    parameters: ParameterSet, estimates: "pd.DataFrame | None", known: Collection[str]
+) -> dict[str, tuple[float, float]]:
+    """The ranges within the bounds of parameters of this loop that a fit has given one in place of an interval."""
+    if estimates is None or "range_low" not in estimates:
+        return {}
+    rows = estimates[estimates["stderr"].isna() & estimates["range_low"].notna() & estimates["range_high"].notna()]
+    ends = {str(n): (float(row["range_low"]), float(row["range_high"])) for n, row in rows.iterrows()}
+    return {
+        n: (max(low, parameters[n].lower), min(high, parameters[n].upper))
+        for n, (low, high) in ends.items()
+        if n in parameters and n not in known and not parameters[n].free and low < high
+    }
+
+
+def _draw_in_ranges(
+    parameters: ParameterSet, ranges: Mapping[str, tuple[float, float]], count: int, seed: int
+) -> list[dict[str, float]]:
+    """Values anywhere in each range, by their logarithm where the parameter is searched by it."""
+    rng = np.random.default_rng((seed, 1))
+
+    def draw(name: str, low: float, high: float) -> float:
+        share = float(rng.random())
+        return low * (high / low) ** share if parameters[name].log else low + share * (high - low)
+
+    return [{n: draw(n, *ends) for n, ends in ranges.items()} for _ in range(count)]
 
 
 def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict[AxisNames, float]:
@@ -184,9 +228,14 @@ def _tolerance_axis(names: AxisNames, share: float) -> PlantAxis:
     return PlantAxis(tuple(names), share, low, high, names[0].startswith(GAIN_PREFIXES))
 
 
-def _estimate_axis(parameters: ParameterSet, name: str, deviation: float) -> PlantAxis:
+def _range_axis(parameters: ParameterSet, name: str, low: float, high: float) -> PlantAxis:
+    value = abs(parameters.value(name))
+    return PlantAxis((name,), (high - low) / 2 / value if value else 0.0, {name: low}, {name: high})
+
+
+def _estimate_axis(parameters: ParameterSet, name: str, deviation: float, dof: float) -> PlantAxis:
     """An estimate with the interval that its standard deviation leaves, within its bounds."""
-    p, width = parameters[name], FIT_SPREAD * deviation
+    p, width = parameters[name], float(t.ppf((1 + FIT_SHARE) / 2, dof)) * deviation
     ends = [p.value * np.exp(s * width / p.value) if p.log else p.value + s * width for s in (-1, 1)]
     low, high = (float(min(max(end, p.lower), p.upper)) for end in ends)
     return PlantAxis((name,), width / abs(p.value) if p.value else 0.0, {name: low}, {name: high})

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import norm, t
 
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
@@ -171,7 +172,14 @@ def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int
     return out
 
 
-def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, seed: int = 0) -> ScenarioValues:
+def draws(
+    parameters: ParameterSet,
+    covariance: "pd.DataFrame",
+    count: int,
+    *,
+    seed: int = 0,
+    dof: Mapping[str, float] = MappingProxyType({}),
+) -> ScenarioValues:
     """Plants drawn from a fit's covariance: the uncertainty that the logs leave, correlations included.
 
     Parameters
@@ -183,6 +191,9 @@ def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, s
         is drawn by it.
     count : int
     seed : int
+    dof : mapping of str to float, optional
+        Degrees of freedom of a parameter's variance, ``fit.estimates["dof"]``: each parameter is then drawn by
+        Student's t, as its confidence interval is, with normal scores that are correlated as the estimates are.
 
     Returns
     -------
@@ -206,12 +217,21 @@ def draws(parameters: ParameterSet, covariance: "pd.DataFrame", count: int, *, s
     scale = np.where(log, centre, 1.0)
     mean = np.where(log, np.log(np.where(log, centre, 1.0)), centre)
     rng, factor = np.random.default_rng(seed), _square_root(matrix / np.outer(scale, scale))
+    freedom = np.array([dof.get(n, math.inf) for n in names])
 
     def draw() -> Array:
-        z = mean + factor @ rng.standard_normal(len(names))
+        z = mean + _by_student_t(factor @ rng.standard_normal(len(names)), np.linalg.norm(factor, axis=1), freedom)
         return np.asarray(np.where(log, np.exp(np.where(log, z, 0.0)), z))
 
     return {f"draw {k}": _draw_within_bounds(parameters, names, draw) for k in range(1, count + 1)}
+
+
+def _by_student_t(normal: Array, deviations: Array, dof: Array) -> Array:
+    """Normal draws, moved to the same probability of Student's t where there are finite degrees of freedom."""
+    few = np.isfinite(dof) & (deviations > 0)
+    out = normal.copy()
+    out[few] = deviations[few] * t.ppf(norm.cdf(normal[few] / deviations[few]), dof[few])
+    return out
 
 
 def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:

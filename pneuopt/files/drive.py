@@ -161,6 +161,28 @@ def read_covariance(path: str | Path) -> "pd.DataFrame | None":
     return pd.DataFrame(matrix, list(rows), list(rows))
 
 
+def read_estimates(path: str | Path) -> "pd.DataFrame | None":
+    """The estimates of a fit with what is uncertain about them; None for a file that no fit has written.
+
+    Parameters
+    ----------
+    path : str or Path
+        A fit.toml.
+
+    Returns
+    -------
+    DataFrame or None
+        A row a parameter with stderr, dof, range_low and range_high as in `IdentificationResult.estimates`; NaN where
+        the file has none.
+    """
+    import pandas as pd
+
+    rows = {n: e for n, e in read_toml(path).unwrap().get("estimates", {}).items() if isinstance(e, dict)}
+    columns = ("stderr", "dof", "range_low", "range_high")
+    table = pd.DataFrame.from_dict(rows, orient="index").reindex(columns=columns)
+    return table.apply(pd.to_numeric, errors="coerce") if rows else None
+
+
 def write_fit(path: str | Path, source: str | Path, result: IdentificationResult) -> None:
     """Write a drive's file with the values found: the user's text and comments, [estimates], [covariance], ...
 

@@ -87,7 +87,7 @@ def tune(
     plants : ExpectedPlants or mapping, optional
         Plants that no search sees, on which the certified design is tried: the result's `validation` says on how many
         it holds. By default those of `expected_plants`, with usual tolerances; after a fit give
-        ``expected_plants(parameters, fit.covariance)``. ``{}``: none.
+        ``expected_plants(parameters, fit.covariance, estimates=fit.estimates)``. ``{}``: none.
     rig : Rig, optional
         The event-accurate model of the rig that the design is for, with its own friction, sensors and actuator: what
         breaks a limit there is not certified. The result's `on_rig` has its figures.

@@ -58,6 +58,34 @@ def test_a_fit_replaces_the_tolerances_of_what_it_identified() -> None:
     assert any(s.startswith("as the fit leaves them: friction.coulomb +-13 %") for s in plants.sentences)
 
 
+def test_few_degrees_of_freedom_widen_the_draws_to_the_interval_and_keep_the_correlation() -> None:
+    """With two of them, 95 % lie within 4.30 deviations (t table), not 1.96; the axis ends there."""
+    given, names = parameters(), ["friction.coulomb", "load.force"]
+    covariance = pd.DataFrame(np.array([[0.04, -0.039], [-0.039, 0.04]]), index=names, columns=names)
+    estimates = pd.DataFrame({"stderr": [0.2, 0.2], "dof": [2.0, np.inf]}, index=names)
+    plants = expected_plants(given, covariance, estimates=estimates, count=2000)
+    frame = pd.DataFrame(list(plants.scenarios.values()))
+    few = (frame["friction.coulomb"].astype(float) - given.value("friction.coulomb")) / 0.2
+    many = (frame["load.force"].astype(float) - given.value("load.force")) / 0.2
+    assert np.quantile(np.abs(few), 0.95) == pytest.approx(4.303, rel=0.12)
+    assert np.quantile(np.abs(many), 0.95) == pytest.approx(1.96, rel=0.06)
+    assert few.rank().corr(many.rank()) < -0.95
+    axis = next(a for a in plants.axes if a.names == ("friction.coulomb",))
+    assert axis.high["friction.coulomb"] == pytest.approx(given.value("friction.coulomb") + 4.303 * 0.2, rel=1e-3)
+
+
+def test_a_range_in_place_of_an_interval_is_drawn_from_end_to_end() -> None:
+    given, name = parameters(), "friction.coulomb"
+    low, high = 0.5 * given.value(name), 1.1 * given.value(name)
+    columns = {"stderr": [np.nan], "dof": [5.0], "range_low": [low], "range_high": [high]}
+    plants = expected_plants(given, estimates=pd.DataFrame(columns, index=[name]), count=400)
+    drawn = np.array([v[name] for v in plants.scenarios.values()], dtype=float)
+    assert low <= drawn.min() < low + 0.02 * (high - low)
+    assert high - 0.02 * (high - low) < drawn.max() <= high
+    assert plants.from_fit == (name,)
+    assert any(s.startswith("as the fit leaves them: friction.coulomb +-30 %") for s in plants.sentences)
+
+
 def test_scenarios_of_the_tuning_are_kept_and_the_rest_still_varies() -> None:
     given = parameters()
     asked = corners(given, {"load.mass": 0.3})

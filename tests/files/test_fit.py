@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pneuopt.files.drive import read_covariance, read_drive, write_fit
+from pneuopt.files.drive import read_covariance, read_drive, read_estimates, write_fit
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
@@ -46,6 +46,15 @@ def test_a_fit_without_a_covariance_gives_the_variances_of_its_estimates(tmp_pat
     found = read_covariance(written(tmp_path, AXIS + rows))
     assert found is not None
     assert found.to_dict() == {"load.mass": {"load.mass": pytest.approx(0.04)}}
+
+
+def test_degrees_of_freedom_and_ranges_are_read_with_the_estimates(tmp_path: Path) -> None:
+    rows = '"load.mass" = {value = 5.0, stderr = nan, dof = 3.5, range_low = 4.0, range_high = 6.0, mark = "exact"}\n'
+    found = read_estimates(written(tmp_path, f'{AXIS}[estimates]\n{rows}"load.force" = {{value = 1.0}}\n'))
+    assert found is not None
+    assert found.loc["load.mass"].dropna().to_dict() == {"dof": 3.5, "range_low": 4.0, "range_high": 6.0}
+    assert found.loc["load.force"].isna().all()
+    assert read_estimates(written(tmp_path, AXIS)) is None
 
 
 @pytest.mark.parametrize("rows", ['"load.mass" = 3', '"load.mass" = [1, 2]', '"a" = [1, 2]\n"b" = [3, 1]', "a = ['x']"])
