@@ -203,7 +203,10 @@ def _rig_claims(rigs: "pd.DataFrame") -> list[Claim]:
         Claim("other.right", 100 * float((done & ~wrong).mean()), "%", None, ">= 95"),
         Claim("other.lies", int((done & wrong).sum()), "1", 0.0, "<= 0"),
         Claim("other.named", 100 * float(rigs["named"][done].mean()), "%"),
-        *[Claim(f"other.{motion.replace(' ', '_')}", 100 * float(share), "%") for motion, share in by_motion.items()],
+        *[
+            Claim(f"other.{str(motion).replace(' ', '_')}", 100 * float(share), "%")
+            for motion, share in by_motion.items()
+        ],
         Claim("other.that_hunt", 100 * float(rigs["oscillation"].between(*HUNTING).mean()), "%"),
         Claim("other.median_seconds", float(rigs["cpu"].median()), "s", None, "<= 2"),
         Claim("other.worst_seconds", float(rigs["cpu"].max()), "s", None, "<= 20"),

@@ -1,6 +1,7 @@
 """Coverage and model mismatch: what is drawn, how the rows are counted; the slow part identifies a few draws."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -100,7 +101,7 @@ def test_without_hardware_the_rig_is_the_model_of_the_same_friction(monkeypatch:
     assert np.ptp(model["position"]) > 0.05
 
 
-HARDWARE = {
+HARDWARE: dict[str, dict[str, Any]] = {
     "hysteresis": {"hysteresis": 0.02},
     "tube": {"tube": 4e-6},
     "dead time": {"dead_time": 2},
@@ -127,7 +128,7 @@ def test_each_fault_moves_the_log_and_none_breaks_it(kind: str) -> None:
 
 def test_the_rig_sticks_where_the_smooth_model_creeps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mismatch, "SAMPLES", 600)
-    log = mismatch.recorded(mismatch.Hardware(encoder=1e-5), po.catalog.b32()[1], 0)
+    log = mismatch.recorded(mismatched_rig.Hardware(encoder=1e-5), po.catalog.b32()[1], 0)
     position = log.trajectory["position"] / 1e-5
     assert np.max(np.abs(position - np.round(position))) < 1e-6
     assert log.noise["position"] == pytest.approx(1e-5 / np.sqrt(12))
