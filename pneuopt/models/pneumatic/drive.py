@@ -22,6 +22,7 @@ from pneuopt.models.pneumatic.gas import GAS_CONSTANT
 from pneuopt.models.pneumatic.limits import check_hardware, check_start, cylinder_limits, position_warning
 from pneuopt.models.pneumatic.rest import BALANCE_RATES, MotionBalance, solve_steady_motion
 from pneuopt.models.pneumatic.valve import Flows, Port, ProportionalValve
+from pneuopt.models.starts.line_pressure import LinePressureCheck
 from pneuopt.models.starts.pneumatic import PneumaticStarts
 from pneuopt.models.starts.pressure_zero import PressureZeroCheck
 from pneuopt.quantities.arrays import Array
@@ -196,7 +197,9 @@ class PneumaticDrive:
         outputs = (POSITION, SPEED, *PRESSURE_SIGNALS)
         starts = PneumaticStarts(self.system, self.friction, _air_force)
         system = define(self.states, (VALVE_VOLTAGE,), outputs, self.parameters, self._rhs, starts, self._find_rest)
-        warnings = partial(_log_warnings, PressureZeroCheck(starts.prepare_logs))
+        warnings = partial(
+            _log_warnings, PressureZeroCheck(starts.prepare_logs), LinePressureCheck(starts.prepare_logs)
+        )
         declared = replace(
             system,
             hardware_check_hook=self.check,
@@ -332,15 +335,15 @@ _AIR_PARAMETERS = ParameterSet(
 )
 
 
-def _log_warnings(zeros: LogWarningHook, logs: Mapping[str, Log]) -> Sequence[str]:
-    """Warnings of impossible positions or, where there are none, of wrong zero points of the pressures.
+def _log_warnings(zeros: LogWarningHook, lines: LogWarningHook, logs: Mapping[str, Log]) -> Sequence[str]:
+    """Warnings of impossible positions or, where there are none, of pressures: wrong zero points, or before a line.
 
     A wrong position gives wrong chamber volumes, from which no zero point of a pressure can be judged.
     """
     moved = {name: log for name, log in logs.items() if "position" in log.measured}
     found = {name: position_warning(log.parameters, log.measured["position"]) for name, log in moved.items()}
     outside = [f"{name}: {sentence}" for name, sentence in found.items() if sentence]
-    return outside or zeros(logs)
+    return outside or zeros(logs) or lines(logs)
 
 
 def _air_force(p: Mapping[str, Any], a: Any, b: Any) -> Any:

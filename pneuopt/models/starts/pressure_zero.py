@@ -67,7 +67,7 @@ class PressureZeroCheck:
 
     def __call__(self, logs: Mapping[str, Log]) -> Sequence[str]:
         """Return a sentence for each pressure whose chamber's equation holds better from another zero point."""
-        active = {name: _most_active_part(log) for name, log in logs.items() if _is_informative(log)}
+        active = {name: most_active_part(log) for name, log in logs.items() if is_informative(log)}
         left = self._doubtful_residuals(active) if active else {}
         together = left.values() if len(left) == len(active) else ()
         warnings = list(_warning_sentences("".join(logs) if len(logs) == 1 else "", together))
@@ -95,7 +95,7 @@ class PressureZeroCheck:
         """Squared residuals of each log's pressure rates with shifted zero points [Pa^2/s^2]."""
         left: dict[str, dict[str, float]] = {}
         for name, run in self.prepare({n: _shift_zero(log, remedy) for n, log in logs.items()}).items():
-            parts = [run.valve_columns(shape) for shape in _valve_shapes(logs[name])]
+            parts = [run.valve_columns(shape) for shape in trial_shapes(logs[name])]
             left[name] = {
                 n: min(_regression_residual(columns[:, k], wanted[:, k]) for columns, wanted in parts)
                 if run.known_states[n].min() > 0
@@ -105,13 +105,13 @@ class PressureZeroCheck:
         return left
 
 
-def _is_informative(log: Log) -> bool:
+def is_informative(log: Log) -> bool:
     """Whether a log has motion and a pressure, and the supply pressure is known, without which no ratio is."""
     known = SUPPLY_PRESSURE not in log.parameters.free_names
     return known and any(n in log.measured for n in ("position", "speed")) and bool(_pressure_channels(log))
 
 
-def _most_active_part(log: Log) -> Log:
+def most_active_part(log: Log) -> Log:
     """Part of a long log in which the pressures change most, which is enough for the check and cheap."""
     data = log.measured
     if len(data) <= MAX_SAMPLES_PER_LOG:
@@ -142,7 +142,7 @@ def _shift_zero(log: Log, remedy: ZeroShift) -> Log:
     return Log(measured, p.with_bounds(dict.fromkeys(moved, (0.0, math.inf))).with_values(moved))
 
 
-def _valve_shapes(log: Log) -> Iterator[dict[str, float]]:
+def trial_shapes(log: Log) -> Iterator[dict[str, float]]:
     """Values of the valve's shape parameters to try, where they are free."""
     tried = valve_shapes(log.parameters, log.parameters.free_names)
     for values in itertools.product(*tried.values()):
