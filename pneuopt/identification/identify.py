@@ -28,6 +28,7 @@ from pneuopt.identification.identifiability import leans_on_prior, rests_on_prio
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
+from pneuopt.identification.order import hold_order
 from pneuopt.identification.problem import (
     EstimationProblem,
     apply_conditions,
@@ -171,6 +172,7 @@ def _fit_and_review(
     if windowed := fit_in_windows(held, fit):
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
+    held, fit = hold_order(held, fit, label)
     result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths, window=chosen)
     if problem.method.budget is not None:
         result = replace(result, status=problem.method.budget.name_end(result.status))
