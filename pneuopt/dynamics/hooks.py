@@ -6,7 +6,7 @@ the limits beyond which the equations no longer hold (end stops, a vacuum).
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, overload
 
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet, Quantity
@@ -44,6 +44,36 @@ class Start:
     parameters: Mapping[str, float]
     label: str = ""
     trial_parameters: tuple[str, ...] = ()
+
+
+class Starts(Sequence[Start]):
+    """Starts of which each is computed when it is first asked for: most searches end at the first one.
+
+    Parameters
+    ----------
+    makers : sequence of callable
+        Each returns a start.
+    """
+
+    def __init__(self, makers: Sequence[Callable[[], Start]]) -> None:
+        self._makers, self._made = tuple(makers), dict[int, Start]()
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+    @overload
+    def __getitem__(self, index: int) -> Start: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Start]: ...
+
+    def __getitem__(self, index: int | slice) -> Start | Sequence[Start]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        i = range(len(self))[index]
+        if i not in self._made:
+            self._made[i] = self._makers[i]()
+        return self._made[i]
 
 
 class StartHook(Protocol):

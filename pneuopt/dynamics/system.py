@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -343,6 +343,7 @@ def define(
     return System(tuple(states), tuple(inputs), tuple(outputs), parameters, ode, start_hook, rest_hook)
 
 
+@lru_cache(maxsize=64)
 def discretise(system: System, substeps: int = 1) -> DiscreteSystem:
     """The sampled form of a system, by `substeps` classical Runge-Kutta steps (RK4) a sample; `InputError` below 1.
 

@@ -5,6 +5,7 @@
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -102,6 +103,16 @@ class ArrowEquations:
         ReducedEquations or None
             None where the nodes' matrix is not positive definite.
         """
+        if damping == 0 and not np.any(node_damping):
+            return self._undamped_elimination
+        return self._eliminate(damping, node_damping)
+
+    @cached_property
+    def _undamped_elimination(self) -> ReducedEquations | None:
+        """Without damping, as convergence, covariance and scores of one iterate all ask for it."""
+        return self._eliminate(0.0, 0.0)
+
+    def _eliminate(self, damping: float, node_damping: Array | float) -> ReducedEquations | None:
         m, n, k = self.border.shape
         flat = self.border.reshape(m * n, k)
         right = np.concatenate([flat, self.node_gradient.reshape(m * n, 1)], axis=1)

@@ -13,7 +13,7 @@ from pneuopt.shooting.solution import Optimum
 # Newton steps: fewer leave gaps that another would close, more cost as much as a run from end to end
 MAX_STEPS = 3
 # shift of a node that open gaps still cause, in nominal sizes: higher shows in the errors of the run, lower is rounding
-MAX_SHIFT = 1e-7
+MAX_SHIFT = 1e-6
 
 
 def close_gaps(optimum: Optimum) -> Array | None:

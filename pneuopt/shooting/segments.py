@@ -1,5 +1,6 @@
 """`Segments`: a transcription as one batch of compiled segments of all phases, with sensitivities."""
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -132,8 +133,7 @@ class Segments:
     @cached_property
     def jacobian(self) -> ca.Function:
         """The Jacobian of the states' rates: ``(t, x, u, p) -> d(xdot)/dx``, shape (n_states, n_states)."""
-        slope, s = _state_rate(self.system)
-        return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
+        return _rate_jacobian(self.system)
 
     @cached_property
     def sensitivities(self) -> Rollout:
@@ -246,6 +246,13 @@ def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.
     return min(max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step)), SUBSTEPS_CAP)
 
 
+@functools.lru_cache(maxsize=64)
+def _rate_jacobian(system: DiscreteSystem) -> ca.Function:
+    slope, s = _state_rate(system)
+    return ca.Function("jacobian", [s["t"], s["x"], s["u"], s["p"]], [ca.densify(ca.jacobian(slope, s["x"]))])
+
+
+@functools.lru_cache(maxsize=64)
 def _state_rate(system: DiscreteSystem) -> tuple[ca.SX, dict[str, ca.SX]]:
     """The rate f(t, x, u, p) behind a step: d(x_next)/dh at h = 0, exact and with f's own sparsity; and its symbols."""
     symbols = {n: ca.SX.sym(n, system.step.size1_in(i)) for i, n in enumerate(("t", "h", "x", "u", "p"))}

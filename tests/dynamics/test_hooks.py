@@ -1,6 +1,8 @@
 """What a plant refuses to be, and what a simulation of it tells."""
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import pytest
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.hooks import Contact, ValidityLimit
+from pneuopt.dynamics.hooks import Contact, Log, Start, Starts, ValidityLimit
 from pneuopt.dynamics.simulate import contacts, simulate
 from pneuopt.dynamics.system import System, define, names
 from pneuopt.evaluation.record import record
@@ -21,6 +23,7 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.pneumatic.cylinder import Cylinder
 from pneuopt.models.pneumatic.drive import PneumaticDrive
+from pneuopt.models.starts import friction as friction_starts
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
@@ -179,3 +182,38 @@ def test_a_search_refuses_friction_that_only_a_simulation_switches() -> None:
     log = Experiment(Trajectory(t, {"force": 60 * np.sin(9 * t), "speed": 0.1 * np.sin(9 * t)}))
     with pytest.raises(ModelError, match="Karnopp's friction"):
         identify(plant, [log], plant.parameters.freed("friction.coulomb"))
+
+
+def test_starts_are_computed_once_and_when_asked_for() -> None:
+    made: list[str] = []
+
+    def make(label: str) -> Start:
+        made.append(label)
+        return Start({}, {}, label)
+
+    starts = Starts([partial(make, label) for label in "abc"])
+    assert len(starts) == 3
+    assert starts[0] is starts[0]
+    assert made == ["a"]
+    assert [start.label for start in starts[-2:]] == ["b", "c"]
+    assert [start.label for start in starts] == made == ["a", "b", "c"]
+    with pytest.raises(IndexError):
+        starts[3]
+
+
+def test_a_drive_regresses_the_candidates_of_friction_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[float] = []
+    regress = friction_starts._regress
+
+    def count(friction: Any, logs: Any, parameters: Any, values: Any) -> Any:
+        tried.append(values["stribeck_velocity"])
+        return regress(friction, logs, parameters, values)
+
+    monkeypatch.setattr(friction_starts, "_regress", count)
+    t = np.arange(0.0, 1.0, 1e-3)
+    log = Trajectory(t, {"force": 60 * np.sin(6 * t), "position": 0.1 * np.sin(6 * t)})
+    drive = ForceDrive(Stribeck())
+    starts = drive.system().starts({"run": Log(log, drive.parameters.freed("friction.*"))})
+    assert "stribeck velocity 0.025 m/s" in starts[0].label
+    assert tried == [0.025]
+    assert len(starts) > 1

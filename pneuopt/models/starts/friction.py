@@ -4,6 +4,7 @@ A drive's force is linear in its parameters, except a few that the law scans, su
 a few values gives a candidate by one bounded linear least squares, in milliseconds. The law declares this (`start`).
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
-from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.models.friction import FrictionModel, law_inputs
 from pneuopt.models.friction_start import FrictionSamples, FrictionStart
 from pneuopt.models.load import GRAVITY
@@ -128,18 +129,26 @@ class RegressionRows:
 def friction_candidates(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> Sequence[Start]:
     """Starts from the rows of all logs, one for each set of values of the parameters that the law scans."""
     parameters = next(iter(logs.values())).parameters
-    by_log, starts = {n: rows.parameters for n, rows in logs.items()}, []
-    for tried in _scanned_values(friction.start, parameters):
-        values, _ = _regress(friction, logs, parameters, tried)
-        guess: dict[str, float] = {}
-        for name, value in tried.items():
-            guess |= per_log_values(f"friction.{name}", value, by_log)
-        values |= guess
-        words = [f"{n.replace('_', ' ')} {v:g} {parameters[f'friction.{n}'].unit}" for n, v in tried.items()]
-        bristles = _bristle_deflections(friction, logs, values)
-        states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
-        starts.append(Start(states, values, ", ".join(words) or "equation error", tuple(guess)))
-    return starts
+    tried = _scanned_values(friction.start, parameters)
+    return Starts([functools.partial(_candidate, friction, logs, parameters, values) for values in tried])
+
+
+def _candidate(
+    friction: FrictionModel,
+    logs: Mapping[str, RegressionRows],
+    parameters: ParameterSet,
+    tried: Mapping[str, float],
+) -> Start:
+    """The start with these values of the scanned parameters."""
+    values, _ = _regress(friction, logs, parameters, dict(tried))
+    guess: dict[str, float] = {}
+    for name, value in tried.items():
+        guess |= per_log_values(f"friction.{name}", value, {n: rows.parameters for n, rows in logs.items()})
+    values |= guess
+    words = [f"{n.replace('_', ' ')} {v:g} {parameters[f'friction.{n}'].unit}" for n, v in tried.items()]
+    bristles = _bristle_deflections(friction, logs, values)
+    states = {n: Trajectory(r.measured.t, {**r.states, **bristles.get(n, {})}) for n, r in logs.items()}
+    return Start(states, values, ", ".join(words) or "equation error", tuple(guess))
 
 
 def force_misfit(friction: FrictionModel, logs: Mapping[str, RegressionRows]) -> float:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.dynamics.hooks import Log, Start, Starts
 from pneuopt.dynamics.system import System
 from pneuopt.models.friction import FrictionModel
 from pneuopt.models.pneumatic.gas import REFERENCE_DENSITY
@@ -82,12 +82,17 @@ class PneumaticStarts:
         valve_values: dict[str, float] = {}
         for name, value in valve.items():
             valve_values |= per_log_values(name, value, {n: log.parameters for n, log in logs.items()})
-        return [replace(start, parameters={**start.parameters, **valve_values}) for start in starts]
+        return Starts([functools.partial(_with_valve, starts, i, valve_values) for i in range(len(starts))])
 
     def prepare_logs(self, logs: Mapping[str, Log]) -> dict[str, "PneumaticLog"]:
         """Logs with the motion and the air of this drive."""
         simulator_for = functools.cache(functools.partial(AirSimulator, self.system()))
         return {name: PneumaticLog(log, simulator_for, self.air_force) for name, log in logs.items()}
+
+
+def _with_valve(starts: Sequence[Start], index: int, valve: ValveValues) -> Start:
+    start = starts[index]
+    return replace(start, parameters={**start.parameters, **valve})
 
 
 class PneumaticLog:
