@@ -230,7 +230,8 @@ def _split_number(text: str | float, where: str) -> tuple[str, str]:
     shown = text if isinstance(text, str) else repr(text)
     match = _NUMBER_WITH_UNIT.fullmatch(shown)
     if match is None or isinstance(text, bool):
-        raise UnitError(f'{_place_prefix(where)}{shown[:60]!r} is not a number with a unit; write for instance "32 mm"')
+        said = repr(text[:60]) if isinstance(text, str) else shown[:60]
+        raise UnitError(f'{_place_prefix(where)}{said} is not a number with a unit; write for instance "32 mm"')
     number, unit = match.groups()
     text_is_short = len(number) <= MAX_NUMBER_LENGTH
     require(text_is_short, f"{_place_prefix(where)}a number of {len(number)} characters; round it", UnitError)
