@@ -57,7 +57,7 @@ def options(
 @app.command("init")
 def init_command(
     kind: Annotated[
-        str | None, typer.Argument(metavar="[KIND]", help="What drives the load: pneumatic, force, rotary, linear.")
+        str | None, typer.Argument(metavar="KIND", help="What drives the load: pneumatic, force, rotary, linear.")
     ] = None,
     size: Annotated[str | None, typer.Option(help="Of the catalogue: s25, s32 or s40.")] = None,
     cylinder: Annotated[str | None, typer.Option(help="Of the catalogue, by its bore: 25, 32 or 40.")] = None,
@@ -192,7 +192,7 @@ def study_command(
 @app.command("keys")
 def keys_command(
     word: Annotated[
-        str | None, typer.Argument(metavar="[WORD]", help="A file, a section, a key, or a word of its meaning.")
+        str | None, typer.Argument(metavar="WORD", help="A file, a section, a key, or a word of its meaning.")
     ] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print tables in Markdown, as in README.")] = False,
 ) -> None:

@@ -62,7 +62,7 @@ LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
 
 LOOP_MEANINGS: Mapping[str, str] = {
     "loop": "which signals the controller connects",
-    "pid": "the controller; required, with its first gain at least",
+    "pid": "the controller, with its first gain at least",
     "sensor": "what the controller sees of the signal: a lag, or an encoder",
     "dither": "a small oscillation added to the command",
     "feedforward": "what a change of the reference adds to the command",
@@ -142,7 +142,7 @@ TUNING_KEYS: Mapping[str, Key] = {
     ACCEPT_KEY: Key(
         "defects with which a design is certified all the same", Takes.LIST, choices=_words(Defect), usual=[]
     ),
-    **{section: table(LOOP_MEANINGS[section], keys) for section, keys in LOOP_KEYS.items()},
+    **{n: table(LOOP_MEANINGS[n], keys, required=n == "pid") for n, keys in LOOP_KEYS.items()},
     "reference": table("a step to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
     "minimise": table("what shall be small, weighted", {n: objective_key(n) for n in REQUIREMENTS_BY_KEY}),
     "limits": table("what shall be kept", {n: limit_key(n) for n in REQUIREMENTS_BY_KEY}),

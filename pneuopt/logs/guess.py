@@ -124,7 +124,8 @@ def guess_log(table: Table, channels: Mapping[str, str], ask: Ask) -> LogGuess:
         name = names[0] if len(names) == 1 else ask(Question(channel, text, tuple(names)))
         guesses += _guess_column(table, channel, name, channels[channel], ask)
     used = {guess.column for guess in guesses}
-    require("time" in {g.channel for g in guesses}, f"{table.path}: the time's unit is not understood", LogError)
+    time = f'{table.path}: column {found["time"][0]!r} holds no time that is understood; name one "time [s]"'
+    require("time" in {g.channel for g in guesses}, time, LogError)
     step = _sample_time(table, next(g for g in guesses if g.channel == "time"))
     return LogGuess(tuple(guesses), tuple(n for n in table.names if n and n not in used), step)
 
@@ -152,7 +153,9 @@ def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask) 
     """A channel's column with unit and centre; nothing where its unit does not measure the channel."""
     if name in table.stamps:
         return [ColumnGuess(channel, name, "")]
-    values = table.read([name])[name]
+    values = _read_numbers(table, name)
+    if values is None:
+        return []
     stated = split_unit(name)[1] or table.units.get(name, "") or _unit_suffix(name, target)
     unit = _settle_unit(channel, name, stated, target, values, ask)
     if not unit:
@@ -166,6 +169,15 @@ def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask) 
     if low >= 0 and options[0] == "0 V":
         centre = ask(Question(channel, f"{name!r} goes from {low:.3g} to {high:.3g} V. Where is its centre?", options))
     return [ColumnGuess(channel, name, unit, "" if centre == "0 V" else centre)]
+
+
+def _read_numbers(table: Table, name: str) -> Array | None:
+    """A column's values; None where it holds words, or nothing."""
+    try:
+        values = table.read([name])[name]
+    except LogError:
+        return None
+    return values if np.isfinite(values).any() else None
 
 
 def _settle_unit(channel: str, name: str, stated: str, target: str, values: Array, ask: Ask) -> str:

@@ -312,7 +312,7 @@ def test_help_loads_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for command in ("identify", "tune", "simulate", "study", "info"):
+    for command in ("init", "identify", "tune", "simulate", "study", "keys", "info"):
         assert f"\n  {command} " in done.stdout
 
 

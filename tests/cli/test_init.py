@@ -2,9 +2,9 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -14,11 +14,11 @@ from pneuopt.cli.app import app
 from pneuopt.cli.init import Asker
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.files.drive import read_drive
+from pneuopt.files.drive import FIT_SECTIONS, read_drive
 from pneuopt.files.key_list import KeyRow, list_keys
 from pneuopt.files.rig import read_rig
 from pneuopt.files.study import read_axes, read_study
-from pneuopt.files.tuning import Tuning, read_tuning
+from pneuopt.files.tuning import TUNED_SECTIONS, Tuning, read_tuning
 from pneuopt.logs.guess import Question
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.drive_kinds import DRIVE_KINDS
@@ -28,6 +28,7 @@ from pneuopt.quantities.units import read_value
 
 KINDS = [name for name, kind in DRIVE_KINDS.items() if kind.first is not None]
 FILES = ["drive.toml", "tuning.toml", "study.toml", "rig.toml", "log.toml"]
+EXCLUSIVE = {"sensor", "pareto", "method"}  # sections whose keys exclude each other, or another section
 ENTRY = re.compile(r'(# )?("?[\w.]+"?) = (["\d{[-]|true|false).*')
 
 
@@ -95,22 +96,31 @@ def test_every_key_stands_in_it(folder: Path, file: str) -> None:
     assert missing == []
 
 
-def uncommented(path: Path) -> Iterator[tuple[str, str, str]]:
-    """Section, key and the text in which one more line counts, with its section's head and what that needs."""
-    lines = path.read_text("utf-8").splitlines()
-    head, needed = -1, dict[int, list[int]]()
-    for i, line in enumerate(lines):
-        head = i if re.match(r"(# )?\[+\w+\]+$", line) else head
-        if line.startswith("# ") and re.search(r"^# (gain|level|amplitude|width|kind|frequency|lag|model) = ", line):
-            needed.setdefault(head, []).append(i)
-    head = -1
-    for i, line in enumerate(lines):
-        head = i if re.match(r"(# )?\[+\w+\]+$", line) else head
+class Comment(NamedTuple):
+    """A line of a file that is a key behind a mark, with the lines that it needs: its section's head, and its size."""
+
+    section: str
+    key: str
+    lines: frozenset[int]
+
+
+def comments(text: str) -> list[Comment]:
+    found, head, section, needed = [], -1, "", dict[int, set[int]]()
+    for i, line in enumerate(text.splitlines()):
+        if name := re.match(r"(?:# )?\[+(\w+)\]+$", line):
+            head, section = i, name[1]
         entry = ENTRY.match(line)
         if entry and entry[1]:
-            edited = {i, head, *needed.get(head, [])} - {-1}
-            text = "\n".join(t.removeprefix("# ") if k in edited else t for k, t in enumerate(lines))
-            yield lines[head].strip("# []") if head >= 0 else "", entry[2].strip('"'), text
+            key = entry[2].strip('"')
+            own = needed.setdefault(head, {head})
+            own |= {i} if key in ("gain", "level", "amplitude", "width", "frequency", "model") else set()
+            found.append((section, key, head, i))
+    return [Comment(s, key, frozenset({i, *needed[h]} - {-1})) for s, key, h, i in found]
+
+
+def without_marks(text: str, lines: Iterable[int]) -> str:
+    edited = set(lines)
+    return "\n".join(t.removeprefix("# ") if k in edited else t for k, t in enumerate(text.splitlines()))
 
 
 def refusal(read: Callable[[Path], Any], path: Path) -> list[str]:
@@ -129,15 +139,17 @@ def test_every_commented_line_counts_without_its_mark(folder: Path, tmp_path: Pa
         "tuning.toml": lambda path: read_tuning(path, drive.system()),
         "study.toml": read_study,
     }
-    refusals: list[str] = []
     for file, read in readers.items():
+        text, path = (folder / file).read_text("utf-8"), tmp_path / file
         conditions = {(r.section, r.name): r.key.condition for r in rows_of(file, kind)}
-        exclusive = {"sensor", "pareto"}
-        for section, key, text in uncommented(folder / file):
-            (tmp_path / file).write_text(text, encoding="utf-8")
-            allowed = bool(conditions.get((section, key))) or section in exclusive
-            refusals += [] if allowed else refusal(read, tmp_path / file)
-    assert not refusals, "\n".join(refusals)
+        free = [c for c in comments(text) if not conditions.get((c.section, c.key)) and c.section not in EXCLUSIVE]
+        path.write_text(without_marks(text, frozenset().union(*(c.lines for c in free))), encoding="utf-8")
+        if not refusal(read, path):
+            continue
+        for comment in free:  # which of them
+            path.write_text(without_marks(text, comment.lines), encoding="utf-8")
+            assert refusal(read, path) == [], f"{file} [{comment.section}] {comment.key}"
+        pytest.fail(f"{file}: its lines count one by one, not together: {refusal(read, path)}")
 
 
 def test_a_schema_knows_what_the_file_says(folder: Path) -> None:
@@ -154,6 +166,25 @@ def test_a_schema_knows_what_the_file_says(folder: Path) -> None:
             if isinstance(entries, dict):
                 assert set(known.get("required", [])) <= set(entries)
                 assert known["additionalProperties"] or set(entries) <= set(known["properties"])
+
+
+def names_in(schema: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """The full names of the keys that a schema knows."""
+    for part in (schema, schema.get("items", {}), *schema.get("anyOf", [])):
+        for name, entry in part.get("properties", {}).items():
+            yield f"{prefix}{name}"
+            yield from names_in(entry, f"{prefix}{name}.")
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_schema_has_every_key(folder: Path, file: str) -> None:
+    name = "sidecar" if file == "log.toml" else file.removesuffix(".toml")
+    known = set(names_in(json.loads((folder / "schemas" / f"{name}.json").read_text("utf-8"))))
+    known |= {re.sub(r"\.\w+\.", ".*.", n) for n in known}
+    rows = {r.full_name for r in rows_of(file, folder.name.rstrip("0123456789")) if "<" not in r.full_name}
+    assert rows - known == set()
+    results = {"drive.toml": {*FIT_SECTIONS}, "tuning.toml": {*TUNED_SECTIONS}}.get(file, set())
+    assert {n.partition(".")[0] for n in known} - {r.partition(".")[0] for r in rows} == results
 
 
 def test_the_loop_that_it_writes_runs(folder: Path) -> None:

@@ -119,6 +119,14 @@ def test_what_measures_something_else_is_not_read(tmp_path: Path) -> None:
     assert (found.unused, [c.channel for c in found.columns]) == (("valve [mA]",), ["time", "position"])
 
 
+def test_a_column_without_numbers_is_not_read(tmp_path: Path) -> None:
+    log = tmp_path / "run.csv"
+    rows = "".join(f"{0.1 * i:.1f},open,,{i}\n" for i in range(20))
+    log.write_text(f"t [s],valve,speed [m/s],x [mm]\n{rows}", encoding="utf-8")
+    found, _ = guess(log)
+    assert (found.unused, [c.channel for c in found.columns]) == (("valve", "speed [m/s]"), ["time", "position"])
+
+
 def test_time_stamps_are_the_time(tmp_path: Path) -> None:
     rows = "".join(f"2024-03-01 10:00:00.{i:03d},{i / 1e3}\n" for i in range(0, 200, 10))
     (tmp_path / "run.csv").write_text(f"stamp,x [mm]\n{rows}", encoding="utf-8")
