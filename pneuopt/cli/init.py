@@ -128,7 +128,11 @@ def _place_files(folder: Path, files: Mapping[str, str], log: Path | None) -> di
         return placed
     side = sidecar_name(log.name)
     text = placed.pop(folder / side)
-    schema = Path(os.path.relpath(folder, log.parent), "schemas", "sidecar.json").as_posix()
+    try:
+        way = os.path.relpath(folder, log.parent)
+    except ValueError:  # on another disk of Windows there is none
+        way = str(folder.resolve())
+    schema = Path(way, "schemas", "sidecar.json").as_posix()
     return placed | {log.with_suffix(".toml"): text.replace("schemas/sidecar.json", schema, 1)}
 
 

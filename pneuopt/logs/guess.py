@@ -1,12 +1,13 @@
 """What the columns of a foreign log may be, by their names, units and values; where that leaves a doubt, it asks."""
 
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pneuopt.logs.columns import split_unit
+from pneuopt.logs.columns import MIN_SAMPLES, split_unit
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, require
@@ -65,8 +66,7 @@ class ColumnGuess:
     def entry(self) -> str:
         """The line of a sidecar: { column = "U valve", unit = "V", centre = "5 V" }."""
         parts = {"column": self.column, "unit": self.unit, "centre": self.centre}
-        escaped = {n: text.replace("\\", "\\\\").replace('"', '\\"') for n, text in parts.items() if text}
-        return "{ " + ", ".join(f'{n} = "{text}"' for n, text in escaped.items()) + " }"
+        return "{ " + ", ".join(f"{n} = {_toml_text(text)}" for n, text in parts.items() if text) + " }"
 
 
 @dataclass(frozen=True)
@@ -151,11 +151,14 @@ def _guess_channel(name: str, channels: Mapping[str, str]) -> tuple[str, int]:
 
 def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask) -> list[ColumnGuess]:
     """A channel's column with unit and centre; nothing where its unit does not measure the channel."""
-    if name in table.stamps:
-        return [ColumnGuess(channel, name, "")]
     values = _read_numbers(table, name)
     if values is None:
         return []
+    enough = int(np.isfinite(values).sum()) >= MIN_SAMPLES
+    few = f"{table.path}: {values.size} samples are too few; at least {MIN_SAMPLES} are needed"
+    require(enough or channel != "time", few, LogError)
+    if name in table.stamps:
+        return [ColumnGuess(channel, name, "")]
     stated = split_unit(name)[1] or table.units.get(name, "") or _unit_suffix(name, target)
     unit = _settle_unit(channel, name, stated, target, values, ask)
     if not unit:
@@ -191,8 +194,7 @@ def _settle_unit(channel: str, name: str, stated: str, target: str, values: Arra
     options = _UNITS.get(target, (target,))
     if len(options) == 1:
         return target
-    steps = np.abs(np.diff(values)) if channel == "time" else np.abs(values)
-    size = float(np.nanmedian(steps) if channel == "time" else np.nanmax(steps))
+    size = float(np.median(np.abs(_steps(values))) if channel == "time" else np.nanmax(np.abs(values)))
     guess = options[1] if size > LARGEST_SI.get(target, np.inf) else options[0]
     ordered = (guess, *(unit for unit in options if unit != guess))
     what = f"is {size:.3g} from row to row" if channel == "time" else f"reaches {size:.3g}"
@@ -227,9 +229,19 @@ def _unit_suffix(name: str, target: str) -> str:
 
 def _sample_time(table: Table, time: ColumnGuess) -> float:
     """The median step of the time, to three digits [s]."""
-    steps = np.diff(table.read([time.column])[time.column])
+    steps = _steps(table.read([time.column])[time.column])
     factor = si_conversion(time.unit, "s")[0] if time.unit else 1.0
-    return float(f"{factor * float(np.nanmedian(steps)):.3g}")
+    return float(f"{factor * float(np.median(steps)):.3g}")
+
+
+def _steps(stamps: Array) -> Array:
+    """From row to row, where both have a time."""
+    return np.diff(stamps[np.isfinite(stamps)])
+
+
+def _toml_text(text: str) -> str:
+    """A text in quotes; JSON escapes as TOML does, but for one character."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _plain(channel: str) -> str:

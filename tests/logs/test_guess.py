@@ -143,7 +143,7 @@ def test_a_log_that_says_nothing_is_refused(columns: dict[str, Array], message: 
         guess(write(tmp_path / "run.csv", columns))
 
 
-@pytest.mark.parametrize("name", ['a "quoted" x [mm]', "x\\y [mm]"])
+@pytest.mark.parametrize("name", ['a "quoted" x [mm]', "x\\y [mm]", "x\0 \x7f\n"])
 def test_an_entry_is_toml_whatever_the_name(name: str) -> None:
     import tomllib
 
