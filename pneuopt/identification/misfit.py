@@ -80,6 +80,8 @@ class Misfit:
         Whether the residuals are so large that there is no interval.
     signals : tuple of str
         The simulated signals on which the residuals depend, the clearest first.
+    is_too_wide : bool
+        Whether narrower widths of the model explain the logs better.
     is_slow, lone
         As of a `RobustCovariance`; `lone` by name.
     """
@@ -95,11 +97,17 @@ class Misfit:
     signals: tuple[str, ...] = ()
     is_slow: bool = False
     lone: tuple[str, ...] = ()
+    is_too_wide: bool = False
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether parts of the logs disagree, and no signal is behind it: a width of the model may be."""
+        return self.widened and not self.signals
 
     def mark(self, *, is_optimum: bool) -> Mark:
         """The mark of an estimate, which may be at an optimum or at a bound."""
         is_missed = self.noisy_states or self.level > MODEL_ERROR_LEVEL
-        if self.signals or is_missed or not is_optimum:
+        if self.signals or self.is_too_wide or is_missed or not is_optimum:
             return Mark.BIAS_POSSIBLE
         return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
 
@@ -118,6 +126,8 @@ class Misfit:
         found = []
         if self.signals:
             found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
+        if self.is_too_wide:
+            found.append("narrower widths explain the logs better: estimates may be biased by the widths in use")
         if self.is_slow:
             found.append("the misfit is as slow as the logs, or different from log to log: log more or longer runs")
         if self.lone:

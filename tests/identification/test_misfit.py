@@ -176,3 +176,13 @@ def test_a_mark_that_is_none_is_refused(tmp_path: Path) -> None:
     path.write_text('[estimates]\n"load.mass" = {value = 5.0, mark = "perfect"}\n', encoding="utf-8")
     with pytest.raises(InputError, match="perfect"):
         read_marks(path)
+
+
+def test_a_width_that_the_logs_refute_marks_all_estimates() -> None:
+    plain = Misfit(None, np.full(1, 9.0), 1.0, np.zeros((1, 2)), 1.0, noisy_states=False, is_excessive=False)
+    wide = replace(plain, widened=True, is_too_wide=True)
+    assert (plain.mark(is_optimum=True), wide.mark(is_optimum=True)) == (Mark.EXACT, Mark.BIAS_POSSIBLE)
+    assert "narrower widths explain the logs better" in wide.sentences[0]
+    assert wide.is_suspect
+    assert not replace(wide, signals=("speed",)).is_suspect
+    assert not plain.is_suspect
