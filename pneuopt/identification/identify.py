@@ -43,7 +43,7 @@ from pneuopt.identification.statistics import (
     cross_correlation,
     ljung_box,
 )
-from pneuopt.identification.width_bias import prefers_narrower_widths
+from pneuopt.identification.width_bias import suspect_widths
 from pneuopt.identification.widths import choose_widths
 from pneuopt.identification.windows import check_window, fit_in_windows, run_freely
 from pneuopt.logs.experiments import Experiment
@@ -293,9 +293,7 @@ def _result(
     squares = fit.chi_square if fit.jumps is None else 2 * fit.stats["cost"]
     dof = max(1, fit.count - len(free) - starts)
     variance = squares / dof
-    misfit = diagnose_misfit(problem, fit, variance, dof)
-    if misfit.is_suspect and fit.status.converged:
-        misfit = replace(misfit, is_too_wide=prefers_narrower_widths(problem, fit, variance))
+    misfit = suspect_widths(diagnose_misfit(problem, fit, variance, dof), problem, fit, variance)
     covariance = misfit.covariance
     leaning = resting = np.zeros(len(free), dtype=bool)
     if covariance is not None and fit.prior_covariance is not None:

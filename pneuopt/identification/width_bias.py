@@ -1,4 +1,4 @@
-"""`prefers_narrower_widths`: whether the logs refute a width that only serves the integration.
+"""`suspect_widths`: whether the logs refute a width that only serves the integration.
 
 A smooth model turns friction round over a width; a drive that truly sticks does it over none. What the width hides goes
 into the parameters, the Stribeck velocity first, before the residuals show it: at 1.08 times the noise it was 20 %
@@ -8,6 +8,7 @@ that it has made itself, a narrower one explains the logs worse.
 
 from dataclasses import replace
 
+from pneuopt.identification.misfit import Misfit
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.identification.widths import SIGNIFICANT_FALL
 from pneuopt.quantities.status import Code
@@ -16,6 +17,26 @@ from pneuopt.shooting.solution import Fit
 
 # factor by which the widths are narrowed [1]: a smaller one takes more integration steps, a larger one changes less
 NARROWING = 0.5
+
+
+def suspect_widths(misfit: Misfit, problem: EstimationProblem, fit: Fit, variance: float) -> Misfit:
+    """The misfit, with whether a width may be behind it; only looked for where parts of the logs disagree.
+
+    Parameters
+    ----------
+    misfit : Misfit
+    problem : EstimationProblem
+    fit : Fit
+    variance : float
+        Of the residuals, in noise variances.
+
+    Returns
+    -------
+    Misfit
+    """
+    if not (misfit.is_suspect and fit.status.converged):
+        return misfit
+    return replace(misfit, is_too_wide=prefers_narrower_widths(problem, fit, variance))
 
 
 def prefers_narrower_widths(problem: EstimationProblem, fit: Fit, variance: float) -> bool:
