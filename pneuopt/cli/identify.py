@@ -23,7 +23,7 @@ from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
-from pneuopt.identification.examination import QUIET_CHECKS, examine_logs
+from pneuopt.identification.examination import examine_logs
 from pneuopt.identification.identifiability import identifiability
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult, Verdict
@@ -73,7 +73,7 @@ def run_identify(
     with _draw_refusal(outputs):
         before = identifiability(system, experiments, parameters).sentences
     found = examine_logs(system, experiments, parameters)
-    for sentence in (*before, *(f"{note.log}: {note.message}" for note in found if note.check in QUIET_CHECKS)):
+    for sentence in (*before, *(f"{doubt.log}: {doubt.message}" for doubt in found if not doubt.fault)):
         warn(f"before the fit: {sentence}")
     with _draw_refusal(outputs), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)

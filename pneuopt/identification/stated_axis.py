@@ -51,6 +51,8 @@ def stated_axis(plant: System, experiment: Experiment, parameters: ParameterSet)
         others, moved = body.forces(body.with_change(name))
         weights = weights if _agree(others, weights) else {}
         constant = constant if _agree({"": moved}, {"": constant}) else math.nan
+    if any(abs(body.asymmetry(p)) > 1e-6 for p in (body.vector, *map(body.with_change, known.free_names))):
+        constant = math.nan
     if any(n.startswith("sensor.") and n.endswith(".offset") for n in known):
         constant = math.nan
     return StatedAxis(
@@ -103,6 +105,12 @@ class _Body:
         sizes = {q.name: abs(weights.get(q.name, 0.0)) * q.nominal for q in (*self.plant.states, *self.plant.inputs)}
         pushes = {n: weight for n, weight in weights.items() if sizes[n] > MIN_FORCE_SHARE * max(sizes.values())}
         return pushes, float(at_base - sum(weight * base[n] for n, weight in pushes.items()))
+
+    def asymmetry(self, vector: Array) -> float:
+        """What friction takes more at the nominal speed one way than the other."""
+        fast = next(s.nominal for s in self.plant.states if s.name == self.axis.speed)
+        ways = [self.force(vector, {self.axis.speed: speed}) for speed in (fast, -fast)]
+        return sum(ways) - 2 * self.force(vector, {})
 
     def with_change(self, name: str) -> Array:
         """The vector with one parameter changed a little."""

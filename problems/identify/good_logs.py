@@ -204,7 +204,8 @@ def _stopped(log: GoodLog) -> GoodLog:
     end = float(x.min() + 0.8 * np.ptp(x))
     push = log.axis.net_force({n: run[n] for n in log.axis.forces})
     more = np.where(x > end, 4 * float(np.quantile(np.abs(push), 0.9)) - push, 0.0)
-    columns = {"position": np.minimum(x, end), channel: run[channel] + more / area}
+    noise = 1e-5 * np.random.default_rng(0).standard_normal(x.size)
+    columns = {"position": np.minimum(x, end) + noise, channel: run[channel] + more / area}
     return _replaced(log, columns | ({"speed": np.where(x > end, 0.0, run["speed"])} if "speed" in run else {}))
 
 

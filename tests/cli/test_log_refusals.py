@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from pneuopt.cli import identify as identify_module
 from pneuopt.cli.app import app
 from pneuopt.cli.shared import write_csv
 from pneuopt.logs.experiments import Experiment
@@ -14,14 +15,15 @@ DRIVE = """
 [drive]
 kind = "force"
 [load]
-mass = "5 kg"
+mass = "20 kg"
 [friction]
 model = "coulomb"
 coulomb = { value = "20 N", free = true }
 viscous = { value = "40 N*s/m", free = true }
 smoothing = "5 mm/s"
 """
-REFUSED = ("motion", "work", "scale")  # of the checks, those that a drive that is pushed by a force meets
+REFUSED = ("motion", "work", "scale", "jumps", "stops", "mass")
+"""The checks that a force drive's log meets."""
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +43,7 @@ def write(log: Experiment) -> None:
 
 @pytest.mark.parametrize("check", REFUSED)
 def test_a_refusal_is_said_in_whole_words_and_drawn(check: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write(BAD_LOGS[check])
+    write(BAD_LOGS[check].select(["position", "force"]))
     plain = run("identify drive.toml run.csv -q")
     assert plain.exit_code == 2
     assert plain.stderr.startswith("error: run: ")
@@ -56,6 +58,20 @@ def test_a_refusal_is_said_in_whole_words_and_drawn(check: str, folder: Path, mo
     assert "draws it" not in drawn.stderr
     assert (folder / "fit_refused.png").stat().st_size > 10_000
     assert not (folder / "fit.json").exists()
+
+
+def test_a_doubt_is_said_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A force that reads off by 20 N; the drive's load.force is stated as zero, its mass as it is."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(identify_module, "identify", stop)
+    Path("drive.toml").write_text(DRIVE.replace("20 kg", "2.6 kg"), encoding="utf-8")
+    write(BAD_LOGS["offset"].select(["position", "force"]))
+    result = run("identify drive.toml run.csv -q")
+    assert "warning: before the fit: run: the drive pushes with 20 N more than the motion needs" in result.stderr
+    assert "free load.force, which takes it" in result.stderr
 
 
 def test_a_refusal_that_no_signal_shows_is_said_only(folder: Path) -> None:

@@ -32,7 +32,8 @@ def only(log: Experiment, *channels: str) -> Experiment:
 def stopped() -> Experiment:
     """It runs into a stop at 0.13 m, against which the force then pushes."""
     x, push = RIGHT["position"], RIGHT["force"]
-    return swing(position=np.minimum(x, 0.13), force=np.where(x > 0.13, 250.0, push))
+    rest = 1e-5 * np.random.default_rng(2).standard_normal(T.size)
+    return swing(position=np.minimum(x, 0.13) + rest, force=np.where(x > 0.13, 250.0, push))
 
 
 def jumped() -> Experiment:

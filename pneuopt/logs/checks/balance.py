@@ -90,7 +90,7 @@ def check_mass(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]
     if 1 / MAX_MASS_FACTOR < factor < MAX_MASS_FACTOR:
         return
     if found.contradicts(found.with_stated_mass):
-        left = [f"{100 * r / found.spread:.2g} %" for r in (found.residual, found.with_stated_mass)]
+        left = [f"{100 * r / found.spread:.3g} %" for r in (found.residual, found.with_stated_mass)]
         message = f"force and acceleration are those of {found.mass:.3g} {axis.inertia_unit}, {factor:.3g} times the "
         message += f"stated {axis.inertia_name} of {axis.inertia:.3g} {axis.inertia_unit}"
         message += f" (of the force {left[0]} remain unexplained with the one, {left[1]} with the other)"

@@ -32,9 +32,10 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
     if motion is None or axis.position not in log or not axis.forces or any(n not in log for n in axis.forces):
         return
     x, push, unit = log[axis.position], axis.net_force({n: log[n] for n in axis.forces}), experiment.unit(axis.position)
-    middle, level = _usual_push(x, motion, push)
     way = float(np.nanmax(x) - np.nanmin(x))
     width = max(STOP_WIDTH * experiment.noise.get(axis.position, noise_level(x, log.t)), STOP_SHARE * way)
+    inside = (x > np.nanmin(x) + width) & (x < np.nanmax(x) - width)
+    middle, level = _usual_push(inside, motion, push)
     for side, end in ((1, float(np.nanmax(x))), (-1, float(np.nanmin(x)))):
         held = (np.abs(x - end) < width) & (side * (push - middle) > MIN_STOP_FORCE_RATIO * level)
         begin, last = _longest_run(held)
@@ -52,18 +53,16 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
         yield LogFinding(axis.position, message, True, evidence=shown)
 
 
-def _usual_push(x: Array, motion: Array, push: Array) -> tuple[float, float]:
+def _usual_push(inside: Mask, motion: Array, push: Array) -> tuple[float, float]:
     """The middle of the pushes that move the body each way, and how far from it a push moves or holds it."""
     fast = LARGE_SHARE * float(np.nanquantile(np.abs(motion), 0.99))
     ways = [push[side * motion > fast] for side in (1, -1)]
     known = [float(np.nanmedian(way)) for way in ways if way.size >= MIN_STOP_SAMPLES]
     middle = sum(known) / 2 if len(known) == 2 else 0.0
     pushes = np.abs(np.concatenate(ways) - middle)
-    low, high = np.nanquantile(x, (0.05, 0.95))
-    held = np.abs(push[(np.abs(motion) < fast) & (x > low) & (x < high)] - middle)
-    return middle, max(
-        float(np.nanmedian(pushes)), float(np.nanquantile(held, 0.99)) if held.size >= MIN_STOP_SAMPLES else 0.0
-    )
+    held = np.abs(push[(np.abs(motion) < fast) & inside] - middle)
+    holding = float(np.nanquantile(held, 0.99)) if held.size >= MIN_STOP_SAMPLES else 0.0
+    return middle, max(float(np.nanmedian(pushes)), holding)
 
 
 def _is_stated(end: float, axis: StatedAxis) -> bool:
