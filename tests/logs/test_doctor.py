@@ -219,3 +219,14 @@ def test_millimetres_read_as_metres_are_named_before_a_fit() -> None:
     assert [f.check for f in examine(Experiment(Trajectory(t, both))) if f.fault] == ["scale"]
     high = {n: 1e3 * swing().trajectory[n] for n in ("pressure_a", "pressure_b")}
     assert any("more than air drives have: its unit?" in message for message in faults(swing(**high)))
+
+
+def test_outliers_and_strokes_within_few_samples_are_no_jumps() -> None:
+    """A lost sample is a robust loss's business; a short stroke at 50 Hz takes three samples."""
+    rng, log = np.random.default_rng(6), swing().trajectory
+    hit = rng.random(T.size) < 0.01
+    spiked = log["position"] + np.where(hit, rng.choice([-0.02, 0.02], T.size), 0.0)
+    t = np.arange(500) * 0.02
+    strokes = 0.1 + 0.05 * np.interp((t % 1.0), [0, 0.44, 0.5, 0.94, 1.0], [-1, -1, 1, 1, -1])
+    for time, position in ((T, spiked), (t, strokes + 1e-5 * rng.standard_normal(t.size))):
+        assert "jumps" not in [f.check for f in examine(Experiment(Trajectory(time, {"position": position})))]
