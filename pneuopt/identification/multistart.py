@@ -132,7 +132,9 @@ def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[tuple[f
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
     bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
-    fit = solve_least_squares(held, replace(problem.method, stages=problem.method.stages[:GUESS_STAGES]))
+    # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
+    stages = problem.method.stages[: GUESS_STAGES if problem.has_gaps else 1]
+    fit = solve_least_squares(held, replace(problem.method, stages=stages))
     if fit.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     start = problem.start_from(fit, f"{candidate.label}, settled")

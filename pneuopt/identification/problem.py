@@ -59,6 +59,11 @@ class EstimationProblem:
     noise_is_stated: bool = False
     window: float = math.inf
 
+    @property
+    def has_gaps(self) -> bool:
+        """Whether some segment continues another; not so in windows of one segment each."""
+        return self.method.segment_time < self.window
+
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
         known = {

@@ -1,5 +1,6 @@
 """The order of starts: the model's first, then all, settled with their guesses held."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -191,3 +192,20 @@ def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatc
     monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
     assert starting.fit_from_starts(problem)[1].status.converged
     assert labels == [c.label for c in problem.candidates()[:2]]
+
+
+@pytest.mark.parametrize(("window", "segment", "stages"), [(math.inf, 0.01, starting.GUESS_STAGES), (0.1, 0.1, 1)])
+def test_guesses_are_settled_once_where_no_gap_tightens(
+    window: float, segment: float, stages: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, run = posed(Stribeck()), list[int]()
+
+    def counted(transcription: Transcription, method: LeastSquares) -> Fit:
+        run.append(len(method.stages))
+        return solve_least_squares(transcription, method)
+
+    monkeypatch.setattr(starting, "solve_least_squares", counted)
+    method = replace(problem.method, segment_time=segment)
+    found = list(starting.starts_by_cost(replace(problem, window=window, method=method)))
+    assert len(found) > 1
+    assert set(run) == {stages}
