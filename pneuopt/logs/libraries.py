@@ -3,16 +3,22 @@
 import importlib
 import logging
 import sys
+import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from pneuopt.quantities.errors import InputError, LogError
 
 MAX_REASON = 200
 """Length of a library's own words in a message [character]: more may show the whole file."""
+MAX_SECONDS = 120.0
+"""Time for a library [s] in a process of its own: more looks like a hang; less refuses logs of 100 MB."""
+
+Result = TypeVar("Result")
 
 
 def import_extra(module: str, package: str, path: Path | str, kind: str, extra: str) -> Any:
@@ -41,10 +47,31 @@ def foreign_code(path: Path, kind: str) -> Iterator[None]:
     except LogError:
         raise
     except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_REASON]
-        error.__traceback__ = error.__context__ = None  # so that half-made objects die while nobody listens
+        name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        reason = " ".join(f"{name}{error}".split())[:MAX_REASON]
+        traceback.clear_frames(error.__traceback__)  # so that half-made objects die while nobody listens
         text = f"{path}: cannot be read as {kind} ({reason}); save the log again, or export it as CSV"
         raise LogError(text) from None
     finally:
         logging.root.manager.disable = said
         sys.unraisablehook = unraisable
+
+
+def run_apart(read: Callable[[Path, bytes], Result], path: Path, raw: bytes, kind: str) -> Result:
+    """Run a reader in a process of its own, which a damaged file may end or keep busy, but not ours.
+
+    Raises
+    ------
+    LogError
+        If it does either, or the reader says so.
+    """
+    import loky
+
+    executor = loky.ProcessPoolExecutor(1, context=loky.backend.get_context("loky"))
+    try:
+        return cast("Result", executor.submit(read, path, raw).result(MAX_SECONDS))
+    except (loky.process_executor.BrokenProcessPool, FutureTimeoutError):
+        text = f"{path}: cannot be read as {kind}: the library fails on it; save the log again, or export it as CSV"
+        raise LogError(text) from None
+    finally:
+        executor.shutdown(kill_workers=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from pneuopt.logs.arrays import array_table
 from pneuopt.logs.libraries import foreign_code
+from pneuopt.logs.mat_elements import Structure, has_elements, read_elements
 from pneuopt.logs.table import Table, check_columns
 from pneuopt.quantities.errors import LogError, require
 
@@ -46,7 +47,8 @@ def read_table(path: Path, raw: bytes) -> Table:
     LogError
         If the file is not a .mat file of these versions, or holds no vector.
     """
-    columns = [column for column in _columns(_load(path, raw)) if _is_vector(column.values)]
+    variables = (_flatten(_Column(name, value), 0) for name, value in _load(path, raw))
+    columns = [column for found in variables for column in found if _is_vector(column.values)]
     require(bool(columns), f"{path}: no vector of numbers; {_STRUCTURE_REMEDY}", LogError)
     names = [column.name for column in columns]
     check_columns(path, names)
@@ -54,56 +56,44 @@ def read_table(path: Path, raw: bytes) -> Table:
     return array_table(path, {column.name: column.values for column in columns}, units)
 
 
-def _load(path: Path, raw: bytes) -> Mapping[str, Any]:
-    from scipy.io import loadmat
-
-    file: Any = io.BytesIO(raw)  # which the types do not know
+def _load(path: Path, raw: bytes) -> list[tuple[str, Any]]:
+    remedy = "in MATLAB, save it with the option '-v7'"
+    require(b"MATLAB 7.3" not in raw[:20], f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}", LogError)
     with foreign_code(path, "a .mat file"):
-        try:
-            return loadmat(file, squeeze_me=True)
-        except NotImplementedError:
-            remedy = "in MATLAB, save it with the option '-v7'"
-            raise LogError(f"{path}: a .mat file of version 7.3 (HDF5) is not read; {remedy}") from None
+        if has_elements(raw):
+            return read_elements(raw)
+        from scipy.io import loadmat
+
+        file: Any = io.BytesIO(raw)  # which the types do not know
+        return [(n, v) for n, v in loadmat(file, squeeze_me=True).items() if not n.startswith("__")]  # loadmat's own
     raise AssertionError  # the context lets no error pass
 
 
-def _columns(variables: Mapping[str, Any]) -> Iterator[_Column]:
-    """Variables by name, and in place of a structure its fields."""
-    for name, value in variables.items():
-        if not name.startswith("__"):  # loadmat's own, such as "__header__"
-            yield from _flatten(_Column(name, value), 0)
-
-
 def _flatten(column: _Column, depth: int) -> Iterator[_Column]:
+    """A variable, or in place of a structure its fields."""
     value = column.values
-    fields = value.dtype.names if isinstance(value, np.ndarray) else None
-    if not fields:
+    if not isinstance(value, Structure):
         yield column
-        return
-    if depth == MAX_DEPTH or value.ndim > 1:
-        return
-    for element in np.atleast_1d(value):
-        signal = _signal(column.name, element, fields)
-        if signal is not None:
-            yield signal
-        elif value.ndim == 0:
-            for field in fields:
-                unit = "s" if field == "time" and "signals" in fields else ""  # Simulink's
-                yield from _flatten(_Column(field, element[field], unit), depth + 1)
+    elif depth < MAX_DEPTH:
+        for element in value.elements:
+            signal = _signal(column.name, element)
+            if signal is not None:
+                yield signal
+            elif len(value.elements) == 1:
+                for field in value.fields:
+                    unit = "s" if field == "time" and "signals" in value.fields else ""  # Simulink's
+                    yield from _flatten(_Column(field, element[field], unit), depth + 1)
 
 
-def _signal(name: str, element: Any, fields: tuple[str, ...]) -> _Column | None:
+def _signal(name: str, element: Mapping[str, Any]) -> _Column | None:
     """One signal of Simulink's structure with time (values, label) or of dSPACE's (Data, Name, Unit)."""
     for values, label in (("values", "label"), ("Data", "Name")):
-        if values in fields and label in fields:
-            said, unit = str(element[label]), str(element["Unit"]) if "Unit" in fields else ""
-            is_time = name == "X" and not _is_text(element[label])
-            return _Column("time" if is_time else said, element[values], "s" if is_time else unit.strip("[]"))
+        if values in element and label in element:
+            said, unit = element[label], element.get("Unit")
+            if name == "X" and not (isinstance(said, str) and said):
+                return _Column("time", element[values], "s")
+            return _Column(str(said), element[values], unit if isinstance(unit, str) else "")
     return None
-
-
-def _is_text(value: Any) -> bool:
-    return str(value) not in {"", "[]"}
 
 
 def _is_vector(value: Any) -> bool:

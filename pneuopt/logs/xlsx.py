@@ -18,7 +18,7 @@ from pneuopt.logs.text_cells import MISSING
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 
-MAX_ROWS = 2**20
+MAX_SHEET_ROWS = 2**20
 """Rows of a sheet [1]: Excel's own bound."""
 _SHOWN_DATE = "0:00:00"  # what a date looks like where only its being one counts
 
@@ -93,7 +93,9 @@ def _read_cells(path: Path, sheet: Any) -> list[list[Any]]:
     for row in sheet.iter_rows():
         width = max(width, len(row))
         rows.append([_Date(cell.value) if _is_date(cell) else cell.value for cell in row])
-        require(len(rows) <= MAX_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError)
+        require(
+            len(rows) <= MAX_SHEET_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError
+        )
         check_cells(path, len(rows), width)
     while rows and all(cell is None for cell in rows[-1]):
         rows.pop()

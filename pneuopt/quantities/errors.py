@@ -4,6 +4,9 @@ import difflib
 from collections.abc import Iterable
 from typing import Any
 
+MAX_SHOWN = 80
+"""Length of an unknown name in a message [character]: more hides the remedy behind it."""
+
 
 class PneuoptError(Exception):
     """Base of every error that pneuopt raises on purpose."""
@@ -22,7 +25,8 @@ class UnknownNameError(InputError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str], where: str = "") -> None:
         known = sorted(known)
-        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(name[:MAX_SHOWN], known, n=1, cutoff=0.5)
+        name = name if len(name) < MAX_SHOWN else name[:MAX_SHOWN] + "..."
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known) or 'none'}"
         super().__init__(f"{where + ': ' if where else ''}unknown {kind} {name!r}; {hint}")
 

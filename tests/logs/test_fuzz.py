@@ -11,7 +11,7 @@ def check(report: Report) -> None:
 
 
 def test_a_few_mutated_logs() -> None:
-    check(fuzz(200, seed=1, styles=3))
+    check(fuzz(100, seed=1, styles="plain"))
 
 
 @pytest.mark.slow
