@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pneuopt.logs.budget import MAX_BYTES, MAX_COLUMNS, check_cells
+from pneuopt.logs.columns import MAX_MAGNITUDE
 from pneuopt.logs.layout import MAX_HEAD_ROWS, find_layout, has_table
 from pneuopt.logs.libraries import foreign_code, import_extra
 from pneuopt.logs.stamps import is_stamp, seconds_from_first
@@ -20,6 +21,8 @@ from pneuopt.quantities.errors import LogError, require
 
 MAX_SHEET_ROWS = 2**20
 """Rows of a sheet [1]: Excel's own bound."""
+MAX_DAYS = 2958466
+"""Days of a date [1]: Excel's last, in the year 9999; more overflow as seconds."""
 _SHOWN_DATE = "0:00:00"  # what a date looks like where only its being one counts
 
 
@@ -130,9 +133,8 @@ def _column(sheet: _Sheet, name: str) -> Array:
     cells = [row[i] if i < len(row) else None for row in sheet.rows]
     if name in sheet.stamps and not isinstance(cells[0], _Date):
         return seconds_from_first([_show(cell) for cell in cells], sheet.path, name, sheet.first_row)
-    if name in sheet.stamps:
-        return _seconds(np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)]))
-    return np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)])
+    numbers = np.array([_number(sheet, name, k, cell) for k, cell in enumerate(cells)])
+    return _seconds(sheet, name, numbers) if name in sheet.stamps else numbers
 
 
 def _number(sheet: _Sheet, name: str, index: int, cell: Any) -> float:
@@ -141,12 +143,16 @@ def _number(sheet: _Sheet, name: str, index: int, cell: Any) -> float:
     is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
     place = f"{sheet.path}: row {index + sheet.first_row}, column {name!r}"
     require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; leave the cell empty if it is missing", LogError)
-    return float(cell)
+    return float(cell) if not abs(cell) > MAX_MAGNITUDE else np.inf  # which is refused
 
 
-def _seconds(days: Array) -> Array:
+def _seconds(sheet: _Sheet, name: str, days: Array) -> Array:
     """Seconds from the first; a time of day leaps back at midnight. A double holds today's date to 0.6 us."""
-    leaps = np.diff(days, prepend=days[:1]) < -0.5
-    if np.nanmax(days) <= 1:
-        days = days + np.cumsum(leaps)
-    return np.asarray(np.round((days - days[0]) * 86400, 6))
+    wrong = np.flatnonzero(np.abs(days) > MAX_DAYS)
+    if wrong.size:
+        place = f"{sheet.path}: row {wrong[0] + sheet.first_row}, column {name!r}"
+        raise LogError(f"{place}: {days[wrong[0]]:.6g} is no date of Excel; write a date with its time, or a number")
+    known = days[np.isfinite(days)]
+    if known.max(initial=0.0) <= 1:
+        days = days + np.cumsum(np.diff(days, prepend=days[:1]) < -0.5)
+    return np.asarray(np.round((days - (known[0] if known.size else 0.0)) * 86400, 6))

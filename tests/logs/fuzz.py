@@ -324,7 +324,8 @@ def _mutated_sidecar(rng: random.Random) -> str:
 
 
 if __name__ == "__main__":
-    result = fuzz(int(sys.argv[1]), int((*sys.argv, 0, 0)[2]), *sys.argv[3:])
+    _, count, start, style = (*sys.argv, *("", "0", "")[len(sys.argv) - 1 :])
+    result = fuzz(int(count), int(start), style)
     sys.stdout.write(f"{result}\n")
     for style_name, fault, raw, side in result.failures[:40]:
         sys.stdout.write(f"\n{style_name}: {fault}\n{raw[:400]!r}\n{side}\n")
