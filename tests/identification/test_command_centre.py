@@ -1,11 +1,13 @@
 """A valve's command that was logged from 0 to 10 V: the centre is found, and estimated; one about 0 V stays."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import pneuopt as po
+from pneuopt.dynamics.hooks import Log
 from pneuopt.identification.command_centre import find_centre
 from pneuopt.quantities.errors import LogError
 
@@ -123,3 +125,16 @@ def test_a_log_predicted_before_any_fit_is_read_from_where_it_rests() -> None:
         run = po.predict(system, log, truth.with_values({CENTRE: 0.0}))
     travel = float(np.ptp(log.trajectory["position"]))
     assert np.abs(run["position"] - log.trajectory["position"]).max() < 0.3 * travel
+
+
+def test_a_search_starts_at_the_centre_that_the_pressures_show() -> None:
+    """From 0.16 V beside it, where a mass balance would take the supply's pressure for a wrong one."""
+    system, truth, log = simulated(5.06)
+    beside = replace(truth[CENTRE], value=4.9, lower=4.0, upper=6.0, free=True)
+    given = truth.with_values({"valve.dead_zone": 0.0, "valve.conductance": 1.5e-8})
+    given = given.freed("valve.dead_zone", "valve.conductance") | po.ParameterSet({CENTRE: beside})
+    logs = {"run": Log(log.trajectory, given)}
+    start = system.starts(logs)[0].parameters
+    assert start[CENTRE] == pytest.approx(5.06, abs=0.02)
+    assert start["valve.conductance"] == pytest.approx(truth.value("valve.conductance"), rel=0.2)
+    assert list(system.log_warnings(logs)) == []
