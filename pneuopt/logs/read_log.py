@@ -121,7 +121,7 @@ def _read_intersample(entries: Mapping[str, Any], trajectory: Trajectory, where:
     for channel, word in entries.items():
         require(
             isinstance(word, str) and word in known,
-            f"{where}.{channel} is {word!r}; it must be " + " or ".join(map(repr, known)),
+            f"{where}.{channel} is {str(word)[:60]!r}; it must be " + " or ".join(map(repr, known)),
             LogError,
         )
     return {channel: known[word] for channel, word in entries.items()}

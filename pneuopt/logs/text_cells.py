@@ -77,7 +77,7 @@ def split_cells(line: str, delimiter: str, where: str = "") -> list[str]:
     ['0,1', 'a;b', '3" pipe']
     """
     if delimiter == " ":
-        return [match[0] for match in _WORD.finditer(line)]
+        return [match[0] for match in _WORD.finditer(line)] or [""]
     if '"' not in line:
         return [cell.strip() for cell in line.split(delimiter)]
     try:

@@ -21,6 +21,8 @@ from pneuopt.quantities.errors import LogError, require
 
 MAX_SHEET_ROWS = 2**20
 """Rows of a sheet [1]: Excel's own bound."""
+MAX_EMPTY_ROWS = 10_000
+"""Empty rows one after another [1]: a single stray cell far below makes a million, which take seconds."""
 MAX_DAYS = 2958466
 """Days of a date [1]: Excel's last, in the year 9999; more overflow as seconds."""
 _SHOWN_DATE = "0:00:00"  # what a date looks like where only its being one counts
@@ -92,9 +94,13 @@ def _read_sheets(path: Path, raw: bytes, openpyxl: Any) -> dict[str, list[list[A
 def _read_cells(path: Path, sheet: Any) -> list[list[Any]]:
     sheet.reset_dimensions()  # which some programs write wrong
     rows: list[list[Any]] = []
-    width = 0
+    width = empty = 0
     for row in sheet.iter_rows():
         width = max(width, len(row))
+        empty = 0 if row else empty + 1
+        require(
+            empty <= MAX_EMPTY_ROWS, f"{path}: {empty} rows are empty; delete them, or what is below them", LogError
+        )
         rows.append([_Date(cell.value) if _is_date(cell) else cell.value for cell in row])
         require(
             len(rows) <= MAX_SHEET_ROWS and width <= MAX_COLUMNS, f"{path}: the sheet is too large; cut it", LogError

@@ -154,6 +154,7 @@ def test_missing_samples_and_any_start_time(tmp_path: Path) -> None:
         ("time [s]\n" + "".join(f"{k}\n" for k in range(12)), "one column only; put ',', ';' or a tab"),
         ("time [s],position [mm],position [mm]\n" + BODY, "two columns are named 'position [mm]'; rename one"),
         ("time [s],position [mm],position_mm\n" + BODY.replace("\n", ",1\n"), "'position' has another column"),
+        ("\n" + "time [s] mass\n" + BODY.replace(",", " "), "no channel but time"),
         ("a,b\n" + BODY, 'no time; name a column "time [s]"'),
         ("time [s],b\n" + BODY, "no channel but time; known: time, valve_voltage"),
         ("time [s],presure_a_bar(g)\n" + BODY, "'presure_a_bar(g)' looks like the channel 'pressure_a'"),

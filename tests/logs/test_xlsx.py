@@ -35,6 +35,7 @@ def test_dates_keep_more_than_milliseconds(tmp_path: Path) -> None:
         ("A2", None, "row 2, column 'time [s]': the time is missing; delete the row"),
         ("B3", 10**100, "row 3, column 'position [mm]': inf is not a number; leave the cell empty"),
         ("B3", "12,5", "row 3, column 'position [mm]': '12,5' is not a number; leave the cell empty"),
+        ("B90000", 1.0, "10001 rows are empty; delete them, or what is below them"),
         ("C3", 1.0, "row 3 has 3 cells, the header 2; mend it"),
     ],
 )
