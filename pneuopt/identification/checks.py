@@ -161,6 +161,8 @@ def _fill_noise(system: Fittable, experiments: Sequence[Experiment]) -> list[Exp
         constant = f"{next(iter(levels))}: channel {channel!r} is constant; leave it out, or state its [noise]"
         require(len(shown) > 0, constant, LogError)
         pooled[channel] = float(np.median(shown))
+        silent = f"{next(iter(levels))}: channel {channel!r} shows no noise, not even rounding; state its [noise]"
+        require(pooled[channel] > 0, silent, LogError)
     return [
         e.with_noise({n: s for n, s in pooled.items() if n in e.trajectory and n not in e.noise}) for e in experiments
     ]

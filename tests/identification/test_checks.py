@@ -195,6 +195,17 @@ def test_a_constant_channel_is_no_obstacle_where_its_noise_is_stated() -> None:
     assert check_logs(RIG.system(), still, RIG.parameters)[0].noise == {"position": NOISE}
 
 
+def test_a_channel_that_stands_exactly_still_for_long_is_told_to_state_its_noise() -> None:
+    """A quarter of the log without any change looks like noise of 0, by which no residual can be divided."""
+    t = np.arange(2000) * 1e-3
+    moves = np.where(t < 1.0, 0.0, 0.05 * (1 - np.cos(np.sqrt(50.0) * (t - 1.0))))
+    log = Experiment(Trajectory(t, {"force": np.sin(3 * t), "position": moves}), name="run")
+    with pytest.raises(
+        LogError, match=r"run: channel 'position' shows no noise, not even rounding; state its \[noise\]"
+    ):
+        check_logs(RIG.system(), log, RIG.parameters)
+
+
 def test_a_sidecar_accepts_checks_by_name(tmp_path: Path) -> None:
     rows = "".join(f"{k},{k * k}\n" for k in range(12))
     (tmp_path / "run.csv").write_text(f"time [s],position [m]\n{rows}", encoding="utf-8")
