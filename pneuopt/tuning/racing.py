@@ -43,8 +43,8 @@ FINE_MEMBERS = 20
 FEW_BEST, NO_DITHER = 6, 0.02
 # Points, as far from each other as this share of a gain's range, that gradients improve at a time, on whole responses:
 # cut ones end at other operating points, whose margins they meet. Fewer or farther points miss basins; each more costs
-# a descent, and closer ones end in the same point.
-POLISHED, MIN_DISTANCE = 2, 0.03
+# a descent, and closer ones end in the same point. A search near its start has fewer trials, so it gets more points.
+POLISHED, POLISHED_NEARBY, MIN_DISTANCE = 2, 4, 0.03
 AGREEMENT = 0.01  # relative difference of two starts' merits that count as one: larger ones hide a second optimum
 # Best merit after the wide bands, over that with which the first start ended, from which on a start is given up; and a
 # point's merit over the best, from which on gradients leave it. A smaller one gives up what gradients may still bring
@@ -243,7 +243,7 @@ class _RacingSearch:
         self._rng, self._progress, self._coarse = rng, progress, simulator.coarse(spec)
         self._polisher = Polish(simulator, spec)
         self.best, self.count, self.starts, self.agreeing = np.clip(start, 0.0, 1.0), 0, 0, 0
-        self._ends, self._polished = list[Array](), list[Array]()
+        self._ends, self._polished, self._points = list[Array](), list[Array](), POLISHED
 
     def run(self, method: Racing) -> None:
         """Search from each start on coarse samples, then from the best of all on fine ones."""
@@ -251,6 +251,7 @@ class _RacingSearch:
         population = first_population(method.members, given, self._rng)
         if not method.bands:
             population[1:] = _near(given, population[1:], self._rng)
+            self._points = POLISHED_NEARBY
         bests = list[float]()
         for share in START_SHARES:
             population, merits = self._search(population, method, share, LAGGING * min(bests, default=np.inf))
@@ -292,7 +293,7 @@ class _RacingSearch:
             if merits[0] > most:
                 return population, merits
             population = self._polish(population, merits, self._simulator, method.polish)[0]
-            self._polished.append(population[:POLISHED])
+            self._polished.append(population[: self._points])
         return self.evolve(population, last)
 
     def _best_first(self, population: Array, simulator: Simulator) -> tuple[Array, Array]:
@@ -305,7 +306,7 @@ class _RacingSearch:
         """Improve the best points of a population, apart from each other, by gradients; the best first."""
         if not iterations or not self._polisher.is_possible:
             return population, merits
-        chosen = _distinct_points(population[merits <= LAGGING * merits[0]])[:POLISHED]
+        chosen = _distinct_points(population[merits <= LAGGING * merits[0]])[: self._points]
         self.best = population[0].copy()
         unit, count = self._polisher.improve(population[chosen], simulator, iterations)
         self.count += count
