@@ -13,6 +13,7 @@ INSIDE = {
     "problems/shared/random_problems.py": "finds feasible designs by brute force on the search's batched simulator",
     "problems/paper/paper_rivals.py": "tunes designs that hunt, which tune refuses, on the search's simulator",
     "problems/identify/good_logs.py": "asks the log doctor itself, which identify asks first",
+    "problems/shared/mismatched_rig.py": "makes its logs by machine code, of the library's valve and chambers",
     "problems/speed/benchmark_identification.py": "times the full-space solver from the start that the log gives",
     "problems/speed/linear_tuning.py": SEARCH,
     "problems/speed/simulation_speed.py": "times the compiled simulation, lane by lane",
