@@ -90,6 +90,17 @@ def test_a_silent_fit_is_wrong_and_says_nothing() -> None:
     assert [mismatch.silent(pd.DataFrame([r])) for r in rows] == [1, 0, 0, 0, 1]
 
 
+@pytest.mark.parametrize(("case", "holds"), [("width_1mm", False), ("encoder_10um", False), ("tube", True)])
+def test_a_case_of_friction_or_steps_alone_has_bounds_on_its_bias(case: str, holds: bool) -> None:
+    row = {f"{k} {n}": 1.0 for n in mismatch.WANTED for k in ("bias", "off", "covered", "unmarked")}
+    rows = pd.DataFrame([row | {"bias friction.coulomb": -3.1, "converged": 1.0, "misfit": 1.0, "cpu": 3.0}])
+    found = {c.name: c for c in mismatch._claims(case, rows)}
+    assert found[f"{case}.coulomb"].holds == holds
+    assert found[f"{case}.static"].holds
+    unsettled = {c.name: c for c in mismatch._claims(case, rows.assign(converged=0.0))}
+    assert unsettled[f"{case}.converged"].holds == holds
+
+
 def test_without_hardware_the_rig_is_the_model_of_the_same_friction(monkeypatch: pytest.MonkeyPatch) -> None:
     """At a smoothing of 0.01 mm/s the model creeps by micrometres; two codes that share valve and chambers only."""
     truth = po.catalog.b32()[1].with_values({"friction.smoothing": 1e-5})
@@ -150,6 +161,7 @@ def test_mismatch(tmp_path: Path) -> None:
     claims = mismatch.main(rows).set_index("name")
     assert claims.loc["worst_seconds", "holds"]
     assert claims.loc["unmarked.covered", "holds"]
+    assert claims.loc["width_0.3mm.coulomb", "holds"]
     assert "width_0.3mm: converged" in mismatch.told(rows)
     mismatch.figure(rows).savefig(tmp_path / "mismatch.png")
     assert (tmp_path / "mismatch.png").stat().st_size > 10_000
