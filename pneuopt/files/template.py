@@ -1,5 +1,6 @@
 """The text of a new file: every key with its unit, default and source; those that are not stated, as comments."""
 
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -120,6 +121,7 @@ def _words_of(unit: str) -> list[str]:
 
 def _comment(text: str) -> list[str]:
     whole = text.replace(" [", f"{_NO_BREAK}[")  # "# [s]" would look like a section
+    whole = re.sub(r'"[^"]*"', lambda quoted: quoted[0].replace(" ", _NO_BREAK), whole)  # a value stays in one piece
     lines = textwrap.wrap(whole, MAX_WIDTH - 2, subsequent_indent="  ", break_on_hyphens=False)
     return [f"# {line}".replace(_NO_BREAK, " ") for line in lines]
 
