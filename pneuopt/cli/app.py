@@ -211,7 +211,8 @@ def info_command() -> None:
     from importlib.metadata import version
 
     from pneuopt.cli.terminal import make_console, show_pairs
-    from pneuopt.dynamics.compiled.compiler import cache_directory, find_compiler
+    from pneuopt.dynamics.compiled.compiler import find_compiler
+    from pneuopt.dynamics.compiled.library_cache import cache_directory
 
     packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
     with _report_errors():

@@ -1,16 +1,19 @@
-"""`compile_library`: C source compiled and loaded as a library, with a cache of binaries by content."""
+"""`compile_library`: C source compiled and loaded as a library, from the cache where it was compiled before."""
 
 import contextlib
 import ctypes
 import functools
-import hashlib
 import logging
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+
+from pneuopt.dynamics.compiled.library_cache import cache_directory, discard_library, find_library, keep_library
 
 COMPILER_FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 COMPILE_TIMEOUT = 300  # [s]; below, large models on slow machines fall back to the VM; above, a hung compiler blocks
@@ -54,25 +57,6 @@ def find_compiler() -> str | None:
     return next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
 
 
-def cache_directory() -> Path:
-    """Where binaries are kept: ``$PNEUOPT_CACHE`` or the platform's cache folder; a temporary one if unwritable."""
-    home = Path.home() / ("AppData/Local" if os.name == "nt" else ".cache")
-    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME") or home
-    folder = Path(os.environ.get("PNEUOPT_CACHE") or Path(base) / "pneuopt")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError as error:
-        return _temporary_folder(f"{folder}: {error.strerror or error}")
-
-
-@functools.cache
-def _temporary_folder(reason: str) -> Path:
-    logger.warning("the cache of compiled models cannot be written (%s): compiling anew in each run", reason)
-    return Path(tempfile.mkdtemp(prefix="pneuopt-"))
-
-
 def _reason(error: OSError | subprocess.SubprocessError) -> str:
     """The compiler's error text, or the signal that killed it."""
     if isinstance(error, subprocess.CalledProcessError) and not error.stderr:
@@ -84,27 +68,49 @@ def _reason(error: OSError | subprocess.SubprocessError) -> str:
 
 
 def _load_library(cc: str, flags: tuple[str, ...], source: str) -> ctypes.CDLL:
-    identity = [source, *flags, _compiler_version(cc), platform.processor(), _cpu_identity()]
-    name = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:32]
-    binary = cache_directory() / f"{name}.so"
-    if binary.exists():
+    identity = "\0".join([source, *flags, _compiler_version(cc), platform.processor(), _cpu_identity()])
+    folder = cache_directory()
+    binary = find_library(folder, identity)
+    if binary is not None:
         try:
             return ctypes.CDLL(str(binary))
-        except OSError:  # damaged on the disk; it is built anew
-            logger.debug("%s cannot be loaded, compiling it anew", binary)
-    _compile(cc, flags, source, binary)
-    return ctypes.CDLL(str(binary))
+        except OSError:  # whole, but of a system whose loader has changed
+            discard_library(binary)
+    return ctypes.CDLL(str(_compile(cc, flags, source, folder, identity)))
 
 
-def _compile(cc: str, flags: tuple[str, ...], source: str, binary: Path) -> None:
+def _compile(cc: str, flags: tuple[str, ...], source: str, cache: Path, identity: str) -> Path:
     """Compile in a temporary folder, then move the binary: another process may do the same, or this one be killed."""
-    with tempfile.TemporaryDirectory(dir=binary.parent) as folder:
-        text, product = Path(folder) / "model.c", Path(folder) / binary.name
+    with tempfile.TemporaryDirectory(dir=cache) as folder:
+        text, product = Path(folder) / "model.c", Path(folder) / "model.so"
         text.write_text(source, encoding="utf-8")
-        command = [cc, *flags, str(text), "-o", str(product), "-lm"]
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=COMPILE_TIMEOUT)
-        with contextlib.suppress(PermissionError):  # Windows: another process has just loaded its own
-            product.replace(binary)
+        _run_compiler([cc, *flags, str(text), "-o", str(product), "-lm"])
+        return keep_library(cache, identity, product)
+
+
+def _run_compiler(command: Sequence[str]) -> None:
+    """Run a compiler; where we are interrupted, or it hangs, all its processes end with it."""
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", start_new_session=True
+    ) as process:
+        try:
+            out, err = process.communicate(timeout=COMPILE_TIMEOUT)
+        except BaseException:
+            _end_with_children(process)
+            raise
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command, out, err)
+
+
+def _end_with_children(process: "subprocess.Popen[str]") -> None:
+    """Kill a process and those that it started: a compiler is a driver of others, which would go on."""
+    kill_group = getattr(os, "killpg", None)  # not on Windows
+    with contextlib.suppress(OSError):
+        if kill_group is None:
+            process.kill()
+        else:
+            kill_group(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 @functools.cache

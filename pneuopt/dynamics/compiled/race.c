@@ -25,6 +25,7 @@ typedef struct {
   double *y, *x, *x_end;         /* by candidate and case: outputs of each sample, states kept, and the last state */
   Count *loser;                  /* by candidate: the case by which it lost; -1: it came through */
   double *worst;                 /* by candidate: VALUES, the worst over its cases so far */
+  const volatile int *stop;      /* as for `step_through` */
 } Race;
 
 typedef struct {
@@ -130,7 +131,7 @@ EXPORT void race(const Race *r, Count begin, Count end) {
       const Count pair = next_pair(r, begin, end, &place);
       if (pair >= 0) enter(r, &s, run + lane, exits[lane], lane, pair), entered = 1, idle--;
     }
-    if (idle == LANES) return;
+    if (idle == LANES || *r->stop) return;
     if (entered) start(&s);
     for (int lane = 0; lane < LANES; lane++) {
       if (run[lane].candidate < 0) continue;
@@ -151,6 +152,6 @@ EXPORT void race(const Race *r, Count begin, Count end) {
       for (int i = 0; i < NX; i++) r->x_end[own->pair * NX + i] = GET(s.x[i], lane);
       own->candidate = -1, idle++;
     }
-    step_through(&s, r->substeps);
+    step_through(&s, r->substeps, r->stop);
   }
 }

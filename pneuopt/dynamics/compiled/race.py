@@ -101,7 +101,7 @@ class _Race(ctypes.Structure):
         *((n, ctypes.c_double) for n in ("worst_merit", "penalty", "runaway")),
         *((n, ctypes.c_void_p) for n in ("u", "t", "h", "grid", "length", "first", "settings")),
         *((n, ctypes.c_void_p) for n in ("p", "x0", "period", "order", "rival", "band", "weight", "limit")),
-        *((n, ctypes.c_void_p) for n in ("y", "x", "x_end", "loser", "worst")),
+        *((n, ctypes.c_void_p) for n in ("y", "x", "x_end", "loser", "worst", "stop")),
     )
 
 
@@ -173,5 +173,6 @@ def race(rollout: Rollout, course: RaceCourse, merit: RaceMerit, candidates: Rac
         merit.penalty,
         merit.runaway,
     )
-    rollout.race(_Race(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, list(kept.values()))
+    work = m * cases * course.t.shape[1] * course.substeps
+    rollout.race(_Race(*sizes, **{n: a.ctypes.data for n, a in kept.items()}), m, work, list(kept.values()))
     return outcome

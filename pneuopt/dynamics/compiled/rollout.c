@@ -75,11 +75,12 @@ static void mirror(Segment *s) {
     for (int b = 0; b < a; b++) s->gram[b * WIDTH + a] = s->gram[a * WIDTH + b];
 }
 
-static void step_through(Segment *s, int substeps) {
+/* `stop` becomes 1 when the caller is interrupted and wants none of the results any more. */
+static void step_through(Segment *s, int substeps, const volatile int *stop) {
   const Lanes t = s->t[0];
   s->h[0] = s->h[0] / ALL(substeps);
   step_sample(s);
-  for (int k = 0; k < substeps; k++) {
+  for (int k = 0; k < substeps && !*stop; k++) {
     s->t[0] = t + ALL(k) * s->h[0];
     step_call(s);
     advance(s);
@@ -89,7 +90,8 @@ static void step_through(Segment *s, int substeps) {
 EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stride, Count every,
                                   const double *x0, const double *u, const double *p, const double *t, const double *h,
                                   const double *measured, const double *weight, double *y, double *dy, double *x,
-                                  double *x_end, double *dx_end, double *gram, double *squares) {
+                                  double *x_end, double *dx_end, double *gram, double *squares,
+                                  const volatile int *stop) {
   Segment s;
   for (Count i = first; i < last; i += LANES) {
     const int lanes = last - i < LANES ? (int)(last - i) : LANES;
@@ -113,7 +115,8 @@ EXPORT void rollout(Count first, Count last, Count n, int substeps, Count p_stri
         gather(s.measured, measured, sample, NY), gather(s.weight, weight, sample, NY);
         add_residuals(&s);
       }
-      step_through(&s, substeps);
+      step_through(&s, substeps, stop);
+      if (*stop) return;
     }
     mirror(&s);
     scatter(s.gram, gram, row, WIDTH * WIDTH, lanes), scatter(s.squares, squares, row, NY, lanes);

@@ -10,7 +10,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,10 @@ from pneuopt.dynamics.compiled.pieces import prepare_rollout
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 
+BRIEF_STEPS = 20_000
+"""Steps of a lane that run to their end in the main thread [1]: more delay Ctrl-C (at 10 us a step by .2 s); fewer make
+short runs wait for a thread (30 us)."""
+MAX_SUBSTEPS = 2**31 - 1  # integration steps a sample [1]: more do not fit the C int that counts them
 VM_BATCH = 1000  # segments of a batch in the CasADi VM; more take memory for their derivatives, fewer time
 
 
@@ -214,6 +218,7 @@ class Rollout:
             require(array.shape == expected[name], f"{name}: {array.shape}, expected {expected[name]}", ModelError)
         require(p.shape in ((self.n_parameters,), (m, self.n_parameters)), f"p has shape {p.shape}", ModelError)
         require(substeps >= 1, f"substeps must be at least 1, got {substeps}", ModelError)
+        require(substeps <= MAX_SUBSTEPS, f"substeps may be {MAX_SUBSTEPS} at most, got {substeps}", ModelError)
         return x0, u, p, t, h
 
     def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
@@ -252,22 +257,23 @@ class Rollout:
         """Run the machine code, the segments shared out to the threads."""
         assert self._library is not None
         p, (m, n) = given[2], given[3].shape
-        function = self._library.rollout
-        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int] + [ctypes.c_longlong] * 2 + [ctypes.c_void_p] * 14
+        function, stop = self._library.rollout, ctypes.c_int(0)
+        function.argtypes = [ctypes.c_longlong] * 3 + [ctypes.c_int] + [ctypes.c_longlong] * 2 + [ctypes.c_void_p] * 15
         function.restype = None
         arrays = (*given, *others)
         pointers = [a.ctypes.data if a is not None else None for a in arrays]
-        stride = p.shape[1] if p.ndim == 2 else 0
-        self._share_out(
-            function, [(a, b, n, substeps, stride, states or 1, *pointers) for a, b in self._parts(m)], arrays
-        )
+        stride, at = p.shape[1] if p.ndim == 2 else 0, ctypes.addressof(stop)
+        calls = [(a, b, n, substeps, stride, states or 1, *pointers, at) for a, b in self._parts(m)]
+        self._share_out(function, calls, m * n * substeps, stop, arrays)
 
-    def race(self, course: ctypes.Structure, m: int, arrays: Sequence[Any]) -> None:
+    def race(self, course: Any, m: int, steps: int, arrays: Sequence[Any]) -> None:
         """Run the race of m candidates that a struct Race of race.c describes, by pointers to `arrays`."""
         assert self._library is not None
-        function = self._library.race
+        function, stop = self._library.race, ctypes.c_int(0)
         function.argtypes, function.restype = [ctypes.c_void_p, ctypes.c_longlong, ctypes.c_longlong], None
-        self._share_out(function, [(ctypes.addressof(course), a, b) for a, b in self._parts(m)], (course, *arrays))
+        course.stop = ctypes.addressof(stop)
+        calls = [(ctypes.addressof(course), a, b) for a, b in self._parts(m)]
+        self._share_out(function, calls, steps, stop, (course, *arrays))
 
     def _parts(self, m: int) -> list[tuple[int, int]]:
         """Begin and end of each thread's part of m segments."""
@@ -275,14 +281,29 @@ class Rollout:
         parts = max(1, min(self._threads, blocks))
         return list(itertools.pairwise(min(m, blocks * i // parts * self.lanes) for i in range(parts + 1)))
 
-    def _share_out(self, function: Callable[..., None], calls: list[tuple[object, ...]], kept: tuple[Any, ...]) -> None:
-        """Make the calls, each in a thread of its own."""
-        if len(calls) == 1:
+    def _share_out(
+        self,
+        function: Callable[..., None],
+        calls: Sequence[tuple[object, ...]],
+        steps: int,
+        stop: ctypes.c_int,
+        kept: tuple[Any, ...],
+    ) -> None:
+        """Make the calls, each in a thread of its own; Ctrl-C stops them, since this thread only waits.
+
+        A single short call of so many steps is made here: a thread would take longer than its work.
+        """
+        if len(calls) == 1 and steps <= BRIEF_STEPS * self.lanes:
             function(*calls[0])
             return
-        running = [_pool(self._threads).submit(_call_part, function, call, kept) for call in calls]
-        for each in running:
-            each.result()
+        running = [_pool(self._threads).submit(_call_part, function, call, (stop, *kept)) for call in calls]
+        try:
+            for each in running:
+                each.result()
+        except BaseException:
+            stop.value = 1
+            wait(running)
+            raise
 
     def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
@@ -326,6 +347,12 @@ def _processor_count() -> int:
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="pneuopt")
+
+
+if hasattr(
+    os, "register_at_fork"
+):  # a forked child has the pool's locks, but none of its threads: it would wait for ever
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def _unstack(block: ca.DM, rows: int, m: int, columns: int) -> Array:

@@ -1,10 +1,13 @@
 import logging
 import os
+import platform
 import re
 import shutil
+import signal
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled import compiler, library_cache
 from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 
@@ -109,7 +112,7 @@ def test_an_unwritable_cache_is_a_warning(
     assert fall(0.2).uses_machine_code
     assert len(warnings_in(caplog)) == 1
     assert "cannot be written" in warnings_in(caplog)[0]
-    shutil.rmtree(compiler.cache_directory())
+    shutil.rmtree(library_cache.cache_directory())
 
 
 @needs_compiler
@@ -123,14 +126,103 @@ def test_a_cached_binary_is_loaded_and_a_damaged_one_built_anew(
     forget()
     assert fall().uses_machine_code
     assert binary.stat().st_mtime_ns == built
-    forget()
-    damaged = tmp_path / "damaged"
-    damaged.mkdir()
-    shutil.copy(binary, damaged / binary.name)  # the loaded one must not be touched
-    (damaged / binary.name).write_bytes(b"junk")
-    monkeypatch.setenv("PNEUOPT_CACHE", str(damaged))
-    assert fall().uses_machine_code
-    assert (damaged / binary.name).stat().st_size > 1000
+
+
+BUILD = """
+from pneuopt.dynamics.compiled.compiler import compile_library
+assert compile_library("int answer(void) { return 42; }").answer() == 42
+"""
+
+
+def build_in_process(cache: Path) -> subprocess.CompletedProcess[str]:
+    settings = {**os.environ, "PNEUOPT_CACHE": str(cache)}
+    return subprocess.run([sys.executable, "-c", BUILD], env=settings, capture_output=True, text=True, check=False)
+
+
+@needs_compiler
+def test_a_library_damaged_anywhere_is_built_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Cut at twenty places, or with a byte changed there: none of them is handed to the loader."""
+    source = "int answer(void) { return 42; }"
+    monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path))
+    cc = compiler.find_compiler()
+    assert cc is not None
+    compiler._load_library(cc, compiler.COMPILER_FLAGS, source)
+    (binary,) = tmp_path.iterdir()
+    whole = binary.read_bytes()
+    identity = "\0".join(
+        [
+            source,
+            *compiler.COMPILER_FLAGS,
+            compiler._compiler_version(cc),
+            platform.processor(),
+            compiler._cpu_identity(),
+        ]
+    )
+    assert library_cache.find_library(tmp_path, identity) == binary
+    for k in range(20):
+        place = len(whole) * k // 20
+        for damaged in (whole[:place], whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :], whole + b"0"):
+            binary.unlink(missing_ok=True)  # the loaded one must not be touched
+            binary.write_bytes(damaged)
+            binary.chmod(0o600)
+            assert library_cache.find_library(tmp_path, identity) is None
+            assert not binary.exists()
+    binary.write_bytes(whole[: len(whole) // 2])
+    assert build_in_process(tmp_path).returncode == 0
+    assert binary.read_bytes() == whole
+
+
+@needs_compiler
+def test_a_library_of_another_model_or_writable_by_others_is_not_loaded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    product = tmp_path / "product"
+    product.write_bytes(b"one")
+    one = library_cache.keep_library(tmp_path, "one", product)
+    assert one.stat().st_mode & 0o777 == 0o600
+    assert library_cache.find_library(tmp_path, "one") == one
+    stolen = tmp_path / one.name.replace(library_cache._digest("one"), library_cache._digest("two"))
+    os.link(one, stolen)
+    assert library_cache.find_library(tmp_path, "two") is None
+    one.chmod(0o666)
+    assert library_cache.find_library(tmp_path, "one") is None
+    product.write_bytes(b"one")
+    one = library_cache.keep_library(tmp_path, "one", product)
+    owner = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    assert library_cache.find_library(tmp_path, "one") is None
+
+
+@needs_compiler
+@needs_shell
+def test_a_cache_in_which_anybody_may_write_is_not_used(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    done = build_in_process(shared)
+    assert done.returncode == 0, done.stderr
+    assert "other users may exchange files in it" in done.stderr
+    assert list(shared.iterdir()) == []
+    shared.chmod(0o1777)
+    assert build_in_process(shared).stderr == ""
+    assert len(list(shared.iterdir())) == 1
+
+
+@needs_shell
+@pytest.mark.parametrize("home", ["none", "read-only"])
+def test_without_a_home_models_are_compiled_in_a_folder_that_is_removed(home: str, tmp_path: Path) -> None:
+    """The temporary folders of runs do not gather."""
+    (tmp_path / "tmp").mkdir()
+    (tmp_path / "file").touch()
+    settings = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME", "PNEUOPT_CACHE")}
+    settings |= {"TMPDIR": str(tmp_path / "tmp")} | ({"HOME": str(tmp_path / "file")} if home == "read-only" else {})
+    nameless = "import pathlib\ndef home(): raise RuntimeError('no home')\npathlib.Path.home = home\n"
+    program = (nameless if home == "none" else "") + BUILD
+    done = subprocess.run([sys.executable, "-c", program], env=settings, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert "cannot be written" in done.stderr
+    assert list((tmp_path / "tmp").iterdir()) == []
 
 
 @needs_compiler
@@ -157,20 +249,44 @@ def test_an_interrupted_compilation_leaves_nothing_behind(
     monkeypatch: pytest.MonkeyPatch, forget: Forget, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path))
-    run = subprocess.run
 
-    def interrupted(command: list[str], **settings: Any) -> object:
-        if "--version" in command:
-            return run(command, **settings)
+    def interrupted(command: list[str]) -> None:
         Path(command[-2]).write_bytes(b"half a fi")
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(subprocess, "run", interrupted)
+        patch.setattr(compiler, "_run_compiler", interrupted)
         with pytest.raises(KeyboardInterrupt):
             fall()
     assert list(tmp_path.iterdir()) == []
     assert fall().uses_machine_code
+
+
+@needs_shell
+def test_an_interruption_ends_the_compiler_and_what_it_started(tmp_path: Path) -> None:
+    """A driver that starts another process, as gcc starts cc1; the pipe ends when neither holds it any more."""
+    alive, held = os.pipe()
+    text = "import os, subprocess, sys, time; subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'], "
+    text += f"close_fds=False); os.write({held}, b'1'); time.sleep(60)"
+    program = [sys.executable, "-c", text]
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def interrupt() -> None:
+        os.read(alive, 1)
+        signal.pthread_kill(main, signal.SIGINT)
+
+    with pytest.MonkeyPatch.context() as patch:
+        popen = subprocess.Popen
+        patch.setattr(subprocess, "Popen", lambda *given, **settings: popen(*given, pass_fds=(held,), **settings))
+        thread = threading.Thread(target=interrupt)
+        thread.start()
+        with pytest.raises(KeyboardInterrupt):
+            compiler._run_compiler(program)
+    thread.join()
+    os.close(held)
+    assert os.read(alive, 1) == b""
+    os.close(alive)
 
 
 @needs_compiler

@@ -1,3 +1,7 @@
+import os
+import signal
+import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +13,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.compiled import compiler
 from pneuopt.dynamics.compiled import rollout as codegen
-from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.dynamics.compiled.rollout import MAX_SUBSTEPS, Pieces, Rollout
 from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
@@ -244,10 +248,46 @@ def test_wrong_shapes_are_refused(changed: dict[str, Array], message: str) -> No
         case.run(case.rollout(), **changed)
 
 
-def test_no_substeps_are_refused() -> None:
+@pytest.mark.parametrize(
+    ("count", "said"), [(0, "at least 1, got 0"), (2**40, "2147483647 at most, got 1099511627776")]
+)
+def test_no_substeps_and_more_than_the_c_int_counts_are_refused(count: int, said: str) -> None:
     case = Case("stribeck")
-    with pytest.raises(ModelError, match="substeps must be at least 1, got 0"):
-        case.rollout().run(case.x0, case.u, case.p, case.t, case.h, substeps=0)
+    with pytest.raises(ModelError, match=said):
+        case.rollout().run(case.x0, case.u, case.p, case.t, case.h, substeps=count)
+
+
+@needs_compiler
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ctrl_c_ends_machine_code_that_would_run_for_minutes(threads: int) -> None:
+    """2e9 steps of 0.1 us; without the flag that the loop reads, this test takes minutes."""
+    case = Case("stribeck")
+    rollout, main = case.rollout(threads=threads), threading.main_thread().ident
+    assert main is not None
+    alarm = threading.Timer(0.3, signal.pthread_kill, (main, signal.SIGINT))
+    alarm.start()
+    begun = time.process_time()
+    with pytest.raises(KeyboardInterrupt):
+        rollout.run(case.x0, case.u, case.p, case.t, case.h, substeps=MAX_SUBSTEPS)
+    assert time.process_time() - begun < 10 * threads  # CPU time: .3 s on an idle machine
+    alarm.join()
+    assert_array_equal(case.run(rollout).y, case.run(case.rollout(threads=threads)).y)
+
+
+@needs_compiler
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_runs_on_threads_of_its_own() -> None:
+    """The pool's threads are not copied, its queue is: before, the child waited for ever."""
+    case = Case("stribeck")
+    rollout = case.rollout(threads=2)
+    assert len(rollout._parts(len(case.x0))) > 1, "one part runs in the main thread"
+    expected = case.run(rollout).y
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # ends a child that waits
+        os._exit(0 if np.array_equal(case.run(rollout).y, expected) else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 @pytest.mark.parametrize("lanes", [pytest.param(None, marks=needs_compiler), 0])
