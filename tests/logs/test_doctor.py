@@ -62,6 +62,22 @@ def test_exchanged_pressures_are_seen_in_their_work() -> None:
     assert "exchange pressure_a and pressure_b" in told[0]
 
 
+@pytest.mark.parametrize(("zero", "remedy"), [(-101325.0, "write bar(g)"), (101325.0, "write bar(a)")])
+def test_pressures_of_another_zero_are_told_by_the_rod(zero: float, remedy: str) -> None:
+    """Both are one atmosphere off, which pushes on the rod's section alone: 10.1 N of a friction of 30 N."""
+    weights = {"pressure_a": 8e-4, "pressure_b": -7e-4}
+    log = swing().trajectory
+    push = {"pressure_a": 5e5 + log["force"] / 16e-4, "pressure_b": 5e5 * 8 / 7 - log["force"] / 14e-4}
+    axis = PISTON._replace(forces=weights, constant=0.0, offset_parameter="load.force")
+    shifted = {n: p + zero for n, p in push.items()}
+    right = replace(swing(**push), trajectory=swing(**push).trajectory.select(["position", *push]), noise={})
+    wrong = replace(right, trajectory=swing(**shifted).trajectory.select(["position", *push]))
+    assert "offset" not in [f.check for f in examine(right, axis)]
+    (told,) = [f.message for f in examine(wrong, axis) if f.check == "offset"]
+    assert remedy in told
+    assert "load.force" not in told
+
+
 def commanded(frequency: float, sign: float = 1.0) -> Experiment:
     """A speed that follows a valve as a lag of first order, 50 ms, would."""
     w = 2 * np.pi * frequency

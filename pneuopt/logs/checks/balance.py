@@ -21,6 +21,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import noise_level
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import ATMOSPHERE
 
 MIN_RESIDUAL_FACTOR = 2.0
 """Residual with the stated value over that with the log's own [1]: lower blames values for what no model has, higher
@@ -36,6 +37,9 @@ MAX_MASS_FACTOR = 1.5
 """Factor [1] by which a stated mass may be off: lower blames what lags of sensors do, higher passes a lost carriage."""
 MIN_OFFSET_SHARE = 0.2
 """Offset over friction [1] that is worth a word: lower speaks of every sensor, higher passes what moves estimates."""
+MAX_ATMOSPHERE_ERROR = 0.2
+"""Share [1] by which an offset may miss one atmosphere on the difference of a piston's areas: lower forgets gauge
+pressures on a log with noise, higher blames their unit for another force."""
 MAX_NOISE_SHARE = 2e-3
 """Share of the accelerations' variance [1] that noise may have: higher makes masses small, lower blurs fast motion."""
 MIN_HATS = 30
@@ -112,9 +116,22 @@ def check_offset(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFindin
         message = (
             f"the drive pushes with {abs(found.offset):.3g} {axis.force_unit} {more} than the motion needs both ways"
         )
-        message += f" (friction is {found.friction:.3g} {axis.force_unit}), as where a sensor's zero is off"
-        remedy = f"free {axis.offset_parameter}, which takes it" if axis.offset_parameter else "take it off"
-        yield LogFinding(axis.push, f"{message}: {remedy}", False, evidence=_forces(experiment, axis, found))
+        message += (
+            f" (friction is {found.friction:.3g} {axis.force_unit}), as where {_offset_cause(axis, found.offset)}"
+        )
+        yield LogFinding(axis.push, message, False, evidence=_forces(experiment, axis, found))
+
+
+def _offset_cause(axis: StatedAxis, offset: float) -> str:
+    """What shifts the forces by this much, and the remedy: pressures that are one atmosphere off, or some zero."""
+    atmosphere = ATMOSPHERE * sum(weight for n, weight in axis.forces.items() if n.startswith("pressure_"))
+    if abs(abs(offset) - abs(atmosphere)) < MAX_ATMOSPHERE_ERROR * abs(atmosphere):
+        taken, meant, unit = (
+            ("absolute", "gauge", "bar(g)") if offset * atmosphere < 0 else ("gauge", "absolute", "bar(a)")
+        )
+        return f"{meant} pressures are taken for {taken} ones: write {unit} if they are, in the header or the sidecar"
+    remedy = f"free {axis.offset_parameter}, which takes it" if axis.offset_parameter else "take it off"
+    return f"a sensor's zero is off: {remedy}"
 
 
 def force_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
