@@ -23,7 +23,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 
 USUAL_SIZE = "s32"  # of the catalogue: the middle one
-_CATALOGUE_KIND = "pneumatic"
+_PNEUMATIC = "pneumatic"  # the kind that has a catalogue, and its valve's centre as a parameter
 _SAMPLE_TIMES = (1e-4, 0.02)  # [s]: a controller's; a log with another step was not written by the controller
 _WIDTH = 80  # characters of a line on the screen
 
@@ -69,7 +69,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     check_names("kind", [name], first_kinds(), "init")
     known, source = _read_catalogue(name, parts)
     ask = Asker(sys.stdin.isatty() and sys.stdout.isatty())
-    guess = LogGuess((), (), SAMPLE_TIME) if table is None else guess_log(table, first_channels(name), ask)
+    guess = LogGuess((), (), SAMPLE_TIME) if table is None else _guess_log(table, name, ask)
     columns = {column.channel: column.entry for column in guess.columns}
     least, most = _SAMPLE_TIMES
     sample_time = guess.sample_time if least <= guess.sample_time <= most else SAMPLE_TIME
@@ -108,6 +108,10 @@ def write_files(files: Mapping[Path, str], force: bool) -> None:
         write_text(path, text)
 
 
+def _guess_log(table: Table, kind: str, ask: Asker) -> LogGuess:
+    return guess_log(table, first_channels(kind), ask, has_centre=kind == _PNEUMATIC)
+
+
 def _guess_kind(table: Table) -> str:
     """What drives the load, by the channels that a log's columns may be."""
     channels = {n: unit for kind in first_kinds() for n, unit in first_channels(kind).items()}
@@ -139,7 +143,7 @@ def _place_files(folder: Path, files: Mapping[str, str], log: Path | None) -> di
 def _read_catalogue(kind: str, parts: Mapping[str, str | None]) -> tuple[ParameterSet, tuple[str, ...]]:
     """The catalogue's values, and the lines that say where they come from."""
     asked = {what: name for what, name in parts.items() if name is not None}
-    if kind != _CATALOGUE_KIND:
+    if kind != _PNEUMATIC:
         require(not asked, f"--{next(iter(asked), '')} is of the catalogue of pneumatic drives; leave it out")
         return ParameterSet(), ()
     chosen = {"size": USUAL_SIZE, **asked}
@@ -158,7 +162,8 @@ def _show_files(
         for column in guess.columns:
             unit = f" [{column.unit}]" if column.unit else ", time stamps"
             centre = f", less {column.centre}" if column.centre else ""
-            _say(f"{column.channel}: column {column.column!r}{unit}{centre}", "  ")
+            note = f"; {column.note}" if column.note else ""
+            _say(f"{column.channel}: column {column.column!r}{unit}{centre}{note}", "  ")
         if guess.unused:
             _say(f"not read: {', '.join(guess.unused)}", "  ")
         _say(f"a row every {write_value(guess.sample_time, 's')}", "  ")

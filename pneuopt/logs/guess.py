@@ -41,6 +41,9 @@ LARGEST_SI = {"s": 0.1, "m": 3.0, "m/s": 5.0, "rad": 30.0, "rad/s": 2000.0}
 cylinder is shorter than 3 m and slower than 5 m/s. Smaller ones ask about right logs, larger ones miss millimetres."""
 VACUUM_LIMIT = 0.9e5  # [Pa]: a chamber between supply and surroundings is never below; what is, counts from ambient
 _CENTRES = (3.0, 7.0)  # [V]: a command of 0 to 10 V that rests between these is counted from its centre, 5 V
+_SHOWN_CENTRES = (4.0, 6.0)
+"""[V]: where a command of 0 to 10 V that rests between these is logged as it is, its valve's centre is estimated: wider
+leaves a command to `identify` that it does not take for one about 5 V, narrower rounds a centre to 5 V that is not."""
 _RANGE = (-0.3, 10.5)  # [V] of such a command, with the error of its converter
 
 
@@ -55,12 +58,13 @@ class Question:
 
 @dataclass(frozen=True)
 class ColumnGuess:
-    """A channel's column, its unit, "" where the reader knows it, and what is subtracted from it, "" for nothing."""
+    """A channel's column, its unit, "" where the reader knows it, what is subtracted from it, and what to say of it."""
 
     channel: str
     column: str
     unit: str
     centre: str = ""
+    note: str = ""
 
     @property
     def entry(self) -> str:
@@ -97,7 +101,7 @@ def guess_channels(names: Sequence[str], channels: Mapping[str, str]) -> dict[st
     return {c: [name for _, name in sorted(own, key=lambda pair: pair[0])] for c, own in found.items()}
 
 
-def guess_log(table: Table, channels: Mapping[str, str], ask: Ask) -> LogGuess:
+def guess_log(table: Table, channels: Mapping[str, str], ask: Ask, has_centre: bool = False) -> LogGuess:
     """Guess what a log's columns are.
 
     Parameters
@@ -107,6 +111,8 @@ def guess_log(table: Table, channels: Mapping[str, str], ask: Ask) -> LogGuess:
         Those of the drive, and their SI units.
     ask : callable
         Takes a `Question`, and returns one of its options.
+    has_centre : bool
+        Whether the drive has a parameter for its valve's centre, which is estimated where a log shows one.
 
     Raises
     ------
@@ -122,7 +128,7 @@ def guess_log(table: Table, channels: Mapping[str, str], ask: Ask) -> LogGuess:
     for channel, names in found.items():
         text = f"Which column is the {_plain(channel)}?"
         name = names[0] if len(names) == 1 else ask(Question(channel, text, tuple(names)))
-        guesses += _guess_column(table, channel, name, channels[channel], ask)
+        guesses += _guess_column(table, channel, name, channels[channel], ask, has_centre)
     used = {guess.column for guess in guesses}
     time = f'{table.path}: column {found["time"][0]!r} holds no time that is understood; name one "time [s]"'
     require("time" in {g.channel for g in guesses}, time, LogError)
@@ -149,7 +155,7 @@ def _guess_channel(name: str, channels: Mapping[str, str]) -> tuple[str, int]:
     return "", 0
 
 
-def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask) -> list[ColumnGuess]:
+def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask, has_centre: bool) -> list[ColumnGuess]:
     """A channel's column with unit and centre; nothing where its unit does not measure the channel."""
     values = _read_numbers(table, name)
     if values is None:
@@ -167,6 +173,8 @@ def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask) 
     is_offset = channel == "valve_voltage" and unit == "V" and _RANGE[0] <= low and high <= _RANGE[1] and high > 1
     if not is_offset:
         return [ColumnGuess(channel, name, unit)]
+    if has_centre and _SHOWN_CENTRES[0] < middle < _SHOWN_CENTRES[1]:
+        return [ColumnGuess(channel, name, unit, note="its centre, near 5 V, is estimated by identify")]
     options = ("5 V", "0 V") if _CENTRES[0] < middle < _CENTRES[1] else ("0 V", "5 V")
     centre = options[0]
     if low >= 0 and options[0] == "0 V":

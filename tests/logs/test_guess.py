@@ -113,6 +113,14 @@ def test_a_command_from_0_to_10_v_that_leaves_doubt_is_asked_for(tmp_path: Path)
     assert [c.centre for c in guess(log)[0].columns] == ["", "", ""]
 
 
+def test_a_centre_that_is_estimated_is_not_rounded_to_5_v(tmp_path: Path) -> None:
+    """A valve closed at 5.06 V: 5 V in the sidecar leave 60 mV, which become a smaller valve and dead zone."""
+    log = write(tmp_path / "run.csv", {"t [s]": T, "u [V]": 5.06 + 2 * np.sin(9 * T), "x [mm]": T})
+    found = guess_log(read_table(log, log.read_bytes()), CHANNELS, lambda q: q.options[0], has_centre=True)
+    assert [(c.centre, c.note) for c in found.columns][1] == ("", "its centre, near 5 V, is estimated by identify")
+    assert [c.centre for c in guess(log)[0].columns] == ["", "5 V", ""]
+
+
 def test_what_measures_something_else_is_not_read(tmp_path: Path) -> None:
     log = write(tmp_path / "run.csv", {"t [s]": T, "valve [mA]": 12 + T, "x [mm]": T})
     found, _ = guess(log)
