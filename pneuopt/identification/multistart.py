@@ -9,6 +9,7 @@ leave it there, too; holding it needs no weight for the prior beside that of the
 in the covariance of the others (`Fit.prior_covariance`).
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -19,9 +20,13 @@ from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import solve_least_squares
+from pneuopt.shooting.search import ABANDONED_START
 from pneuopt.shooting.solution import Fit
 
 GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
+# squared residuals a sample after the first stage, in noise variances, beyond which the first start waits for the
+# others: lower settles all starts of a model that misses the log a little, higher follows hopeless ones to the end
+HOPELESS_MISFIT = 3.0
 # relative width of the bounds that hold a guess; equal bounds would compile other equations than those of the search
 GUESS_BOUND_WIDTH = 1e-9
 # squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
@@ -59,8 +64,11 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
     try:
-        for start in starts_by_cost(problem, lambda: _only_needs_confirmation([fit for _, fit, _ in fits])):
-            held, fit = fit_holding_unidentifiable(problem, start)
+        confirms, races = lambda: _only_needs_confirmation(fits), lambda: fits[0][1].status is ABANDONED_START
+        for start in starts_by_cost(problem, confirms, races):
+            may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
+            limit = HOPELESS_MISFIT if may_wait else math.inf
+            held, fit = fit_holding_unidentifiable(problem, start, limit)
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
             if _explains_to_noise(held, fit) and not held.held:
                 return held, fit, start.label
@@ -92,7 +100,9 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
     return status
 
 
-def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = lambda: False) -> Iterator[Start]:
+def starts_by_cost(
+    problem: EstimationProblem, confirms: Callable[[], bool] = lambda: False, races: Callable[[], bool] = lambda: False
+) -> Iterator[Start]:
     """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
 
     Parameters
@@ -102,6 +112,9 @@ def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = la
         Called before each further start: whether the first led to an optimum that only needs confirmation. The next
         start is then taken as it is, for settling all would cost more; the others are settled where it is not called
         enough.
+    races : callable
+        Called before the others settle: whether the first start was left after its first stage. The others then get
+        no more than that, either.
 
     Yields
     ------
@@ -118,13 +131,16 @@ def starts_by_cost(problem: EstimationProblem, confirms: Callable[[], bool] = la
         candidates = candidates[1:]
         yield candidates[0]
     guessed = [c for c in candidates if c.trial_parameters]
-    settled = [_settle_start(problem, c) for c in guessed] if len(guessed) > 1 else []
+    # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
+    stages = GUESS_STAGES if problem.has_gaps and not races() else 1
+    settled = [_settle_start(problem, c, stages) for c in guessed] if len(guessed) > 1 else []
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
     yield from [c for c in candidates[1:] if not settled or not c.trial_parameters]
+    yield from candidates[:1] if races() and not settled else []
 
 
-def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[tuple[float, float], Start]:
-    """What a start reaches with its guesses held, and the start from there.
+def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start]:
+    """What a start reaches in some stages with its guesses held, and the start from there.
 
     A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones.
     """
@@ -132,22 +148,24 @@ def _settle_start(problem: EstimationProblem, candidate: Start) -> tuple[tuple[f
     guesses = {n: candidate.parameters[n] for n in candidate.trial_parameters}
     bounds = {n: (v - GUESS_BOUND_WIDTH * abs(v), v + GUESS_BOUND_WIDTH * abs(v)) for n, v in guesses.items()}
     held = replace(transcription, parameters=transcription.parameters.with_bounds(bounds))
-    # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
-    stages = problem.method.stages[: GUESS_STAGES if problem.has_gaps else 1]
-    fit = solve_least_squares(held, replace(problem.method, stages=stages))
+    fit = solve_least_squares(held, replace(problem.method, stages=problem.method.stages[:stages]))
     if fit.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     start = problem.start_from(fit, f"{candidate.label}, settled")
     return (fit.stats["gap_deviation"], fit.stats["cost"]), replace(start, parameters={**start.parameters, **guesses})
 
 
-def fit_holding_unidentifiable(problem: EstimationProblem, start: Start) -> tuple[EstimationProblem, Fit]:
+def fit_holding_unidentifiable(
+    problem: EstimationProblem, start: Start, max_first_misfit: float = math.inf
+) -> tuple[EstimationProblem, Fit]:
     """Fit from one start; while the data do not determine a parameter, hold that one and fit again.
 
     Parameters
     ----------
     problem : EstimationProblem
     start : Start
+    max_first_misfit : float
+        As of `LeastSquares`, for the first fit.
 
     Returns
     -------
@@ -156,7 +174,8 @@ def fit_holding_unidentifiable(problem: EstimationProblem, start: Start) -> tupl
     fit : Fit
         The first one, where holding does not converge, or would leave no parameter to estimate.
     """
-    first = solve_least_squares(problem.transcription(start), problem.method)
+    method = replace(problem.method, max_first_misfit=max_first_misfit)
+    first = solve_least_squares(problem.transcription(start), method)
     if not first.unidentifiable or first.status.code is Code.INTERRUPTED:
         return problem, first
     for is_given in (True, False) if not first.status.converged else (True,):
@@ -227,13 +246,13 @@ def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
     )
 
 
-def _only_needs_confirmation(fits: Sequence[Fit]) -> bool:
+def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
     """Whether the next start is tried as it is, after fits of which the first is the best.
 
     So is one start where the best fit converged; and each where its gaps stand for noise of the states, for settling
     with wide gaps says little there.
     """
-    best = fits[0]
+    best = fits[0][1]
     return best.status.converged and (len(fits) == 1 or best.jumps is not None)
 
 
@@ -244,7 +263,8 @@ def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
     fits come after those that explain the log without.
     """
     cost = fit.stats["cost"]
-    if fit.status.code is Code.INTERRUPTED and fit.stats["gap_deviation"] > tightest:
+    is_cut = fit.status is ABANDONED_START or fit.status.code is Code.INTERRUPTED
+    if is_cut and fit.stats["gap_deviation"] > tightest:
         return 3, cost
     if fit.jumps is not None:
         return 1, cost

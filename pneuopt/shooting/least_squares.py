@@ -5,6 +5,7 @@ record's length. The gaps are tightened in stages, so that a bad start is never 
 as single shooting does, which fails there (problems/speed/benchmark_identification.py).
 """
 
+import math
 from dataclasses import dataclass, field
 
 from pneuopt.quantities.status import ProgressCallback
@@ -55,6 +56,9 @@ class LeastSquares:
         Receives one line of text an iteration.
     budget : CpuBudget, optional
         Ends the search as Ctrl-C does, before the iteration that comes next.
+    max_first_misfit : float
+        Squared residuals a sample after the first stage, in noise variances, beyond which the search ends there, for a
+        caller who has other starts to try.
     """
 
     stages: tuple[Stage, ...] = (
@@ -71,6 +75,7 @@ class LeastSquares:
     kinematic: float = 0.01
     progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
     budget: CpuBudget | None = field(default=None, repr=False, compare=False)
+    max_first_misfit: float = math.inf
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:

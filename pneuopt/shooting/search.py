@@ -37,6 +37,7 @@ MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewe
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
 GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
+ABANDONED_START = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
 # relative change of a parameter [1] after which the stiffness is computed anew: higher risks unstable steps
 STIFFNESS_UPDATE_CHANGE = 0.03
 # error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
@@ -120,8 +121,11 @@ class Search:
                 return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
             self.has_stalled = self._finish_stage(stage.iterations)
             self.stage_ends.append(_StageEnd(self.current.nodes, self.current.z, self.current.cost))
-            if stage is self.method.stages[0] and (found := self._jump_to_last_stage()):
-                return self._refine_steps(found)
+            if stage is self.method.stages[0]:
+                if 2 * self.current.cost > self.method.max_first_misfit * self.current.equations.count:
+                    return ABANDONED_START
+                if found := self._jump_to_last_stage():
+                    return self._refine_steps(found)
         status = self._convergence_status(self.current)
         # gaps that absorb the misfit of the model: the answer depends on their weight
         gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
@@ -340,7 +344,7 @@ class Search:
         if math.isfinite(equations.cost):
             covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
             prior = equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
-            names = self._doubtful_parameters()
+            names = names if status is ABANDONED_START else self._doubtful_parameters()
         if covariance is not None:
             gaps = self.stage.gap * self.gap_scales
             optimum = Optimum(equations, run, current.nodes, q, keep, gaps, self.substeps)

@@ -22,6 +22,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.search import ABANDONED_START
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
@@ -79,7 +80,7 @@ def test_without_guesses_the_candidates_are_tried_as_they_are() -> None:
 
 
 def test_an_interruption_keeps_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(problem: EstimationProblem, _confirms: Callable[[], bool]) -> Iterator[Start]:
+    def interrupted(problem: EstimationProblem, *_: Callable[[], bool]) -> Iterator[Start]:
         wrong = problem.candidates()[0]
         yield Start(wrong.states, {**wrong.parameters, "friction.coulomb": 3.0})
         raise KeyboardInterrupt
@@ -102,7 +103,7 @@ def test_an_interruption_keeps_an_earlier_and_better_start(monkeypatch: pytest.M
         if armed:
             raise KeyboardInterrupt
 
-    def two(problem: EstimationProblem, _confirms: Callable[[], bool]) -> Iterator[Start]:
+    def two(problem: EstimationProblem, *_: Callable[[], bool]) -> Iterator[Start]:
         good = problem.candidates()[0]
         yield good
         armed.append(True)
@@ -183,9 +184,9 @@ def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatc
     """Of a model that misses its log a little two starts agree; settling the others costs six times as much."""
     problem, labels = posed(Stribeck()), list[str]()
 
-    def noted(problem: EstimationProblem, start: Start) -> tuple[EstimationProblem, Fit]:
+    def noted(problem: EstimationProblem, start: Start, most: float) -> tuple[EstimationProblem, Fit]:
         labels.append(start.label)
-        return fit_holding_unidentifiable(problem, start)
+        return fit_holding_unidentifiable(problem, start, most)
 
     monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
     monkeypatch.setattr(starting, "fit_holding_unidentifiable", noted)
@@ -209,3 +210,43 @@ def test_guesses_are_settled_once_where_no_gap_tightens(
     found = list(starting.starts_by_cost(replace(problem, window=window, method=method)))
     assert len(found) > 1
     assert set(run) == {stages}
+
+
+def test_a_first_start_that_is_far_off_waits_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a rig that hunts, the search from the first of six starts went on for a minute; another one had the answer."""
+    problem, stages = posed(Stribeck()), list[int]()
+    good = problem.candidates()
+    far = {"friction.coulomb": 4.0, "friction.static": 4.0, "friction.viscous": 500.0, VELOCITY: 0.5}
+
+    def counted(transcription: Transcription, method: LeastSquares) -> Fit:
+        fit = solve_least_squares(transcription, method)
+        stages.append(1 if fit.status is ABANDONED_START else len(method.stages))
+        return fit
+
+    monkeypatch.setattr(starting, "solve_least_squares", counted)
+    monkeypatch.setattr(EstimationProblem, "candidates", lambda _: [replace(good[0], parameters=far), *good[1:]])
+    monkeypatch.setattr(starting, "HOPELESS_MISFIT", 0.0)
+    _, fit, label = starting.fit_from_starts(problem)
+    assert fit.status.converged
+    right = solve_least_squares(problem.transcription(good[0]), problem.method)
+    assert fit.stats["cost"] == pytest.approx(right.stats["cost"], rel=1e-3)
+    assert label.endswith("settled")
+    assert stages[: len(good) + 1] == [1] * (len(good) + 1)
+    assert len(stages) > len(good) + 1
+
+
+def test_a_lone_start_that_is_far_off_is_searched_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, tried = posed(Stribeck()), list[str]()
+    first = problem.candidates()[0]
+
+    def noted(transcription: Transcription, method: LeastSquares) -> Fit:
+        fit = solve_least_squares(transcription, method)
+        tried.append(fit.status.verdict)
+        return fit
+
+    monkeypatch.setattr(starting, "solve_least_squares", noted)
+    monkeypatch.setattr(EstimationProblem, "candidates", lambda _: [first])
+    monkeypatch.setattr(starting, "HOPELESS_MISFIT", 0.0)
+    _, fit, _ = starting.fit_from_starts(problem)
+    assert fit.status.converged
+    assert tried == [ABANDONED_START.verdict, fit.status.verdict]
