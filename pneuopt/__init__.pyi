@@ -62,6 +62,8 @@ from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
 from .files.drive import read_drive, write_fit
 from .files.tuning import read_tuning, write_tuned
+from .identification.assumptions import Assumption
+from .identification.checkup import Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs
 from .identification.examination import examine_logs
 from .identification.identifiability import identifiability
@@ -71,7 +73,7 @@ from .identification.profiles import Profile, profile
 from .identification.propagation import PropagatedValue, propagate_error
 from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
-from .logs.checks.findings import LogFinding
+from .logs.checks.findings import LogFinding, Severity
 from .logs.experiments import Experiment, differentiate, resample, split
 from .logs.read_log import read_log
 from .models import catalog
@@ -103,6 +105,7 @@ from .plotting import (
     plot_fit,
     plot_friction,
     plot_front,
+    plot_logs,
     plot_loop,
     plot_map,
     plot_prediction,
@@ -134,9 +137,11 @@ __all__ = [
     "PID",
     "Actuator",
     "AirUse",
+    "Assumption",
     "Asymmetric",
     "BandCentre",
     "Certificate",
+    "Checkup",
     "ChosenWidth",
     "ChosenWindow",
     "ClosedLoop",
@@ -218,6 +223,7 @@ __all__ = [
     "SensorLag",
     "SeriesForm",
     "SettlingTime",
+    "Severity",
     "SoftL1",
     "Spool",
     "StandardForm",
@@ -241,6 +247,7 @@ __all__ = [
     "bumpless_transfer",
     "catalog",
     "certificate",
+    "check",
     "coarse_delay",
     "compare_logs",
     "contacts",
@@ -271,6 +278,7 @@ __all__ = [
     "plot_fit",
     "plot_friction",
     "plot_front",
+    "plot_logs",
     "plot_loop",
     "plot_map",
     "plot_prediction",

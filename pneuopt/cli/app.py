@@ -1,4 +1,4 @@
-"""The command line: `pneuopt init | identify | tune | simulate | study | keys | info`.
+"""The command line: `pneuopt init | check | identify | tune | simulate | study | keys | info`.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 130
 interrupted. Each command imports what it needs, so that `--help` waits for no heavy import.
@@ -30,6 +30,13 @@ Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw: .png, .pdf or .svg.")]
 Window = Annotated[
     float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
+]
+Accept = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="CHECK",
+        help="Logs are right: motion, speed, work, command, scale, jumps, stops, mass, pressures; repeatable.",
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
@@ -76,6 +83,27 @@ def init_command(
         raise typer.Exit(run_init(kind, folder, parts, log, force))
 
 
+@app.command("check")
+def check_command(
+    drive: Annotated[
+        Path,
+        typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is to be identified."),
+    ],
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOGS", help="Log files, each with its sidecar .toml if it has one.")
+    ],
+    json: Json = None,
+    plot: Plot = None,
+    accept: Accept = None,
+) -> None:
+    """Show what is read, assumed and wrong before a fit, and what the logs identify; status 1 if a fit refuses them."""
+    with _report_errors():
+        from pneuopt.cli.check import run_check
+        from pneuopt.cli.shared import Outputs
+
+        raise typer.Exit(run_check(drive, _expand_patterns(logs), Outputs(None, json, plot), accept or ()))
+
+
 @app.command("identify")
 def identify_command(
     drive: Annotated[
@@ -88,13 +116,7 @@ def identify_command(
     json: Json = None,
     plot: Plot = None,
     window: Window = None,
-    accept: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="CHECK",
-            help="Logs are right: motion, speed, work, command, scale, jumps, stops, mass, pressures; repeatable.",
-        ),
-    ] = None,
+    accept: Accept = None,
     select: Annotated[
         bool, typer.Option("--select", help="Compare friction models instead, and recommend one.")
     ] = False,

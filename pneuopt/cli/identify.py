@@ -23,8 +23,7 @@ from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show
 from pneuopt.cli.terminal import make_console, progress, show_status
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
-from pneuopt.identification.examination import examine_logs
-from pneuopt.identification.identifiability import identifiability
+from pneuopt.identification.checkup import MODEL_CHECK, check
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.identification.select_model import select_model
@@ -66,14 +65,14 @@ def run_identify(
     budget: float = math.inf,
 ) -> int:
     """Identify from logs; returns the exit status."""
-    outputs.check(_input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS)
+    outputs.check(
+        _input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS, MODEL_CHECK
+    )
     model, parameters = _read_free_drive(drive)
     system = model.system()
     experiments = _read_experiments(logs, system, parameters, accept)
-    with _draw_refusal(outputs):
-        before = identifiability(system, experiments, parameters).sentences
-    found = examine_logs(system, experiments, parameters)
-    for sentence in (*before, *(f"{doubt.log}: {doubt.message}" for doubt in found if not doubt.fault)):
+    found = check(system, experiments, parameters)
+    for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
     with _draw_refusal(outputs), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
@@ -96,7 +95,7 @@ def run_identify(
     if outputs.output is not None:
         writers[outputs.output] = partial(write_fit, outputs.output, drive, result)
     if outputs.plot is not None:
-        writers |= figure_writers(outputs.plot, _fit_figures(system, result, experiments, found))
+        writers |= figure_writers(outputs.plot, _fit_figures(system, result, experiments, found.findings))
     return finish(outputs, writers, tables | stats_and_provenance(result), result.status)
 
 

@@ -15,6 +15,7 @@ import tomlkit
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive_keys import KIND_KEY
 from pneuopt.files.toml import FileLocations, inline_table, read_parameter, read_toml, toml_table, write_parameter
+from pneuopt.identification.assumptions import AMBIENT_PRESSURE
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.models.declaration import Alias, Drive, DriveKind, Sections, Structure
 from pneuopt.models.drive_kinds import DRIVE_KINDS
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 FIT_SECTIONS = ("estimates", "covariance", "agreement", "status", "verdict", "provenance")
 """Sections that a result adds to a drive's file; reading the drive passes over them."""
 
-AMBIENT_PRESSURE = "ambient.pressure"  # the parameter of a drive that its gauge pressures count from
 _KNOWN_SECTIONS = {"drive", *(section for kind in DRIVE_KINDS.values() for section in kind.sections)}
 _DRIVE_SECTION = {"drive": {"kind": KIND_KEY}}
 

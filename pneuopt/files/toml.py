@@ -118,7 +118,7 @@ def read_parameter(entry: Any, default: Parameter, where: str) -> Parameter:
         require(isinstance(fields.get(flag, False), bool), f"{where}: {flag} must be true or false")
     others = {f: fields[f] for f in (*_PARAMETER_FLAGS, "source") if f in fields}
     if "value" in fields:
-        others.setdefault("source", "")
+        others = {"source": "", "stated": True, **others}
     try:
         return replace(default, **numbers, **others)
     except InputError as error:

@@ -92,12 +92,17 @@ def emit_log_warnings(system: Fittable, experiments: Sequence[Experiment], param
 
     The warnings are returned, too.
     """
-    every = system.parameters | parameters
-    known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
-    found = system.log_warnings({e.name: Log(e.trajectory, known[e.name]) for e in experiments})
+    found = find_log_warnings(system, experiments, parameters)
     for sentence in found:
         warnings.warn(sentence, PhysicsWarning, stacklevel=3)
-    return tuple(found)
+    return found
+
+
+def find_log_warnings(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:
+    """What the model finds in logs; see `emit_log_warnings`."""
+    every = system.parameters | parameters
+    known = {e.name: every.with_values(e.conditions).fixed(*e.conditions) for e in experiments}
+    return tuple(system.log_warnings({e.name: Log(e.trajectory, known[e.name]) for e in experiments}))
 
 
 def log_remarks(system: Fittable, given: Sequence[Experiment], checked: Sequence[Experiment]) -> tuple[str, ...]:

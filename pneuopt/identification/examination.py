@@ -56,21 +56,32 @@ def check_content(system: Fittable, experiments: Sequence[Experiment], parameter
     LogError
         With the finding and its evidence.
     """
-    found: dict[str, list[LogFinding]] = {}
-    said: dict[str, str] = {}
-    for finding in _find(system, experiments, parameters):
+    found, said = list(_find(system, experiments, parameters)), dict[str, str]()
+    for finding in found:
         if not finding.fault and finding.check not in QUIET_CHECKS:
             said.setdefault(finding.channel, f"{finding.log}: {finding.message}")
-        elif finding.fault and finding.check in next(e.accept for e in experiments if e.name == finding.log):
+        elif is_accepted(finding, experiments):
             said.setdefault(finding.channel, f"{finding.log}: accepted as right: {finding.message}")
-        elif finding.fault:
-            found.setdefault(finding.channel, []).append(finding)
-    for faults in found.values():
-        name = faults[0].check
-        remedy = f"if the log is right, accept = [{name!r}] in its sidecar, or --accept {name}"
-        if len({fault.log for fault in faults}) > len(experiments) / 2:
-            raise LogError(f"{faults[0].log}: {faults[0].message}; {remedy}", faults[0])
+    for finding in found:
+        if is_refused(finding, found, experiments):
+            raise LogError(f"{finding.log}: {finding.message}; {accept_remedy(finding)}", finding)
     return tuple(said.values())
+
+
+def is_accepted(finding: LogFinding, experiments: Sequence[Experiment]) -> bool:
+    """Whether a fault's log is right by what its user says."""
+    return finding.fault and any(finding.check in e.accept for e in experiments if e.name == finding.log)
+
+
+def is_refused(finding: LogFinding, found: Iterable[LogFinding], experiments: Sequence[Experiment]) -> bool:
+    """Whether a fit refuses the logs for a fault: it is not accepted, and more than half of the logs show it."""
+    alike = {f.log for f in found if f.fault and f.channel == finding.channel and not is_accepted(f, experiments)}
+    return finding.fault and finding.log in alike and 2 * len(alike) > len(experiments)
+
+
+def accept_remedy(finding: LogFinding) -> str:
+    """How a user says that a log is right all the same."""
+    return f"if the log is right, accept = [{finding.check!r}] in its sidecar, or --accept {finding.check}"
 
 
 def _find(system: Fittable, experiments: Iterable[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:

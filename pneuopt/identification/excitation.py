@@ -3,7 +3,9 @@
 Which motion a parameter needs is declared by the model (`System.excitation`).
 """
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +14,9 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
 
+_VALUE_IN_WORDS = re.compile(r"<(?:([\d.]+) )?(\w+)>")
 # share of the largest speed [1] below which a sample counts as standing still: lower takes noise for motion, higher
 # leaves slow motion out
 MOVING_SPEED_SHARE = 0.05
@@ -82,8 +86,36 @@ def remedy(excitation: Excitation, names: Sequence[str]) -> str:
     bases = {_base_name(n) for n in names}
     for run in excitation.runs:
         if bases & run.some and (len(bases) == 1 or bases & run.others):
-            return run.words
+            return _write_values(run.words, ParameterSet())
     return f"fix {'it' if len(bases) == 1 else 'one of them'}, or log a run that moves differently"
+
+
+def with_values_in_words(excitation: Excitation, values: ParameterSet) -> Excitation:
+    """The excitation, with the values in use in the words of its runs.
+
+    Parameters
+    ----------
+    excitation : Excitation
+        In whose words "<stribeck_velocity>" stands for the value of the parameter that ends so, "<5 stribeck_velocity>"
+        for five times it.
+    values : ParameterSet
+    """
+    runs = tuple(replace(run, words=_write_values(run.words, values)) for run in excitation.runs)
+    return replace(excitation, runs=runs)
+
+
+def _write_values(words: str, values: ParameterSet) -> str:
+    """The words with values in place of "<5 stribeck_velocity>"; its name where there is no such parameter."""
+
+    def write(found: re.Match[str]) -> str:
+        name = next((n for n in values if n.rpartition(".")[2] == found[2]), None)
+        factor = float(found[1] or 1)
+        if name is not None:
+            return write_value(factor * values.value(name), values[name].unit, 2)
+        times = "" if factor == 1 else f"{factor:g} times "
+        return f"{times}the {found[2].replace('_', ' ')}"
+
+    return _VALUE_IN_WORDS.sub(write, words)
 
 
 def _base_name(name: str) -> str:

@@ -19,7 +19,7 @@ from pneuopt.dynamics.runnable import HasSystem, check_smooth
 from pneuopt.identification.checks import check_free, check_logs
 from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import check_content
-from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion
+from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion, with_values_in_words
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.profiles import Profile
 from pneuopt.identification.result import Verdict
@@ -212,7 +212,7 @@ def _make_verdict(
     names, (spread, alone, weak) = list(free), _standard_deviations(root)
     values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
     seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
-    rows, reasons, excitation = {}, {}, problem.system.plant.excitation
+    rows, reasons, excitation = {}, {}, with_values_in_words(problem.system.plant.excitation, values)
     for i, (name, p) in enumerate(free.items()):
         if inside_bounds is not None and not inside_bounds[i]:
             rows[name] = [p.value, *[math.nan] * 4, True]

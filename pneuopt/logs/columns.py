@@ -51,7 +51,7 @@ _BRACKETED_UNIT = re.compile(r"(.+?)\s*\[\s*(.*?)\s*\]|(.+?)\s+\((.+)\)")
 
 def read_channels(
     table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str] = CHANNELS
-) -> tuple[dict[str, Array], tuple[str, ...]]:
+) -> "ReadChannels":
     """Read the channels of a log from its columns.
 
     Parameters
@@ -67,52 +67,90 @@ def read_channels(
 
     Returns
     -------
-    values : dict of str to ndarray, each of shape (n,)
-        In SI units, "time" among them, strictly increasing; NaN where a sample is missing.
-    remarks : tuple of str
-        What the table says of itself, and the columns that are not read although their names nearly are channels.
+    ReadChannels
 
     Raises
     ------
     LogError, UnitError, UnknownNameError
         If the log cannot be understood beyond doubt.
     """
+    found, remarks = find_columns(table, entries, where, channels)
+    numbers = table.read([column.name for column in found.values()])
+    _check_finite(table, numbers)
+    values = {channel: c.factor * numbers[c.name] + c.offset for channel, c in found.items()}
+    _check_samples(table, found, values)
+    return ReadChannels(values, found, remarks)
+
+
+class ReadChannels(NamedTuple):
+    """What `read_channels` returns.
+
+    Attributes
+    ----------
+    samples : dict of str to ndarray, each of shape (n,)
+        In SI units, "time" among them, strictly increasing; NaN where a sample is missing.
+    columns : mapping of str to ChannelColumn
+    remarks : tuple of str
+        What the table says of itself, and the columns that are not read although their names nearly are channels.
+    """
+
+    samples: dict[str, Array]
+    columns: Mapping[str, "ChannelColumn"]
+    remarks: tuple[str, ...]
+
+
+def find_columns(
+    table: Table, entries: Mapping[str, Any], where: str, channels: Mapping[str, str]
+) -> tuple[dict[str, "ChannelColumn"], tuple[str, ...]]:
+    """The column of each channel, and what the user may want to know of the others; see `read_channels`."""
     check_names("channel", entries, channels, where)
     found = {
-        name: _resolve_column(table, name, entry, f"{where}.{name}", channels)
+        name: _resolve_column(table, name, entry, f"{where}.{name}", channels, entry_from=where)
         for name, entry in entries.items()
         if entry is not False
     }
     remarks = list(table.remarks)
     found |= _columns_from_names(table, channels, entries, {column.name for column in found.values()}, remarks)
     if "time" not in found and len(table.stamps) == 1:
-        found["time"] = _Column(next(iter(table.stamps)), 1.0, 0.0)
+        found["time"] = ChannelColumn(next(iter(table.stamps)), 1.0, 0.0)
         remarks.append(f"the time stamps of column {found['time'].name!r} are read as the time")
     require("time" in found, f'{table.path}: no time; name a column "time [s]", or say which in a sidecar', LogError)
     require(len(found) > 1, f"{table.path}: no channel but time; known: {', '.join(channels)}", LogError)
-    numbers = table.read([column.name for column in found.values()])
-    _check_finite(table, numbers)
-    values = {channel: c.factor * numbers[c.name] + c.offset for channel, c in found.items()}
-    _check_samples(table, found, values)
-    return values, tuple(remarks)
+    return found, tuple(remarks)
 
 
-class _Column(NamedTuple):
-    """The name of a channel's column, and ``si = factor * raw + offset``."""
+class ChannelColumn(NamedTuple):
+    """The column of a channel, and ``si = factor * raw + offset``.
+
+    Attributes
+    ----------
+    name : str
+        Of the column.
+    factor, offset : float
+    unit : str
+        Of the column; empty for time stamps.
+    unit_from : str
+        What says the unit: the place of the entry, "its name", "the file's units".
+    said_by : str
+        What says that it is this channel: the place of the entry; empty: its name.
+    """
 
     name: str
     factor: float
     offset: float
+    unit: str = ""
+    unit_from: str = ""
+    said_by: str = ""
 
 
 def _columns_from_names(
     table: Table, channels: Mapping[str, str], entries: Mapping[str, Any], used: Collection[str], remarks: list[str]
-) -> dict[str, _Column]:
+) -> dict[str, ChannelColumn]:
     """Columns whose name is a channel and its unit; a name that nearly is a channel is an error.
 
     Beside entries, which name the columns that count, it is a remark.
     """
-    found: dict[str, _Column] = {}
+    found: dict[str, ChannelColumn] = {}
     for name in table.names:
         channel, _ = _split_channel(name, channels)
         if not name or name in used or channel in entries:
@@ -168,7 +206,9 @@ def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> 
         )
 
 
-def _resolve_column(table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str]) -> _Column:
+def _resolve_column(
+    table: Table, channel: str, entry: Any, where: str, channels: Mapping[str, str], *, entry_from: str = ""
+) -> ChannelColumn:
     column = dict(entry) if isinstance(entry, Mapping) else {"column": entry}
     check_names("key", column, COLUMN_KEYS, where)
     require(isinstance(column.get("column"), str), f'{where}: say which column: {{ column = "U valve" }}', LogError)
@@ -179,19 +219,26 @@ def _resolve_column(table: Table, channel: str, entry: Any, where: str, channels
     if name not in table.names:
         raise UnknownNameError("column", column["column"], filter(None, table.names), where)
     if name in table.stamps:
-        return _stamp_column(name, channel, column, where)
-    unit = str(column.get("unit") or unit or table.units.get(name) or _split_channel(name, channels)[1])
+        return _stamp_column(name, channel, column, where)._replace(said_by=entry_from)
+    places = {
+        entry_from: column.get("unit"),
+        "its name": unit if column["column"] == name else "",
+        "its entry": unit,
+        "the file's units": table.units.get(name),
+        "its end": _split_channel(name, channels)[1],
+    }
+    unit_from, unit = next(((place, str(said)) for place, said in places.items() if said), ("", ""))
     require(bool(unit), f'{where}: no unit; write "{bare} [{channels[channel]}]", or unit = "..."', UnitError)
     raw_centre = read_value(column["centre"], unit, where=f"{where}.centre") if "centre" in column else 0.0
     factor, offset = _column_scaling(unit, column.get("scale"), channels[channel], where)
-    return _Column(name, factor, offset - factor * raw_centre)
+    return ChannelColumn(name, factor, offset - factor * raw_centre, unit, unit_from, entry_from)
 
 
-def _stamp_column(name: str, channel: str, entry: Mapping[str, Any], where: str) -> _Column:
+def _stamp_column(name: str, channel: str, entry: Mapping[str, Any], where: str) -> ChannelColumn:
     require(channel == "time", f"{where}: column {name!r} holds time stamps, no numbers; name another", LogError)
     remedy = f"{where}: its time stamps are read in seconds; leave out unit, centre and scale"
     require(entry.keys() == {"column"}, remedy, LogError)
-    return _Column(name, 1.0, 0.0)
+    return ChannelColumn(name, 1.0, 0.0)
 
 
 def _column_scaling(unit: str, scale: str | float | None, target: str, where: str) -> tuple[float, float]:
@@ -236,7 +283,7 @@ def _check_finite(table: Table, numbers: Mapping[str, Array]) -> None:
             )
 
 
-def _check_samples(table: Table, found: Mapping[str, _Column], values: Mapping[str, Array]) -> None:
+def _check_samples(table: Table, found: Mapping[str, ChannelColumn], values: Mapping[str, Array]) -> None:
     t = values["time"]
     require(
         t.size >= MIN_SAMPLES,

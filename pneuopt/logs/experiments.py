@@ -10,6 +10,7 @@ import numpy as np
 from pneuopt.logs.columns import CHANNELS, read_channels
 from pneuopt.logs.frames import frame_table
 from pneuopt.logs.plant_channels import Plant, plant_channels
+from pneuopt.logs.source import LogSource
 from pneuopt.logs.table import Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import check_names, require
@@ -50,6 +51,8 @@ class Experiment:
         from the state before it. `identify` finds them.
     remarks : tuple of str
         What its reader did that the user may want to know, a sentence each: rows that are skipped as metadata, say.
+    source : LogSource, optional
+        Where the channels were read: file, rows, columns and units. Windows and new grids have none.
 
     Raises
     ------
@@ -73,6 +76,7 @@ class Experiment:
     holes: tuple[tuple[int, int], ...] = ()
     accept: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    source: LogSource | None = None
 
     def __post_init__(self) -> None:
         where = self.name or "experiment"
@@ -187,10 +191,13 @@ def experiment_from_table(
         As `read_channels` does.
     """
     own = {} if plant is None else plant_channels(plant)
-    values, remarks = read_channels(table, columns, where, {**CHANNELS, **own})
-    trajectory = Trajectory(values.pop("time"), values)
+    read = read_channels(table, columns, where, {**CHANNELS, **own})
+    trajectory = Trajectory(read.samples["time"], {n: y for n, y in read.samples.items() if n != "time"})
     units = {n: unit for n, unit in own.items() if n in trajectory and CHANNELS.get(n) != unit}
-    return Experiment(trajectory, name=name, units=units, remarks=remarks)
+    used = {column.name for column in read.columns.values()}
+    unread = tuple(n for n in table.names if n and n not in used)
+    source = LogSource(str(table.path), table.first_row, read.columns, unread)
+    return Experiment(trajectory, name=name, units=units, remarks=read.remarks, source=source)
 
 
 def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
@@ -228,7 +235,7 @@ def split(experiment: Experiment, duration: float) -> tuple[Experiment, ...]:
     )
     starts = range(0, len(trajectory) - n + 1, n)
     return tuple(
-        replace(experiment, trajectory=trajectory.rows(i, i + n), name=f"{experiment.name}@{k}")
+        replace(experiment, trajectory=trajectory.rows(i, i + n), name=f"{experiment.name}@{k}", source=None)
         for k, i in enumerate(starts)
     )
 
@@ -260,7 +267,7 @@ def resample(experiment: Experiment, step: float) -> Experiment:
     held = np.searchsorted(old.t, grid + 1e-9 * step, side="right") - 1
     runs = {n: experiment.intersample.get(n) or usual_intersample(n, experiment.unit(n)) for n in old}
     values = {n: np.interp(grid, old.t, old[n]) if runs[n] is Intersample.LINEAR else old[n][held] for n in old}
-    return replace(experiment, trajectory=Trajectory(grid, values))
+    return replace(experiment, trajectory=Trajectory(grid, values), source=None)
 
 
 def differentiate(experiment: Experiment, *, window: float, position: str = "position") -> Experiment:

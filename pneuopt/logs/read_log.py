@@ -69,8 +69,10 @@ def read_log(
     with count_gauge_from(ambient_pressure):
         run = experiment_from_table(read_table(path, raw), entries, where, plant, path.stem)
         conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
+    read = run.source and replace(run.source, sidecar=str(side) if sections else "", sections=tuple(sections))
     return replace(
         run,
+        source=read,
         noise=_read_noise(sections.get("noise", {}), run, f"{side}: noise"),
         conditions=conditions,
         sha256=sha256,

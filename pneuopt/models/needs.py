@@ -87,7 +87,9 @@ VISCOUS_EXCITATION = Excitation(
     {"viscous": Need(lacks_speed_range, FRICTION_LEVELS)},
     (
         SeparatingRun(
-            frozenset({"viscous"}), STRIBECK_CURVE, "log slow speeds, and such beyond five Stribeck velocities"
+            frozenset({"viscous"}),
+            STRIBECK_CURVE,
+            "log speeds below <stribeck_velocity>, and such beyond <5 stribeck_velocity>",
         ),
     ),
 )
@@ -108,7 +110,7 @@ STRIBECK_EXCITATION = COULOMB_EXCITATION | Excitation(
         SeparatingRun(
             frozenset({"stribeck_velocity"}),
             FRICTION_LEVELS,
-            "log speeds below the Stribeck velocity: slow ramps through zero",
+            "log speeds below <stribeck_velocity>: slow ramps through zero",
         ),
     ),
     at_least={"static": "coulomb"},
@@ -117,7 +119,9 @@ BRISTLE_EXCITATION = STRIBECK_EXCITATION | Excitation(
     dict.fromkeys(sorted(BRISTLES), Need(lacks_presliding)),
     (
         SeparatingRun(
-            BRISTLES, BRISTLES | STRIBECK_CURVE, "log presliding: reversals, and a force that swings below break-away"
+            BRISTLES,
+            BRISTLES | STRIBECK_CURVE,
+            "log presliding: reversals, and a force that swings below break-away, <static>",
         ),
     ),
 )

@@ -12,6 +12,7 @@ from pneuopt.plotting.findings import plot_finding
 from pneuopt.plotting.fits import plot_fit, plot_prediction
 from pneuopt.plotting.friction_map import friction_force, has_friction_map, plot_friction
 from pneuopt.plotting.fronts import plot_front
+from pneuopt.plotting.logs import plot_logs
 from pneuopt.plotting.loop_diagram import plot_loop
 from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
@@ -33,6 +34,7 @@ __all__ = [
     "plot_fit",
     "plot_friction",
     "plot_front",
+    "plot_logs",
     "plot_loop",
     "plot_map",
     "plot_prediction",

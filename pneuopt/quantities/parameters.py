@@ -61,6 +61,9 @@ class Parameter:
         Where the number comes from.
     meaning : str
         What the number is, for lists of keys; two parameters that differ in it alone are equal.
+    stated : bool
+        Whether a file or a user has stated the value, be it the default's; two parameters that differ in it alone are
+        equal.
     """
 
     value: float
@@ -72,6 +75,7 @@ class Parameter:
     per_log: bool = False
     source: str = ""
     meaning: str = field(default="", compare=False, repr=False)
+    stated: bool = field(default=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         require(not math.isnan(self.value), f"a parameter's value is NaN [{self.unit}]; give a number")
@@ -163,7 +167,8 @@ class ParameterSet(Mapping[str, Parameter]):
 
         The sources of the old values go with them.
         """
-        return self._with_parameters({n: self._replace_fields(n, value=float(v), source="") for n, v in values.items()})
+        edits = {n: self._replace_fields(n, value=float(v), source="", stated=True) for n, v in values.items()}
+        return self._with_parameters(edits)
 
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> "ParameterSet":
         """Give the named parameters new bounds, by copy."""

@@ -53,7 +53,7 @@ def test_states_stand_in_for_a_speed_that_is_not_logged() -> None:
 
 def test_the_remedy_suits_the_pair() -> None:
     assert "turn the axis round" in remedy(EXCITATION, ["load.force[a]", "friction.coulomb_asymmetry"])
-    assert "five Stribeck velocities" in remedy(EXCITATION, ["friction.coulomb", "friction.viscous"])
+    assert "beyond 5 times the stribeck velocity" in remedy(EXCITATION, ["friction.coulomb", "friction.viscous"])
     assert "slow ramps" in remedy(EXCITATION, ["friction.static", "friction.stribeck_velocity"])
     assert remedy(EXCITATION, ["rig.area"]) == "fix it, or log a run that moves differently"
     assert remedy(EXCITATION, ["rig.area", "rig.area_bias"]).startswith("fix one of them")

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -92,6 +93,24 @@ class Evidence:
     label: str = "they contradict each other"
 
 
+class Severity(StrEnum):
+    """What a finding means for a fit.
+
+    Attributes
+    ----------
+    FAULT
+        A fit refuses the logs.
+    DOUBT
+        A fit takes the logs, and its estimates may be wrong.
+    NOTE
+        It is worth knowing.
+    """
+
+    FAULT = "fault"
+    DOUBT = "doubt"
+    NOTE = "note"
+
+
 @dataclass(frozen=True, eq=False)
 class LogFinding:
     """One thing about a log.
@@ -109,6 +128,10 @@ class LogFinding:
         The log's name.
     evidence : Evidence, optional
         What `plotting.plot_finding` draws.
+    severity : Severity
+        Of all logs together; a log alone knows faults and notes.
+    rows : (int, int), optional
+        First and last row of the log's file that show it; none where the whole log does, or comes from no file.
     """
 
     channel: str
@@ -117,6 +140,8 @@ class LogFinding:
     check: str = ""
     log: str = ""
     evidence: Evidence | None = None
+    severity: Severity = Severity.NOTE
+    rows: tuple[int, int] | None = None
 
 
 def evidence(
