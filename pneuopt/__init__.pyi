@@ -116,6 +116,7 @@ from .plotting import (
 from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from .quantities.intersample import Intersample
 from .quantities.parameters import Parameter, ParameterSet, Quantity
+from .quantities.report import Report
 from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
@@ -214,6 +215,7 @@ __all__ = [
     "Quantity",
     "Racing",
     "Recording",
+    "Report",
     "Rig",
     "Ripple",
     "RiseTime",

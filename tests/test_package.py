@@ -151,6 +151,7 @@ PUBLIC_NAMES = [
     "record",
     "Racing",
     "Recording",
+    "Report",
     "resample",
     "respond",
     "Rig",

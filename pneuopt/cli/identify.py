@@ -19,12 +19,12 @@ from pneuopt.cli.shared import (
     warn_of_status,
     write_csv,
 )
-from pneuopt.cli.show_fits import show_estimates, show_fit, show_selection, show_verdict
-from pneuopt.cli.terminal import make_console, progress, show_status
+from pneuopt.cli.terminal import make_console, progress, show_report
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
 from pneuopt.identification.checkup import MODEL_CHECK, check
 from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.report import report_agreement
 from pneuopt.identification.result import IdentificationResult, Verdict
 from pneuopt.identification.select_model import select_model
 from pneuopt.logs.checks.findings import LogFinding
@@ -79,11 +79,7 @@ def run_identify(
         result = identify(
             system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
         )
-    console = make_console()
-    show_status(console, result.status)
-    show_estimates(console, result.estimates, result.widths)
-    show_verdict(console, result.verdict)
-    show_fit(console, result.fit)
+    show_report(make_console(), result.summary())
     tables = {
         "estimates": records(result.estimates),
         "fit": records(result.fit),
@@ -121,7 +117,7 @@ def run_select(
             window=window,
             method=LeastSquares(progress=report_progress),
         )
-    show_selection(make_console(), chosen)
+    show_report(make_console(), chosen.summary())
     tables = {"recommended": chosen.recommended, "reason": chosen.reason, "candidates": records(chosen.table)}
     return finish(outputs, {}, tables, chosen.fits[chosen.recommended].status)
 
@@ -134,7 +130,7 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs) ->
     experiment = read_log(log, plant=system, ambient_pressure=ambient_pressure(parameters))
     warn_of_status(fit)
     table = validate(system, [experiment], parameters, window=window)
-    show_fit(make_console(), table)
+    show_report(make_console(), report_agreement(table))
     writers: Writers = {}
     if outputs.output is not None or outputs.plot is not None:
         run = predict(system, experiment, parameters, window=window)

@@ -16,11 +16,12 @@ from pneuopt.cli.shared import (
     read_fit_and_tuning,
     warn_of_status,
 )
-from pneuopt.cli.show_loops import metric_units, show_cases, show_front
-from pneuopt.cli.terminal import make_console, progress
+from pneuopt.cli.show_studies import report_cases, report_front
+from pneuopt.cli.terminal import make_console, progress, show_report
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Requirement, Sense
+from pneuopt.evaluation.report import metric_units
 from pneuopt.evaluation.requirements import (
     METRICS,
     SettlingTime,
@@ -40,6 +41,7 @@ from pneuopt.plotting import plot_front, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.units import write_value
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
@@ -84,12 +86,11 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
         with progress("certifying", quiet=quiet) as report_progress:
             table = sweep(certify, parameters, cases, progress=report_progress)
     verdict, status = _grid_verdict(table, len(task.references))
-    make_console().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
     seen = _worst_of_references(table, axes, study.show)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
-    show_cases(make_console(), seen, written, metrics)
-    for case in table["case"][table["breaks"]] if study.tune else ():
-        make_console().print(f"{case}: breaks with its neighbours, also searched from their gains", soft_wrap=True)
+    breaks = table["case"][table["breaks"]] if study.tune else ()
+    flags = tuple(Line(f"{case}: breaks with its neighbours, also searched from their gains") for case in breaks)
+    show_report(make_console(), _lead(verdict, status) + report_cases(seen, written, metrics) + Report(flags))
     writers: Writers = {}
     if outputs.output is not None:
         text = _grid_csv(table, {n: parameters[n].unit for n in written}, task.loop)
@@ -175,8 +176,7 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
         {n: parameters[n].unit for n in front if n in free},
     )
     verdict, status = _front_verdict(front, pair)
-    make_console().print(verdict, style="bold red" if status else "bold green", soft_wrap=True)
-    show_front(make_console(), front, pair, gains)
+    show_report(make_console(), _lead(verdict, status) + report_front(front, pair, gains))
     writers: Writers = {}
     if outputs.output is not None:
         claimed = {f"claimed {n}": unit for n, unit in pair.items()}
@@ -228,6 +228,11 @@ def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str,
     one = " (one is best by both)" if len(front) == 1 and not parts else ""
     what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
     return f"{what}: {', '.join(parts) or 'all certified'}{one}", status
+
+
+def _lead(verdict: str, status: int) -> Report:
+    """The verdict as a report."""
+    return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
 
 
 def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":

@@ -1,24 +1,33 @@
-"""The terminal: a progress line, how a run ended, the files it wrote, and what every table shares."""
+"""The terminal: a progress line, reports in colour, and the files that were written."""
 
-import math
+import os
 import sys
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Column, Table
+from rich.table import Column
 from rich.text import Text
 
-from pneuopt.quantities.status import Code, ProgressCallback, Status
+from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.status import ProgressCallback
+
+_TONE_STYLES = {
+    Tone.PLAIN: "",
+    Tone.HEADING: "bold",
+    Tone.GOOD: "bold green",
+    Tone.DOUBTFUL: "bold yellow",
+    Tone.BAD: "bold red",
+}
 
 
 def make_console(*, error: bool = False) -> Console:
     """Standard output, or standard error; no text is read as markup, because names of columns have brackets."""
-    return Console(file=sys.stderr if error else sys.stdout, markup=False, highlight=False, emoji=False)
+    plain = bool(os.environ.get("NO_COLOR"))  # https://no-color.org; rich alone would still write bold
+    colours: dict[str, Any] = {"color_system": None} if plain else {}
+    return Console(file=sys.stderr if error else sys.stdout, markup=False, highlight=False, emoji=False, **colours)
 
 
 @contextmanager
@@ -46,28 +55,15 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
         yield lambda text: bar.update(task, description=text)
 
 
-def show_status(console: Console, status: Status) -> None:
-    """How a computation ended: the verdict in bold, then its details, a line each."""
-    verdict, *details = str(status).splitlines()
-    colour = "yellow" if status.code in (Code.MISFIT, Code.PARTIAL) else "green" if status.converged else "red"
-    show_sentence(console, verdict, style=f"bold {colour}")
-    for detail in details:
-        show_sentence(console, detail.strip(), indent=2)
+def show_report(console: Console, report: Report) -> None:
+    """Print a report as wide as the terminal; in a pipe its sentences in one piece, as a program reads them."""
+    for text, tone in report.lines(console.width, sentences=None if console.is_terminal else 0):
+        console.print(Text(text, style=_TONE_STYLES[tone]), soft_wrap=True)
 
 
-def show_sentence(console: Console, text: str, *, indent: int = 0, style: str = "") -> None:
+def show_sentence(console: Console, text: str, *, indent: int = 0) -> None:
     """A sentence in one piece; on a terminal in lines that end between words, the second one indented by two more."""
-    lines = [" " * indent + text]
-    if console.is_terminal:
-        lines = textwrap.wrap(
-            lines[0],
-            console.width,
-            subsequent_indent=" " * (indent + 2),
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
-    for line in lines:
-        console.print(Text(line, style=style), soft_wrap=True)
+    show_report(console, Report((Line(text, indent=indent),)))
 
 
 def show_output_files(console: Console, paths: Sequence[Any]) -> None:
@@ -81,34 +77,3 @@ def show_pairs(console: Console, pairs: Mapping[str, object]) -> None:
     width = max(len(n) for n in pairs)
     for key, value in pairs.items():
         console.print(f"{key:<{width}}  {value}", soft_wrap=True)
-
-
-def new_table(*columns: str) -> Table:
-    """An empty table; texts stand left, numbers right."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, header_style="bold")
-    for column in columns:
-        text = column in (
-            "parameter",
-            "requirement",
-            "new plants",
-            "relaxed alone",
-            "model",
-            "contains",
-            "log",
-            "channel",
-            "certified",
-            "rejected",
-            "best so far",
-            "unit",
-            "mark",
-            "in log",
-            "",
-        )
-        whole = column in ("certified", "rejected", "best so far", "new plants")
-        table.add_column(column, justify="left" if text else "right", overflow="fold", no_wrap=whole)
-    return table
-
-
-def format_number(value: float, digits: int) -> str:
-    """A number for a table, "-" where there is none."""
-    return "-" if math.isnan(value) else f"{value:.{digits}g}"

@@ -20,19 +20,7 @@ from pneuopt.cli.shared import (
     stats_and_provenance,
     write_csv,
 )
-from pneuopt.cli.show_loops import (
-    show_active,
-    show_dither,
-    show_gains,
-    show_margins,
-    show_metrics,
-    show_notes,
-    show_rejection,
-    show_relaxations,
-    show_validation,
-    show_validation_verdict,
-)
-from pneuopt.cli.terminal import make_console, progress, show_status
+from pneuopt.cli.terminal import make_console, progress, show_report, show_sentence
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop
@@ -42,6 +30,7 @@ from pneuopt.evaluation.dither_verdict import judge_dither
 from pneuopt.evaluation.evaluate import evaluate, respond
 from pneuopt.evaluation.expected_plants import expected_plants
 from pneuopt.evaluation.operating_points import worst_open_loop
+from pneuopt.evaluation.report import metric_limits, relevant_units, report_metrics
 from pneuopt.files.drive import read_covariance, read_drive, read_estimates
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import Tuning, write_tuned
@@ -51,6 +40,7 @@ from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.tuning.report import report_tuning
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.without_dither import tune_without_dither
 
@@ -71,18 +61,12 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     with progress("tuning", quiet=quiet) as report_progress:
         result = _tune_task(task, parameters, fit, rig, report_progress)
     result = replace(result, provenance={**result.provenance, **file_hashes(*inputs)})
-    console, shown = make_console(), dict[str, Any]()
-    show_status(console, result.status)
-    if result.status.converged:
-        shown = _show_design(console, task, parameters, result, quiet)
-    else:
-        word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
-        show_rejection(console, tuning, result.stats, parameters, word)
-        limits, beside = task.specification.limits, ("on rig", result.on_rig)
-        show_metrics(console, result.certified, task.loop, title=word, beside=beside, limits=limits)
-        show_relaxations(console, result.relaxations)
+    console = make_console()
+    was = _initial_metrics(task, parameters) if result.status.converged and result.on_rig is None else None
+    show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
+    shown = _design_tables(result) | _compare_dither(console, task, parameters, result, quiet)
     if result.status.code is Code.INTERRUPTED:
-        console.print("no file is written")
+        show_sentence(console, "no file is written")
         return EXIT_INTERRUPTED
     writers: Writers = {}
     if outputs.output is not None:
@@ -130,7 +114,8 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
         envelope=task.specification.envelope,
         max_steps=task.max_steps,
     )
-    show_metrics(make_console(), metrics, task.loop, limits=task.specification.limits)
+    limits = metric_limits(task.specification.limits)
+    show_report(make_console(), report_metrics(metrics, relevant_units(task.loop), limits=limits))
     writers: Writers = {}
     if outputs.output is not None:
         runs = [_as_logged(r, task.centre) for r in _simulate_responses(task, parameters)]
@@ -144,37 +129,26 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     return finish(outputs, writers, tables, None)
 
 
-def _show_design(
+def _design_tables(result: TuningResult) -> dict[str, Any]:
+    """The tables of a design's certificate and of the plants that it was tried on."""
+    if not result.status.converged:
+        return {}
+    notes = {} if result.certificate is None else {"notes": list(result.certificate.notes)}
+    return notes | ({} if result.validation is None else {"validation": records(result.validation.figures)})
+
+
+def _compare_dither(
     console: "Console", task: Tuning, before: ParameterSet, result: TuningResult, quiet: bool
 ) -> dict[str, Any]:
-    """Show a certified design: on how many plants it holds, gains, metrics, margins, plants, the dither's verdict.
-
-    Returns
-    -------
-    dict of str to object
-        The tables of the plants and of the dither.
-    """
-    tables: dict[str, Any] = {}
-    if result.validation is not None:
-        show_validation_verdict(console, result.validation)
-    show_gains(console, before, result.parameters)
-    on_rig = result.on_rig is not None
-    beside = ("on rig", result.on_rig) if on_rig else ("was", _initial_metrics(task, before))
-    show_metrics(console, result.certified, task.loop, beside=beside, limits=task.specification.limits)
-    show_active(console, result.requirements, result.active, result.parameters)
-    if result.certificate is not None:
-        show_margins(console, result.certificate.margins)
-        show_notes(console, result.certificate.notes)
-        tables["notes"] = list(result.certificate.notes)
-    if result.validation is not None:
-        show_validation(console, result.validation, task.loop)
-        tables["validation"] = records(result.validation.summary)
+    """Show whether a certified design's dither is worth its price; returns the table of that."""
+    if not result.status.converged:
+        return {}
     if task.loop.dither_period(result.parameters) is not None:
         rival = tune_rival(console, task, before, quiet)
-        tables |= _show_dither_verdict(console, task, result.parameters, rival)
-    elif "dither.amplitude" in result.parameters.free_names:
-        console.print("the dither's amplitude is 0: the tuning found no use for it")
-    return tables
+        return _show_dither_verdict(console, task, result.parameters, rival)
+    if DITHER_AMPLITUDE in result.parameters.free_names:
+        show_sentence(console, "the dither's amplitude is 0: the tuning found no use for it")
+    return {}
 
 
 def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet: bool) -> ParameterSet | None:
@@ -201,7 +175,7 @@ def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet
         if rival.status.converged:
             return rival.parameters
         refused = rival.status.sentences[0]
-    console.print(f"no gains were certified without dither: {refused}", soft_wrap=True)
+    show_sentence(console, f"no gains were certified without dither: {refused}")
     return None
 
 
@@ -212,9 +186,9 @@ def _show_dither_verdict(
     try:
         verdict = judge_dither(task.loop, task.references, parameters, without=rival, band=task.specification.band)
     except ConvergenceError as error:
-        console.print(f"no verdict on the dither: {error}", soft_wrap=True)
+        show_sentence(console, f"no verdict on the dither: {error}")
         return {}
-    show_dither(console, verdict)
+    show_report(console, verdict.summary())
     gains = None if rival is None else {n: rival.value(n) for n in rival.free_names}
     return {"dither": {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": gains}}
 

@@ -26,8 +26,8 @@ each margin to machine precision. That what is shared is right is shown by tests
 python-control.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
@@ -39,17 +39,19 @@ from pneuopt.evaluation.defects import Defect as Defect  # noqa: PLC0414 - who r
 from pneuopt.evaluation.defects import Ending, Finding, correct_metrics, describe_ending, find_defects
 from pneuopt.evaluation.evaluate import CaseEvaluation, evaluate_cases, tabulate_metrics
 from pneuopt.evaluation.metrics import Envelope
+from pneuopt.evaluation.report import relevant_units, report_certificate
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True, eq=False)
-class Certificate:
-    """What `certificate` found.
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Shown):
+    """What `certificate` found; prints its `summary()`.
 
     Attributes
     ----------
@@ -61,12 +63,19 @@ class Certificate:
         What a user should know and what is no defect, a sentence each.
     margins : DataFrame
         A row a case and operating point: "case", "point", the margins' metrics, and "stable".
+    units : mapping of str to str
+        The metrics that a table shows, in that order, with their units; the reference's has the key "".
     """
 
     metrics: "pd.DataFrame"
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
     margins: "pd.DataFrame"
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def summary(self) -> Report:
+        """The defects, or that there is none, then metrics, margins and notes."""
+        return report_certificate(self)
 
 
 def certificate(
@@ -129,7 +138,8 @@ def judge_evaluations(
         counts = describe_counts(found.loop, found.parameters, found.case.reference, band)
         notes += [f"at {ending.case} {counts}"] if counts else []
         metrics[ending.case] = pd.Series(correct_metrics(ending, found.metrics))
-    return Certificate(metrics, tuple(findings), tuple(notes), pd.DataFrame(margins))
+    units = relevant_units(evaluations[0].loop)
+    return Certificate(metrics, tuple(findings), tuple(notes), pd.DataFrame(margins), units)
 
 
 def _find_instability(row: dict[str, Any]) -> Iterator[Finding]:

@@ -6,17 +6,26 @@ from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step, as_steps
-from pneuopt.evaluation.dither_verdict import NO_RIVAL, Usefulness, read_endings, weigh_changes, worst_metrics
+from pneuopt.evaluation.dither_verdict import (
+    NO_RIVAL,
+    VERDICT_TONES,
+    Usefulness,
+    read_endings,
+    weigh_changes,
+    worst_metrics,
+)
+from pneuopt.evaluation.report import report_verdict
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True, eq=False)
-class CompensatorVerdict:
+@dataclass(frozen=True, eq=False, repr=False)
+class CompensatorVerdict(Shown):
     """Verdict of `judge_compensators`: as text, the verdict in the first line and a reason in each further line.
 
     Attributes
@@ -42,6 +51,10 @@ class CompensatorVerdict:
         parts = " and ".join(f"the {name.replace('_', ' ')}" for name in self.names)
         head = f"{parts} {'are' if len(self.names) > 1 else 'is'} {self.usefulness.value}, against {self.baseline}"
         return "\n".join([head, *(f"  {reason}" for reason in self.reasons)])
+
+    def summary(self) -> Report:
+        """The verdict, then a reason a line."""
+        return report_verdict(str(self), VERDICT_TONES[self.usefulness])
 
 
 def judge_compensators(

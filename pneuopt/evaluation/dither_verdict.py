@@ -13,10 +13,12 @@ from pneuopt.dynamics.hooks import Axis
 from pneuopt.evaluation.dither_effect import DitherEffect, dither_effect, explain_effect, format_with_prefix
 from pneuopt.evaluation.dithered_ending import DitheredEnding, read_ending
 from pneuopt.evaluation.evaluate import evaluate_cases
+from pneuopt.evaluation.report import report_verdict
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown, Tone
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,6 +38,14 @@ class Usefulness(Enum):
     HELPS_THESE_GAINS = "useful with these gains"
     USELESS = "useless"
     HARMFUL = "harmful"
+
+
+VERDICT_TONES = {
+    Usefulness.USEFUL: Tone.GOOD,
+    Usefulness.HELPS_THESE_GAINS: Tone.DOUBTFUL,
+    Usefulness.USELESS: Tone.DOUBTFUL,
+    Usefulness.HARMFUL: Tone.BAD,
+}
 
 
 class Criterion(NamedTuple):
@@ -64,8 +74,8 @@ PRICE_METRICS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class DitherVerdict:
+@dataclass(frozen=True, eq=False, repr=False)
+class DitherVerdict(Shown):
     """Verdict of `judge_dither`: as text, the verdict in the first line and a reason in each further line.
 
     Attributes
@@ -95,6 +105,10 @@ class DitherVerdict:
         dither = f"the dither of {self.effect.amplitude:.4g} {self.unit} at {self.effect.frequency:.4g} Hz"
         head = f"{dither} is {self.usefulness.value}, against {self.baseline}"
         return "\n".join([head, *(f"  {reason}" for reason in self.reasons)])
+
+    def summary(self) -> Report:
+        """The verdict, then a reason a line."""
+        return report_verdict(str(self), VERDICT_TONES[self.usefulness])
 
 
 def judge_dither(

@@ -13,10 +13,12 @@ from pneuopt.identification.checks import as_experiments, check_logs
 from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.identify import identify
 from pneuopt.identification.problem import as_estimation_model
+from pneuopt.identification.report import report_comparison
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
@@ -30,9 +32,9 @@ DISAGREEMENT_DEVIATIONS = 4.0
 MIN_RELATIVE_DIFFERENCE = 0.02
 
 
-@dataclass(frozen=True, eq=False)
-class LogComparison:
-    """The estimates of several logs, each fitted alone, and whether they agree.
+@dataclass(frozen=True, eq=False, repr=False)
+class LogComparison(Shown):
+    """The estimates of several logs, each fitted alone, and whether they agree; prints its `summary()`.
 
     Attributes
     ----------
@@ -51,8 +53,9 @@ class LogComparison:
     reason: str
     fits: Mapping[str, IdentificationResult]
 
-    def __repr__(self) -> str:
-        return f"LogComparison {self.reason}\n{self.table.to_string()}"
+    def summary(self) -> Report:
+        """Whether the logs agree, and each log's estimates."""
+        return report_comparison(self)
 
 
 def compare_logs(

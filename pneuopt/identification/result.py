@@ -2,12 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.dynamics.excitation import Excitation
 from pneuopt.identification.excitation import remedy
+from pneuopt.identification.marks import AT_BOUND_NOTE as AT_BOUND_NOTE  # noqa: PLC0414 - beside what bears them
+from pneuopt.identification.marks import UNIDENTIFIABLE_NOTE as UNIDENTIFIABLE_NOTE  # noqa: PLC0414
+from pneuopt.identification.marks import Mark as Mark  # noqa: PLC0414
+from pneuopt.identification.report import report_fit
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown
 from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
@@ -15,32 +19,9 @@ from pneuopt.quantities.units import write_value
 if TYPE_CHECKING:
     import pandas as pd
 
-AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE = "at its bound", "unidentifiable"
 # inflation of a standard deviation [1] from which "nothing separates them" is shown: lower hides useful figures, higher
 # shows rounding
 INFINITE_INFLATION = 1e5
-
-
-class Mark(StrEnum):
-    """How far an estimate and its interval can be trusted.
-
-    Attributes
-    ----------
-    EXACT
-        The residuals look like noise; the interval is that of white residuals.
-    WIDENED
-        The residuals exceed the noise, are correlated, or differ from log to log; the interval counts that.
-    BIAS_POSSIBLE
-        The model misses a part of the motion, or the estimate is at its bound; no interval holds the error of that. Or
-        most of the interval is what a factor of ten in an unidentifiable parameter does, to first order.
-    UNIDENTIFIABLE
-        The logs do not determine the parameter.
-    """
-
-    EXACT = "exact"
-    WIDENED = "widened"
-    BIAS_POSSIBLE = "bias possible"
-    UNIDENTIFIABLE = "unidentifiable"
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +144,9 @@ class ChosenWindow:
         return f"{start}: {why}, and of {tried} these give the narrowest intervals"
 
 
-@dataclass(frozen=True, eq=False)
-class IdentificationResult:
-    """The result of `identify`: estimates, intervals, fitted trajectories and status.
+@dataclass(frozen=True, eq=False, repr=False)
+class IdentificationResult(Shown):
+    """The result of `identify`: estimates, intervals, fitted trajectories and status; printed, it is its `summary()`.
 
     Attributes
     ----------
@@ -210,6 +191,10 @@ class IdentificationResult:
     verdict: Verdict | None = None
     widths: tuple[ChosenWidth, ...] = ()
     window: ChosenWindow | None = None
+
+    def summary(self) -> Report:
+        """How the fit ended, estimates with intervals and marks, what is unidentifiable, agreement with the logs."""
+        return report_fit(self)
 
 
 def _describe_group(group: Sequence[str], inflation: "pd.Series[float]", excitation: Excitation) -> str:

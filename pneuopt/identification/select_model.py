@@ -12,12 +12,14 @@ from pneuopt.identification.candidates import Candidate, fit_candidates
 from pneuopt.identification.checks import as_experiments
 from pneuopt.identification.excitation import remedy
 from pneuopt.identification.identify import validate
+from pneuopt.identification.report import report_selection
 from pneuopt.identification.result import AT_BOUND_NOTE, UNIDENTIFIABLE_NOTE, IdentificationResult
 from pneuopt.identification.statistics import bayes_information, likelihood_ratio_p
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
@@ -34,9 +36,9 @@ TIE = 6.0
 MAX_HELD_OUT_RATIO = 1.02
 
 
-@dataclass(frozen=True, eq=False)
-class ModelSelection:
-    """The fits of several models to the same logs, ranked, and the recommended one.
+@dataclass(frozen=True, eq=False, repr=False)
+class ModelSelection(Shown):
+    """The fits of several models to the same logs, ranked, and the recommended one; prints its `summary()`.
 
     Attributes
     ----------
@@ -58,8 +60,9 @@ class ModelSelection:
     reason: str
     fits: Mapping[str, IdentificationResult]
 
-    def __repr__(self) -> str:
-        return f"ModelSelection {self.reason}\n{self.table.drop(columns='message').to_string()}"
+    def summary(self) -> Report:
+        """The recommendation and its reason, then a row a candidate."""
+        return report_selection(self)
 
 
 def select_model(

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 
+from pneuopt.quantities.report import Line, Report, Tone
+
 ProgressCallback = Callable[[str], None]
 
 
@@ -66,3 +68,11 @@ class Status:
     def __str__(self) -> str:
         lead = self.code.value if self.converged else f"NOT converged ({self.code.value})"
         return "\n  ".join((f"{lead}: {self.sentences[0]}", *self.sentences[1:])) if self.sentences else lead
+
+
+def report_status(status: Status) -> Report:
+    """How a computation ended: the verdict, which a screen shows in colour, then its details, a line each."""
+    verdict, *details = str(status).splitlines()
+    good = Tone.DOUBTFUL if status.code in (Code.MISFIT, Code.PARTIAL) else Tone.GOOD
+    lead = Line(verdict, good if status.converged else Tone.BAD)
+    return Report((lead, *(Line(detail.strip(), indent=2) for detail in details)))

@@ -1,7 +1,7 @@
 """`TuningResult`: a design, the search's figures beside those of an independent simulation, and what limits cost."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import nan
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +18,10 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.relaxation import describe_relaxations
+from pneuopt.tuning.report import report_tuning
 from pneuopt.tuning.validation import DesignValidation
 
 if TYPE_CHECKING:
@@ -31,9 +33,9 @@ ACTIVE_ROOM = 0.02
 RELAXATION_COLUMNS = ("asked", "needed", "share")
 
 
-@dataclass(frozen=True, eq=False)
-class TuningResult:
-    """The design that `tune` found, with its claim, its certificate and what each requirement comes to.
+@dataclass(frozen=True, eq=False, repr=False)
+class TuningResult(Shown):
+    """The design that `tune` found, its claim, its certificate, what each requirement comes to; prints its `summary()`.
 
     Attributes
     ----------
@@ -73,6 +75,12 @@ class TuningResult:
         On how many plants like the model the design holds, and what would help; `tune` tries what it has certified.
     on_rig : DataFrame, optional
         Metrics on the rig's model, where one was given: a row a metric, a column a reference.
+    given : mapping of str to float
+        The free parameters' values before.
+    units : mapping of str to str
+        The metrics that a table shows, in that order, with their units; the reference's has the key "".
+    limits : mapping of str to float
+        What was asked for, by metric, in the metric's unit.
     """
 
     parameters: ParameterSet
@@ -87,11 +95,13 @@ class TuningResult:
     certificate: Certificate | None = None
     validation: DesignValidation | None = None
     on_rig: "pd.DataFrame | None" = None
+    given: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
 
-    def __repr__(self) -> str:
-        free = self.parameters.select(self.parameters.free_names)
-        tried = f"\n{self.validation.verdict}" if self.validation else ""
-        return f"TuningResult {self.status}{tried}\n{free!r}\n{self.certified.to_string()}"
+    def summary(self) -> Report:
+        """How the tuning ended, gains, certified metrics beside their limits, margins, and how other plants behave."""
+        return report_tuning(self)
 
 
 def requirement_table(

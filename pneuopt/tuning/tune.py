@@ -21,6 +21,7 @@ from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.dither_effect import describe_swing
 from pneuopt.evaluation.expected_plants import ExpectedPlants, expected_plants
+from pneuopt.evaluation.report import metric_limits, relevant_units
 from pneuopt.evaluation.requirements import PeakControl, Requirement, SettlingTime
 from pneuopt.evaluation.rig import Rig
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
@@ -133,7 +134,8 @@ def tune(
     (True, True)
     """
     begun = time.perf_counter()
-    task = prepare_task(loop, references, parameters, specify(minimise, subject_to), scenarios, accept, max_steps)
+    specification = specify(minimise, subject_to)
+    task = prepare_task(loop, references, parameters, specification, scenarios, accept, max_steps)
     if rig is not None:
         check_rig(rig, task)
     _warn_of_swing(task)
@@ -149,6 +151,9 @@ def tune(
         parameters=parameters.with_values(found),
         status=result.status.with_remedies(note),
         stats={**result.stats, "seconds": time.perf_counter() - begun},
+        given={n: parameters.value(n) for n in parameters.free_names},
+        units=relevant_units(loop),
+        limits=metric_limits(specification.limits),
     )
     if result.status.converged and rig is not None:
         search.progress("certifying on the rig's model")

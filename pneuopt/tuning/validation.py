@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.certificate import Defect, certificate
 from pneuopt.evaluation.expected_plants import ExpectedPlants, PlantAxis
 from pneuopt.evaluation.metric import Requirement
+from pneuopt.evaluation.report import metric_units
 from pneuopt.evaluation.requirements import METRICS, larger_is_better, metric_name, user_limit
 from pneuopt.evaluation.scenarios import Scenarios, apply_scenario
 from pneuopt.evaluation.specification import Objective, Specification, specify
@@ -22,25 +23,27 @@ from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report, Shown
 from pneuopt.tuning.advice import LANE_DEFECTS, NO_REST, advise, find_breaks
+from pneuopt.tuning.report import report_validation, report_validation_verdict
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import Space
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Percentile of the plants that the summary shows [%]. A lower one says little of bad plants; near 100 a few plants
+# Percentile of the plants that the figures show [%]. A lower one says little of bad plants; near 100 a few plants
 # decide it, as they decide the worst.
 SUMMARY_PERCENTILE = 95.0
 
 
-@dataclass(frozen=True, eq=False)
-class DesignValidation:
-    """A design on new plants.
+@dataclass(frozen=True, eq=False, repr=False)
+class DesignValidation(Shown):
+    """A design on new plants; prints its `summary()`.
 
     Attributes
     ----------
-    summary : DataFrame
+    figures : DataFrame
         A row a requirement, in the units of `TuningResult.certified`: "median", "p95" (95 of 100 plants do better) and
         "worst" by the compiled simulation; "worst_plant", and "certified", that plant's figure by the independent
         simulation; "limit", NaN without; "violations", the number of plants that break it, or that never settle. A
@@ -58,15 +61,18 @@ class DesignValidation:
         What would help, a sentence each; computed from these plants.
     suggested : tuple of PlantAxis
         What of it to tune over.
+    units : mapping of str to str
+        The metrics' units.
     """
 
-    summary: "pd.DataFrame"
+    figures: "pd.DataFrame"
     plants: "pd.DataFrame"
     certified: "pd.DataFrame"
     broken: Mapping[str, tuple[str, ...]]
     varied: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     suggested: tuple[PlantAxis, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -92,9 +98,9 @@ class DesignValidation:
         words = [w for found in self.broken.values() for w in found]
         return {w: words.count(w) for w in sorted(set(words), key=lambda w: (-words.count(w), w))}
 
-    def __repr__(self) -> str:
-        lines = (f"DesignValidation {self.verdict}", *(f"  {s}" for s in (*self.varied, *self.advice)))
-        return "\n".join((*lines, self.summary.to_string()))
+    def summary(self) -> Report:
+        """On how many plants the design holds, the figures on them, and what would help."""
+        return report_validation_verdict(self) + report_validation(self)
 
 
 def validate_design(
@@ -144,7 +150,7 @@ def validate_design(
     >>> found = validate_design(
     ...     loop, Step(1.0), design, minimise=SettlingTime(), subject_to=[Overshoot(0.01)], scenarios=plants
     ... )
-    >>> int(found.summary.loc["Overshoot", "violations"]), found.held
+    >>> int(found.figures.loc["Overshoot", "violations"]), found.held
     (0, 50)
     """
     expected = scenarios if isinstance(scenarios, ExpectedPlants) else ExpectedPlants(scenarios, ())
@@ -173,13 +179,14 @@ def validate_design(
     axes = {a: by_case[[c for c in by_case if str(c).endswith(tuple(ends))]] for a, ends in sides.items()}
     advice, suggested = advise(loop, spec, values.T, broken, certified, axes)
     return DesignValidation(
-        _summary(values.loc[shown], worst, certified, spec),
+        _figures(values.loc[shown], worst, certified, spec),
         values.loc[shown].T,
         certified.loc[shown],
         broken,
         expected.sentences,
         advice,
         suggested,
+        metric_units(loop),
     )
 
 
@@ -264,10 +271,10 @@ def _rank_order(values: Array, metric: str) -> NDArray[np.intp]:
     return np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
 
 
-def _summary(
+def _figures(
     values: "pd.DataFrame", worst: Mapping[str, str], certified: "pd.DataFrame", spec: Specification
 ) -> "pd.DataFrame":
-    """The table `DesignValidation.summary`."""
+    """The table `DesignValidation.figures`."""
     import pandas as pd
 
     limits = {metric_name(q): _metric_limit(q) for q in spec.limits}

@@ -195,7 +195,7 @@ def _on_scenarios(name: str, found: "pd.DataFrame", limits: Mapping[Any, str]) -
 
 def _on_fresh(name: str, found: po.DesignValidation, least: str) -> list[Claim]:
     claims = []
-    for metric, row in found.summary.iterrows():
+    for metric, row in found.figures.iterrows():
         label, unit = ROWS[str(metric)]
         kept = len(found.plants) - int(row["violations"])
         claims.append(Claim(f"{name}.fresh.{label}.kept", kept, "1", None, least))

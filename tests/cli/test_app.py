@@ -1,5 +1,4 @@
 import json
-import math
 import os
 import subprocess
 import sys
@@ -14,8 +13,6 @@ from typer.testing import CliRunner, Result
 from pneuopt.cli import identify as identify_module
 from pneuopt.cli import tune as tune_module
 from pneuopt.cli.app import app
-from pneuopt.cli.show_fits import show_estimates, show_fit
-from pneuopt.cli.terminal import make_console
 from pneuopt.files.drive import read_drive, read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.files.tuning import read_tuning
@@ -104,54 +101,6 @@ def test_an_unidentifiable_parameter_is_named_before_and_after_the_fit(folder: P
     said = json.loads(Path("fit.json").read_text(encoding="utf-8"))
     assert said["verdict"]["sentences"]
     assert "friction.viscous" in result.stdout
-
-
-def test_open_ends_and_what_is_unidentifiable_are_no_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    none = math.nan
-    rows = {
-        "a.open": (2.0, none, 1.5, math.inf, none, none, "widened", ""),
-        "b.blind": (7.0, none, -math.inf, math.inf, none, none, "unidentifiable", "unidentifiable"),
-        "c.missed": (7.0, none, none, none, 6.0, 9.0, "bias possible", ""),
-        "d.pressed": (7.0, none, none, none, none, none, "bias possible", "at its bound"),
-    }
-    columns = ["value", "stderr", "ci_low", "ci_high", "range_low", "range_high", "mark", "note"]
-    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns).assign(unit="N")
-    show_estimates(make_console(), table)
-    shown = [line.split() for line in capsys.readouterr().out.splitlines()[-5:-1]]
-    assert shown == [
-        ["a.open", "2", "above", "1.5", "N", "widened"],
-        ["b.blind", "-", "not", "determined", "N", "unidentifiable"],
-        ["c.missed", "7", "range", "6.00", "to", "9.00", "N", "bias", "possible"],
-        ["d.pressed", "7", "not", "determined", "N", "at", "its", "bound"],
-    ]
-
-
-def test_marks_fit_a_terminal_of_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
-    row = [0.020014, 2.8e-5, 0.019958, 0.02007, math.nan, math.nan, "bias possible", "", "m/s"]
-    columns = ["value", "stderr", "ci_low", "ci_high", "range_low", "range_high", "mark", "note", "unit"]
-    show_estimates(make_console(), pd.DataFrame([row], index=["friction.stribeck_velocity"], columns=columns))
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
-    assert sum("bias possible" in line and "0.019958 to 0.020070" in line for line in lines) == 1
-
-
-def test_many_logs_are_shown_in_short(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [
-        {
-            "log": f"run@{k}",
-            "channel": "position",
-            "nrmse": 1e-3 * k,
-            "free_run_nrmse": 2e-3 * k,
-            "rmse": 1e-6,
-            "unit": "m",
-        }
-        for k in range(13)
-    ]
-    show_fit(make_console(), pd.DataFrame(rows).set_index(["log", "channel"]))
-    out = capsys.readouterr().out
-    assert "median" in out
-    assert out.count("@") == 1
-    assert [word for word in out.splitlines()[-2].split() if word in {"0.6", "1.2", "2.4"}] == ["0.6", "1.2", "2.4"]
 
 
 def test_windows_are_fitted_and_predicted_with_free_runs_beside(folder: Path) -> None:

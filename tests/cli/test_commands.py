@@ -211,7 +211,7 @@ def test_a_study_of_nothing_but_failures_is_shown_and_drawn(folder: Path) -> Non
 
 
 def test_many_cases_are_shown_by_the_worst(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pneuopt.cli.show_loops.MAX_CASE_ROWS", 2)
+    monkeypatch.setattr("pneuopt.cli.show_studies.MAX_CASE_ROWS", 2)
     result = run("study study.toml -o cases.csv")
     assert "the 2 worst of 4 cases by SettlingTime; -o FILE writes all" in result.stdout
     settling = pd.read_csv("cases.csv")[["SettlingTime[0 to 0.2] [s]", "SettlingTime[0 to -0.1] [s]"]].max(axis=1)

@@ -7,17 +7,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from pneuopt.cli.show_loops import (
-    metric_units,
-    show_active,
-    show_dither,
-    show_gains,
-    show_margins,
-    show_metrics,
-    show_validation,
-    show_validation_verdict,
-)
-from pneuopt.cli.terminal import make_console, show_sentence
+from pneuopt.cli.terminal import show_sentence
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -25,6 +15,7 @@ from pneuopt.control.reference import Step
 from pneuopt.evaluation.dither_effect import DitherEffect
 from pneuopt.evaluation.dither_verdict import DitherVerdict, Usefulness
 from pneuopt.evaluation.expected_plants import expected_plants
+from pneuopt.evaluation.report import metric_limits, metric_units, relevant_units, report_margins, report_metrics
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     MaxComplementarySensitivity,
@@ -36,12 +27,13 @@ from pneuopt.evaluation.requirements import (
     StepEnvelope,
 )
 from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.tuning.report import report_active, report_gains
 from pneuopt.tuning.validation import validate_design
 
 
 def test_metrics_stand_beside_what_is_allowed() -> None:
     """As the user wrote it: percent, and margins from below; the longest name in one piece on 80 columns."""
-    loop, out = ClosedLoop(FirstOrder().system(), PID()), io.StringIO()
+    loop = ClosedLoop(FirstOrder().system(), PID())
     figures = {"Overshoot": 3.2, "StepEnvelope": 0.9, "MaxComplementarySensitivity": 1.1, "PhaseMargin": 61.5}
     table = pd.DataFrame({"0 to 0.05": figures, "0 to 0.25": figures})
     limits: list[Requirement] = [
@@ -50,12 +42,13 @@ def test_metrics_stand_beside_what_is_allowed() -> None:
         PhaseMargin(60.0),
         MaxComplementarySensitivity(),
     ]
-    show_metrics(Console(file=out, width=80), table, loop, limits=limits)
-    rows = [line.split() for line in out.getvalue().splitlines()]
+    out = report_metrics(table, relevant_units(loop), limits=metric_limits(limits)).to_text(80)
+    rows = [line.split() for line in out.splitlines()]
     assert ["Overshoot", "3.2", "3.2", "<=", "5", "%"] in rows
     assert ["StepEnvelope", "0.9", "0.9", "<=", "1"] in rows
     assert ["PhaseMargin", "61.5", "61.5", ">=", "60", "deg"] in rows
     assert ["MaxComplementarySensitivity", "1.1", "1.1"] in rows
+    assert max(map(len, out.splitlines())) <= 80
 
 
 def test_every_kind_of_requirement_is_shown() -> None:
@@ -77,27 +70,23 @@ def test_every_kind_of_requirement_is_shown() -> None:
 )
 def test_gains_are_shown_in_another_form_too(form: Form, values: dict[str, float], said: str) -> None:
     given = ClosedLoop(FirstOrder().system(), PID(form=form)).parameters.with_values(values)
-    out = io.StringIO()
-    show_gains(Console(file=out, width=80), given, given)
-    assert said in out.getvalue()
+    assert said in report_gains({}, given).to_text(80)
 
 
-def test_a_dithers_verdict_is_shown_with_its_reasons(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dithers_verdict_is_shown_with_its_reasons() -> None:
     table = pd.DataFrame({"without": {"Ripple": 0.0}, "with": {"Ripple": 1e-3}})
     effect = DitherEffect(0.001, 159.0)
     verdict = DitherVerdict(Usefulness.USELESS, ("nothing changes", "price: air"), table, effect, "the same gains", "V")
-    show_dither(make_console(), verdict)
-    lines = capsys.readouterr().out.splitlines()
+    lines = verdict.summary().to_text(80).splitlines()
     assert lines[0] == "the dither of 0.001 V at 159 Hz is useless, against the same gains"
     assert [line.strip() for line in lines[1:]] == ["nothing changes", "price: air"]
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.01])
-def test_a_limit_cycle_is_shown_where_there_is_one(amplitude: float, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_limit_cycle_is_shown_where_there_is_one(amplitude: float) -> None:
     rows = {"SettlingTime": 0.1, "LimitCycleAmplitude": amplitude, "LimitCycleFrequency": 2.0, "AirUse": 1.5}
     loop = ClosedLoop(FirstOrder().system(), PID())
-    show_metrics(make_console(), pd.DataFrame({"0 to 1": rows}), loop)
-    out = capsys.readouterr().out
+    out = report_metrics(pd.DataFrame({"0 to 1": rows}), relevant_units(loop)).to_text(80)
     assert ("LimitCycleFrequency" in out) == (amplitude > 0)
     assert "l(ANR)" in out
 
@@ -113,8 +102,8 @@ def test_figures_before_stand_in_columns_of_their_own_on_80_columns() -> None:
     now = {"SettlingTime": 0.08874, "Overshoot": 3.1e-6, "MaxSensitivity": 1.077, "PeakControl": 149.6}
     then = {"SettlingTime": math.nan, "Overshoot": 23.734, "MaxSensitivity": 1.0374, "PeakControl": 68.84}
     frames = [pd.DataFrame({"0 to 0.05": row, "0 to 0.25": row}) for row in (now, then)]
-    limits = [PeakControl(150.0)]
-    text = screen(lambda c: show_metrics(c, frames[0], loop, beside=("was", frames[1]), limits=limits))
+    beside, limits = ("was", frames[1]), metric_limits([PeakControl(150.0)])
+    text = report_metrics(frames[0], relevant_units(loop), beside=beside, limits=limits).to_text(80)
     rows = [line.split() for line in text.splitlines()]
     assert max(map(len, text.splitlines())) <= 80
     assert ["SettlingTime", "0.08874", "never", "0.08874", "never", "s"] in rows
@@ -126,21 +115,21 @@ def test_what_holds_a_design_back_is_one_sentence() -> None:
     table = pd.DataFrame({"room": [0.0171, 0.5], "active": [True, False]}, index=["Overshoot", "PeakControl"])
     loop = ClosedLoop(FirstOrder().system(), PID())
     tuned = loop.parameters.with_values({"pid.Kp": 9.0}).with_bounds({"pid.Kp": (1.0, 9.0)}).freed("pid.Kp")
-    text = screen(lambda c: show_active(c, table, ("Overshoot", "pid.Kp"), tuned))
-    assert text == "held back by: Overshoot (1.7 % of room left), pid.Kp (at its bound)\n"
+    text = report_active(table, ("Overshoot", "pid.Kp"), tuned).to_text(80)
+    assert text == "held back by: Overshoot (1.7 % of room left), pid.Kp (at its bound)"
 
 
 def test_margins_name_their_operating_point() -> None:
     rows = [("0 to 1", "at rest", 1.2, 65.0), ("0 to 1", "sliding", 3.5, 17.0), ("0 to 2", "sliding", 3.1, 19.0)]
     table = pd.DataFrame(rows, columns=["case", "point", "MaxSensitivity", "PhaseMargin"])
-    text = screen(lambda c: show_margins(c, table))
-    assert text == "MaxSensitivity, the worst of all cases: 1.2 at rest, 3.5 sliding; phase margin at least 17 deg\n"
+    text = report_margins(table).to_text(120)
+    assert text == "MaxSensitivity, the worst of all cases: 1.2 at rest, 3.5 sliding; phase margin at least 17 deg"
 
 
 def test_a_derivative_that_does_nothing_has_no_riddle_of_a_time() -> None:
     gains = {"pid.Kp": 793.4, "pid.Ki": 28950.0, "pid.Kd": 1e-6, "pid.Tf": 0.05}
     given = ClosedLoop(FirstOrder().system(), PID()).parameters.with_values(gains)
-    text = screen(lambda c: show_gains(c, given, given))
+    text = report_gains({}, given).to_text(120)
     assert "next to no derivative (Kd/Tf is 2.5e-06 % of Kp)" in text
     assert "Td" not in text
 
@@ -161,9 +150,8 @@ def test_the_plants_are_told_verdict_first_and_what_would_help() -> None:
     design = design.with_bounds({"pid.Kp": (0.1, 50.0)}).freed("pid.Kp")
     asked, step = SettlingTime(max=0.79), Step(1.0, horizon=2.0)
     found = validate_design(loop, step, design, minimise=asked, scenarios=expected_plants(design))
-    verdict = screen(lambda c: show_validation_verdict(c, found))
-    assert verdict == f"holds on {found.held} of 100 plants: SettlingTime breaks on {100 - found.held}\n"
-    text = screen(lambda c: show_validation(c, found, loop))
+    assert repr(found).startswith(f"holds on {found.held} of 100 plants: SettlingTime breaks on {100 - found.held}\n")
+    text = "\n".join(line for line, _ in found.summary().lines(None))
     assert "assumed tolerances: plant.gain +-5 %\n" in text
     assert "these gains hold on 100 of 100\n" in text
     assert 'add to the tuning\'s file: [scenarios.corners] "plant.gain" = "5 %"' in text

@@ -1,6 +1,5 @@
 """Every metric that a requirement may limit, through one mill: a new one is a row of `ROWS` here."""
 
-import io
 import re
 from functools import cache
 from pathlib import Path
@@ -9,15 +8,14 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 import pytest
-from rich.console import Console
 
-from pneuopt.cli.show_loops import metric_units, show_metrics
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import AtMost, Metric, Requirement, Sense, Source
 from pneuopt.evaluation.metrics import BandCentre, batch_metrics
+from pneuopt.evaluation.report import metric_units, relevant_units, report_metrics
 from pneuopt.evaluation.requirements import METRICS, REQUIREMENT_KINDS, StepEnvelope, user_limit
 from pneuopt.evaluation.step_record import StepRecord
 from pneuopt.files.tuning import read_tuning
@@ -185,7 +183,6 @@ def test_the_certificate_has_it_and_the_screen_shows_it_with_its_unit(kind: type
     assert name in certified().index
     if kind.metric.unit == "{measured}":  # ripple is on the screen with a dither only
         return
-    console = Console(file=io.StringIO(), width=200)
-    show_metrics(console, certified(), AXIS)
-    line = next(line for line in str(console.file.getvalue()).splitlines() if line.split()[:1] == [name])  # type: ignore[attr-defined]
+    text = report_metrics(certified(), relevant_units(AXIS)).to_text(200)
+    line = next(line for line in text.splitlines() if line.split()[:1] == [name])
     assert line.rstrip(" │|").endswith(metric_units(AXIS)[name])

@@ -47,7 +47,7 @@ def test_the_figures_are_those_of_the_plants() -> None:
     times = {n: math.log(50) / (5 * v["plant.gain"]) for n, v in plants.items()}
     limit = 0.9
     found = validate_design(loop, STEPS, design, minimise=SettlingTime(max=limit), scenarios=plants)
-    row, ordered = found.summary.loc["SettlingTime"], sorted(times.values())
+    row, ordered = found.figures.loc["SettlingTime"], sorted(times.values())
     assert row["worst"] == pytest.approx(ordered[-1], rel=1e-3)
     assert row["certified"] == pytest.approx(ordered[-1], rel=1e-3)
     assert row["p95"] == pytest.approx(ordered[94], rel=1e-3)
@@ -61,7 +61,7 @@ def test_what_never_settles_is_the_worst_and_counted_without_a_limit() -> None:
     loop, design = integrator(1.0)
     slow = {f"plant {k}": {"plant.gain": gain} for k, gain in enumerate((8.0, 1.0, 6.0))}
     found = validate_design(loop, STEPS, design, minimise=SettlingTime(), scenarios=slow)
-    row = found.summary.loc["SettlingTime"]
+    row = found.figures.loc["SettlingTime"]
     assert row["worst_plant"] == "plant 1"
     assert row[["worst", "certified"]].isna().all()
     assert row["violations"] == 1
@@ -81,13 +81,13 @@ def test_the_smallest_margin_is_the_worst() -> None:
         subject_to=[PhaseMargin(40.0), Overshoot(0.9)],
         scenarios=plants,
     )
-    row = found.summary.loc["PhaseMargin"]
+    row = found.figures.loc["PhaseMargin"]
     assert row["worst"] == found.plants["PhaseMargin"].min()
     assert row["worst_plant"] == "high"
     assert row["limit"] == pytest.approx(40.0)
     assert row["certified"] == pytest.approx(row["worst"], abs=0.5)
-    assert found.summary.loc["Overshoot", "limit"] == pytest.approx(90.0)
-    assert list(found.summary.index) == ["SettlingTime", "Overshoot", "PhaseMargin"]
+    assert found.figures.loc["Overshoot", "limit"] == pytest.approx(90.0)
+    assert list(found.figures.index) == ["SettlingTime", "Overshoot", "PhaseMargin"]
 
 
 def test_gains_off_by_a_tolerance_are_new_plants_too() -> None:
