@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.dynamics.compiled.compiler import compile_library
+from pneuopt.dynamics.compiled.vm import bind_function
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
 
@@ -26,14 +27,10 @@ def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
     callable
         ``f(*inputs) -> tuple of ndarray``: vectors flat, matrices of shape (rows, columns). Not thread-safe.
     """
-    function = _with_dense_outputs(function, "system_function")
-    shapes = [function.size_out(i) for i in range(function.n_out())]
-    code = _MachineCode.of(function)
-    if code is None:
-        return lambda *inputs: tuple(map(_reshape, map(np.array, function.call(list(inputs))), shapes))
+    code = _BoundCode.of(_with_dense_outputs(function, "system_function"))
     buffers, results, call, pointers = code.buffers, code.results, code.call, code.pointers
 
-    def call_machine_code(*inputs: ArrayLike) -> tuple[Array, ...]:
+    def call_function(*inputs: ArrayLike) -> tuple[Array, ...]:
         for i, (buffer, value) in enumerate(zip(buffers, inputs, strict=True)):
             size = value.size if isinstance(value, np.ndarray) else 1 if isinstance(value, float) else np.size(value)
             if size != buffer.size:
@@ -42,8 +39,8 @@ def compile_function(function: ca.Function) -> Callable[..., tuple[Array, ...]]:
         call(*pointers)
         return tuple([result.copy() for result in results])
 
-    call_machine_code.keep_alive = code  # type: ignore[attr-defined]
-    return call_machine_code
+    call_function.keep_alive = code  # type: ignore[attr-defined]
+    return call_function
 
 
 def compile_rate(ode: ca.Function) -> Callable[[float, Array, Array, Array], Array]:
@@ -59,24 +56,21 @@ def compile_rate(ode: ca.Function) -> Callable[[float, Array, Array, Array], Arr
     callable
         ``f(t, x, u, p) -> xdot`` on arrays of these lengths, which are not checked. Not thread-safe.
     """
-    function = _with_dense_outputs(ode, "system_function")
-    code = _MachineCode.of(function, wanted=1)
-    if code is None:
-        return lambda t, x, u, p: np.array(function.call([t, x, u, p])[0]).ravel()
+    code = _BoundCode.of(_with_dense_outputs(ode, "system_function"), wanted=1)
     (at, states, inputs, parameters), (rate,), call, pointers = code.buffers, code.results, code.call, code.pointers
 
-    def call_machine_code(t: float, x: Array, u: Array, p: Array) -> Array:
+    def call_rate(t: float, x: Array, u: Array, p: Array) -> Array:
         at[0], states[:], inputs[:], parameters[:] = t, x, u, p
         call(*pointers)
         return rate.copy()
 
-    call_machine_code.keep_alive = code  # type: ignore[attr-defined]
-    return call_machine_code
+    call_rate.keep_alive = code  # type: ignore[attr-defined]
+    return call_rate
 
 
 @dataclass(frozen=True, eq=False)
-class _MachineCode:
-    """A Function's machine code with the memory that it reads and writes."""
+class _BoundCode:
+    """A Function's code with the memory that it reads and writes: machine code, or the VM's where there is none."""
 
     call: Callable[..., object]
     pointers: tuple[object, ...]
@@ -85,13 +79,13 @@ class _MachineCode:
     keep_alive: tuple[object, ...]
 
     @classmethod
-    def of(cls, function: ca.Function, wanted: int | None = None) -> "_MachineCode | None":
-        """Of a Function of which only the first `wanted` results are kept; None where there is no compiler."""
-        library = compile_library(_casadi_source(function))
-        if library is None:
-            return None
+    def of(cls, function: ca.Function, wanted: int | None = None) -> "_BoundCode":
+        """Of a Function of which only the first `wanted` results are kept."""
         buffers = [_buffer(function.size_in(i)) for i in range(function.n_in())]
         results = [_buffer(function.size_out(i)) for i in range(function.n_out())][:wanted]
+        library = compile_library(_casadi_source(function))
+        if library is None:
+            return cls(bind_function(function, buffers, results), (), buffers, results, ())
         work = np.zeros(max(1, function.sz_w()))
         arg = (ctypes.c_void_p * max(1, function.sz_arg()))(*(b.ctypes.data for b in buffers))
         res = (ctypes.c_void_p * max(1, function.sz_res()))(*(r.ctypes.data for r in results))
@@ -116,8 +110,3 @@ def _with_dense_outputs(function: ca.Function, name: str) -> ca.Function:
 def _buffer(shape: tuple[int, int]) -> Array:
     """Vectors flat, matrices in CasADi's column order."""
     return np.zeros(shape[0] * shape[1]) if 1 in shape else np.zeros(shape, order="F")
-
-
-def _reshape(array: Array, shape: tuple[int, int]) -> Array:
-    rows, columns = shape
-    return array.ravel(order="F") if 1 in (rows, columns) else array.reshape(rows, columns, order="F")

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from pneuopt.dynamics.compiled.compiler import compile_library
 from pneuopt.dynamics.compiled.pieces import prepare_rollout
+from pneuopt.dynamics.compiled.vm import run_in_vm
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 
@@ -223,13 +224,19 @@ class Rollout:
 
     def _run(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
         if self._library is None:
-            return self._run_vm(x0, u, p, t, h, substeps, states)
+            return self._run_vm((x0, u, p, t, h), substeps, states)
         (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
         y, x_end = np.empty((m, n, ny)), np.empty((m, nx))
         dy, dx_end = (np.empty((m, n, ns, ny)), np.empty((m, ns, nx))) if ns else (None, None)
         x = np.empty((m, -(-n // states), nx)) if states else None
         self._call_library((x0, u, p, t, h), substeps, states, (None, None, y, dy, x, x_end, dx_end, None, None))
         return RolloutResult(y, x_end, x, _swap_last_axes(dy), _swap_last_axes(dx_end))
+
+    def _run_vm(self, given: tuple[Array, Array, Array, Array, Array], substeps: int, states: int) -> RolloutResult:
+        run = run_in_vm(self._functions, given, self._starts, substeps, states, self._threads)
+        if not self.n_columns:
+            return RolloutResult(run.y, run.x_end, run.x)
+        return RolloutResult(run.y, run.x_end, run.x, _swap_last_axes(run.dy), _swap_last_axes(run.dx_end))
 
     def _gram_native(self, given: tuple[Array, ...], measured: Array, weight: Array, substeps: int) -> Gram:
         m, nx, ns = len(given[0]), self.n_states, self.n_columns
@@ -242,9 +249,8 @@ class Rollout:
         parts = []
         for i in range(0, len(measured), VM_BATCH):
             x0, u, p, t, h, y, w = (a if a.ndim == 1 else a[i : i + VM_BATCH] for a in (*given, measured, weight))
-            run = self._run_vm(x0, u, p, t, h, substeps, 0)
-            dy = np.empty((*y.shape, 0)) if run.dy is None else run.dy
-            dx_end = np.empty((*run.x_end.shape, 0)) if run.dx_end is None else run.dx_end
+            run = run_in_vm(self._functions, (x0, u, p, t, h), self._starts, substeps, 0, self._threads)
+            dy, dx_end = (np.swapaxes(a, -1, -2) for a in (run.dy, run.dx_end))
             e = np.concatenate([dy, (run.y - y)[..., None]], axis=-1) * w[..., None]
             e = np.where(np.isfinite(y)[..., None], e, 0.0)
             flat = e.reshape(len(y), -1, e.shape[-1])
@@ -305,33 +311,6 @@ class Rollout:
             wait(running)
             raise
 
-    def _run_vm(self, x0: Array, u: Array, p: Array, t: Array, h: Array, substeps: int, states: int) -> RolloutResult:
-        (m, n), ny, nx, ns = t.shape, self.n_outputs, self.n_states, self.n_columns
-        update, step, output = (f and f.map(m) for f in map(self._functions.get, ("update", "step", "output")))
-        assert step is not None
-        assert output is not None
-        numbers = ca.DM(np.broadcast_to(p, (m, self.n_parameters)).T)
-        x, S = ca.DM(x0.T), ca.DM(np.tile(np.eye(nx, ns) if self._starts else np.zeros((nx, ns)), (1, m)))
-        xs, ys, dys = [], [], []
-        for j in range(n):
-            tj, hj, uj = (ca.DM(np.atleast_2d(a)) for a in (t[:, j], h[:, j] / substeps, u[:, j].T))
-            if states and j % states == 0:
-                xs.append(x)
-            if update is not None:
-                x, S = update(tj, x, uj, numbers, S)
-            y, dy = output(tj, x, uj, numbers, S)
-            ys.append(y)
-            dys.append(dy)
-            for k in range(substeps):
-                x, S = step(tj + k * hj, hj, x, uj, numbers, S)
-        run_y = np.stack([np.array(a).T for a in ys], axis=1) if ny else np.empty((m, n, 0))
-        run_x = np.stack([np.array(a).T for a in xs], axis=1) if states else None
-        x_end = np.array(x).T.copy()
-        if not ns:
-            return RolloutResult(run_y, x_end, run_x)
-        run_dy = np.stack([_unstack(a, ny, m, ns) for a in dys], axis=1)
-        return RolloutResult(run_y, x_end, run_x, run_dy, _unstack(S, nx, m, ns))
-
 
 def _call_part(function: Callable[..., None], call: tuple[object, ...], kept: tuple[Any, ...]) -> None:  # noqa: ARG001
     """Run a thread's part; it holds what they point to, which Ctrl-C in the main thread must not free."""
@@ -349,15 +328,8 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="pneuopt")
 
 
-if hasattr(
-    os, "register_at_fork"
-):  # a forked child has the pool's locks, but none of its threads: it would wait for ever
+if hasattr(os, "register_at_fork"):  # a forked child has the pool's locks, but no threads: it would wait for ever
     os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-def _unstack(block: ca.DM, rows: int, m: int, columns: int) -> Array:
-    """(rows, m * columns) as CasADi's map stacks it -> (m, rows, columns)."""
-    return np.ascontiguousarray(np.array(block).reshape(rows, m, columns).transpose(1, 0, 2))
 
 
 def _swap_last_axes(array: Array | None) -> Array | None:

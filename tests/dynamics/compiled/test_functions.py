@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pneuopt.dynamics.compiled import compiler
 from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
 from pneuopt.dynamics.system import parameter_vector
 from pneuopt.models.drive import ForceDrive
@@ -15,7 +14,6 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import ModelError
 
 Forget = Callable[[], None]
-needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
 
 
 def mixed() -> ca.Function:
@@ -62,7 +60,11 @@ def test_a_rate_is_the_first_result_of_a_right_hand_side(
     assert_array_equal(first[0], 0.3)  # the caller's own
 
 
-@needs_compiler
-def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers() -> None:
+@pytest.mark.parametrize("cc", [None, ""])
+def test_a_wrong_size_is_refused_rather_than_padded_with_old_numbers(
+    cc: str | None, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    if cc is not None:
+        monkeypatch.setenv("PNEUOPT_CC", cc)
     with pytest.raises(ModelError, match="argument 2 has 2 numbers, expected 3"):
         compile_function(mixed())(1.0, np.ones((2, 3)), np.ones(2))

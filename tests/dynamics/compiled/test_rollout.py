@@ -3,7 +3,9 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -11,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pneuopt.control.dither import Dither
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.dynamics.compiled import compiler
+from pneuopt.dynamics.compiled import compiler, vm
 from pneuopt.dynamics.compiled import rollout as codegen
 from pneuopt.dynamics.compiled.rollout import MAX_SUBSTEPS, Pieces, Rollout
 from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
@@ -210,6 +212,41 @@ def test_threads_change_nothing(threads: int) -> None:
     one, many = (case.run(case.rollout((1,), start=True, threads=k)) for k in (1, threads))
     for field in ("y", "x_end", "dy", "dx_end"):
         assert_array_equal(getattr(one, field), getattr(many, field))
+
+
+def test_the_vm_runs_without_casadi_s_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A call of a Function by matrices takes fifty times as long as a small model's arithmetic."""
+    case = Case("sampled loop")
+    rollout = Rollout(case.system.pieces, (0,), start=True, lanes=0)
+    usual = case.run(rollout)
+
+    def refuse(*_: object) -> None:
+        pytest.fail("a Function was called by matrices")
+
+    monkeypatch.setattr(ca.Function, "call", refuse)
+    monkeypatch.setattr(ca.Function, "__call__", refuse)
+    again = case.run(rollout)
+    assert_array_equal(again.x_end, usual.x_end)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_threads_of_the_vm_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    case, found = Case(name, m=7), []
+    monkeypatch.setattr(vm, "OPERATIONS_A_THREAD", 10)
+    original, maps = ca.Function.map, list[tuple[object, ...]]()
+
+    def count(function: ca.Function, *given: Any) -> Any:
+        maps.append(given)
+        return original(function, *given)
+
+    monkeypatch.setattr(ca.Function, "map", count)
+    for threads in (1, 3):
+        rollout = Rollout(case.system.pieces, (0,), start=True, threads=threads, lanes=0)
+        found.append(case.run(rollout))
+    assert (7,) in maps
+    assert (7, "thread", 3) in maps
+    for field in ("y", "x_end", "x", "dy", "dx_end"):
+        assert_array_equal(getattr(found[0], field), getattr(found[1], field))
 
 
 @pytest.mark.parametrize("cc", [None, ""])
