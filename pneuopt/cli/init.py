@@ -60,7 +60,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
     log : Path, optional
         Whose sidecar is filled.
     force : bool
-        Whether old files may be replaced.
+        Whether old files may be replaced; without it those that stand beside another log's sidecar are kept.
     """
     table = None if log is None else read_table(log, read_bytes(log))
     kind = kind if table is None or kind is not None else _guess_kind(table)
@@ -82,8 +82,12 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         source=source,
         doubts=ask.assumed,
     )
-    write_files(_place_files(folder, files, log), force)
-    _show_files(folder, files, guess, ask.assumed, log)
+    placed = _place_files(folder, files, log)
+    kept = (
+        [] if log is None or force else [path for path in placed if path != log.with_suffix(".toml") and path.exists()]
+    )
+    write_files({path: text for path, text in placed.items() if path not in kept}, force)
+    _show_files(folder, [name for name in files if folder / name not in kept], guess, ask.assumed, log)
     return EXIT_SUCCESS
 
 
@@ -153,11 +157,12 @@ def _read_catalogue(kind: str, parts: Mapping[str, str | None]) -> tuple[Paramet
 
 
 def _show_files(
-    folder: Path, files: Mapping[str, str], guess: LogGuess, assumed: Sequence[str], log: Path | None
+    folder: Path, written: Sequence[str], guess: LogGuess, assumed: Sequence[str], log: Path | None
 ) -> None:
     """Say what was written, what was assumed, and what comes next."""
-    names = [name for name in files if name.endswith(".toml")]
-    _say(f"wrote {', '.join(names)} and schemas/" + ("" if folder == Path() else f" in {folder}"))
+    names = [name for name in written if name.endswith(".toml")]
+    schemas = " and schemas/" if len(names) < len(written) else ""
+    _say(f"wrote {', '.join(names)}{schemas}" + ("" if folder == Path() else f" in {folder}"))
     if log is not None:
         for column in guess.columns:
             unit = f" [{column.unit}]" if column.unit else ", time stamps"

@@ -313,6 +313,19 @@ def test_a_log_fills_its_sidecar_and_says_what_was_assumed(tmp_path: Path) -> No
     assert (tmp_path / place[1]).resolve() == (tmp_path / "files/schemas/sidecar.json").resolve()
 
 
+def test_a_second_log_gets_its_sidecar_beside_files_that_were_edited(tmp_path: Path) -> None:
+    logs = [write_foreign_log(tmp_path / f"run_{k}.csv") for k in (1, 2)]
+    assert run("init", "--from", str(logs[0]), "-o", str(tmp_path))[0] == 0
+    (tmp_path / "drive.toml").write_text("# mine\n", encoding="utf-8")
+    code, output = run("init", "--from", str(logs[1]), "-o", str(tmp_path))
+    assert code == 0, output
+    assert "wrote run_2.toml in" in output
+    assert (tmp_path / "drive.toml").read_text("utf-8") == "# mine\n"
+    (tmp_path / "run_2.toml").write_text("# mine\n", encoding="utf-8")
+    code, output = run("init", "--from", str(logs[1]), "-o", str(tmp_path))
+    assert (code, "run_2.toml: is there already" in output) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("columns", "kind"),
     [("t_ms;Kraft [N];x ist", "force"), ("t_ms;M [N*m]", "rotary"), ("t_ms;U Ventil;v [m/s]", "linear")],
