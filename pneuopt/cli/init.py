@@ -79,6 +79,7 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         columns,
         log=log.name if log else "log.csv",
         sample_time=sample_time,
+        counts_from_zero=any(column.centre_is_estimated for column in guess.columns),
         source=source,
         doubts=ask.assumed,
     )
@@ -167,7 +168,7 @@ def _show_files(
         for column in guess.columns:
             unit = f" [{column.unit}]" if column.unit else ", time stamps"
             centre = f", less {column.centre}" if column.centre else ""
-            note = f"; {column.note}" if column.note else ""
+            note = "; its centre, near 5 V, is estimated by identify" if column.centre_is_estimated else ""
             _say(f"{column.channel}: column {column.column!r}{unit}{centre}{note}", "  ")
         if guess.unused:
             _say(f"not read: {', '.join(guess.unused)}", "  ")
@@ -176,6 +177,7 @@ def _show_files(
         _say(f"assumed, check it in [columns] of {sidecar_name(log.name) if log else ''}: {doubt}")
     _say("Next: put what you know into drive.toml, then")
     place = "LOG" if log is None else str(log)
+    typer.echo(f"  pneuopt check drive.toml {place}")
     typer.echo(f"  pneuopt identify drive.toml {place} -o fit.toml")
     typer.echo("  pneuopt tune fit.toml tuning.toml -o tuned.toml")
     typer.echo("What a key means: pneuopt keys KEY")

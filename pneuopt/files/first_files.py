@@ -46,6 +46,7 @@ def first_files(
     *,
     log: str = "log.csv",
     sample_time: float = SAMPLE_TIME,
+    counts_from_zero: bool = False,
     source: Sequence[str] = (),
     doubts: Sequence[str] = (),
 ) -> dict[str, str]:
@@ -63,6 +64,8 @@ def first_files(
         The log's file name.
     sample_time : float
         Of the controller [s].
+    counts_from_zero : bool
+        Whether a log shows a command from 0 to twice the usual limit about a centre between, which is then estimated.
     source : sequence of str
         Lines at the drive's top that say where its values come from.
     doubts : sequence of str
@@ -83,7 +86,7 @@ def first_files(
     loop = ClosedLoop(plant, PID(sample_time))
     templates = {
         "drive": _drive_template(kind, first, values, source),
-        "tuning": _tuning_template(loop, first, values),
+        "tuning": _tuning_template(loop, first, values, counts_from_zero),
         "study": _study_template(loop, first, values),
         "rig": _rig_template(loop),
         "sidecar": _sidecar_template(loop, first, values, columns, log, doubts),
@@ -134,20 +137,20 @@ def _with_source(key: Key, parameter: Parameter) -> Key:
     return replace(key, source="catalogue" if parameter.source == CATALOGUE_SOURCE else key.source)
 
 
-def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> Template:
+def _tuning_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet, counts_from_zero: bool) -> Template:
     command, measured = loop.command.unit, loop.feedback.unit
     given = loop.parameters.with_values({f"pid.{n}": value for n, (value, _, _) in first.gains.items()})
     given = given.with_bounds({f"pid.{n}": (low, high) for n, (_, low, high) in first.gains.items()})
-    limit = write_value(first.limit, command)
+    ends = (0.0, 2 * first.limit) if counts_from_zero else (-first.limit, first.limit)
     sample_time = write_value(loop.pid.sample_time or 0.0, "s", _DIGITS)
     stated = {"pid.form": '"parallel"', "pid.sample_time": _quote(sample_time)}
     stated |= {f"pid.{n}": _value_text(given[f"pid.{n}"], free=True, bounds=True) for n in first.gains}
-    stated["pid.limits"] = f'["-{limit}", "{limit}"]'
+    stated["pid.limits"] = "[" + ", ".join(_quote(write_value(end, command)) for end in ends) + "]"
     if first.dither is not None:
         frequency, most = first.dither
         stated |= {"dither.waveform": '"sine"', "dither.frequency": _quote(write_value(frequency, "Hz"))}
-        ends = {"amplitude": 0.0, "offset": -most}
-        free = {n: Parameter(0.0, command, lower, most) for n, lower in ends.items()}
+        least = {"amplitude": 0.0, "offset": -most}
+        free = {n: Parameter(0.0, command, lower, most) for n, lower in least.items()}
         stated |= {f"dither.{n}": _value_text(p, free=True, bounds=True) for n, p in free.items()}
     stated["minimise.settling_time"] = f'{{ band = "{BAND}", weight = 1.0 }}'
     stated |= {"limits.overshoot": _quote(OVERSHOOT), "limits.max_sensitivity": f"{SENSITIVITY:g}"}

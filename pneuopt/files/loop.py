@@ -199,9 +199,11 @@ def _read_limits(entries: Mapping[str, Any], own: ParameterSet, centre: float, w
     )
     low, high = (read_value(end, unit, where=where) for end in ends)
     require(low < high, f"{where}: {ends[0]} is not below {ends[1]}")
-    wire = [write_value(v, unit, 3) for v in (centre, 0.0, 2 * centre)]
-    remedy = f'write what the wire may carry, limits = ["{wire[1]}", "{wire[2]}"] for instance'
-    inside = centre == 0 or low < centre < high
-    require(inside, f"{where}: the valve's centre, {wire[0]}, does not lie between {ends[0]} and {ends[1]}; {remedy}")
+    wire = [write_value(v, unit, 2) for v in (0.0, 2 * centre)]
+    remedy = f'write what the wire may carry, limits = ["{wire[0]}", "{wire[1]}"] for instance'
+    inside, own_centre = centre == 0 or low < centre < high, write_value(centre, unit, 3)
+    require(
+        inside, f"{where}: the valve's centre, {own_centre}, does not lie between {ends[0]} and {ends[1]}; {remedy}"
+    )
     ends = {"pid.lower": low - centre, "pid.upper": high - centre}
     return {name: replace(own[name], value=value) for name, value in ends.items()}

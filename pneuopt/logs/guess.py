@@ -58,13 +58,16 @@ class Question:
 
 @dataclass(frozen=True)
 class ColumnGuess:
-    """A channel's column, its unit, "" where the reader knows it, what is subtracted from it, and what to say of it."""
+    """A channel's column, its unit, "" where the reader knows it, and what is subtracted from it, "" for nothing.
+
+    `centre_is_estimated`: the column is a command of 0 to 10 V, whose centre `identify` finds.
+    """
 
     channel: str
     column: str
     unit: str
     centre: str = ""
-    note: str = ""
+    centre_is_estimated: bool = False
 
     @property
     def entry(self) -> str:
@@ -174,7 +177,7 @@ def _guess_column(table: Table, channel: str, name: str, target: str, ask: Ask, 
     if not is_offset:
         return [ColumnGuess(channel, name, unit)]
     if has_centre and _SHOWN_CENTRES[0] < middle < _SHOWN_CENTRES[1]:
-        return [ColumnGuess(channel, name, unit, note="its centre, near 5 V, is estimated by identify")]
+        return [ColumnGuess(channel, name, unit, centre_is_estimated=True)]
     options = ("5 V", "0 V") if _CENTRES[0] < middle < _CENTRES[1] else ("0 V", "5 V")
     centre = options[0]
     if low >= 0 and options[0] == "0 V":

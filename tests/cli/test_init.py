@@ -313,6 +313,16 @@ def test_a_log_fills_its_sidecar_and_says_what_was_assumed(tmp_path: Path) -> No
     assert (tmp_path / place[1]).resolve() == (tmp_path / "files/schemas/sidecar.json").resolve()
 
 
+def test_a_valve_of_0_to_10_v_gets_the_limits_of_its_wire(tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv")
+    assert run("init", "--from", str(log), "-o", str(tmp_path / "five"))[0] == 0
+    assert 'limits = ["-5 V", "5 V"]' in (tmp_path / "five" / "tuning.toml").read_text("utf-8")
+    log.write_text(log.read_text("utf-8").replace(";6;", ";5.5;").replace(";4;", ";4.6;"), encoding="utf-8")
+    code, output = run("init", "--from", str(log), "-o", str(tmp_path / "wire"), "--force")
+    assert (code, "its centre, near 5 V, is estimated" in " ".join(output.split())) == (0, True)
+    assert 'limits = ["0 V", "10 V"]' in (tmp_path / "wire" / "tuning.toml").read_text("utf-8")
+
+
 def test_a_second_log_gets_its_sidecar_beside_files_that_were_edited(tmp_path: Path) -> None:
     logs = [write_foreign_log(tmp_path / f"run_{k}.csv") for k in (1, 2)]
     assert run("init", "--from", str(logs[0]), "-o", str(tmp_path))[0] == 0

@@ -160,7 +160,8 @@ def test_limits_beside_the_valves_centre_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         read_tuning(path, VALVE_DRIVE.system(), AT_5_06_V)
     said = (
-        "limits: the valve's centre, 5.06 V, does not lie between -5 V and 5 V; write what the wire may carry, limits ="
+        "limits: the valve's centre, 5.06 V, does not lie between -5 V and 5 V; "
+        'write what the wire may carry, limits = ["0 V", "10 V"] for instance'
     )
     assert said in str(error.value)
     assert read_tuning(path, VALVE_DRIVE.system()).parameters.value("pid.lower") == -5

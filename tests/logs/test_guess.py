@@ -117,7 +117,7 @@ def test_a_centre_that_is_estimated_is_not_rounded_to_5_v(tmp_path: Path) -> Non
     """A valve closed at 5.06 V: 5 V in the sidecar leave 60 mV, which become a smaller valve and dead zone."""
     log = write(tmp_path / "run.csv", {"t [s]": T, "u [V]": 5.06 + 2 * np.sin(9 * T), "x [mm]": T})
     found = guess_log(read_table(log, log.read_bytes()), CHANNELS, lambda q: q.options[0], has_centre=True)
-    assert [(c.centre, c.note) for c in found.columns][1] == ("", "its centre, near 5 V, is estimated by identify")
+    assert [(c.centre, c.centre_is_estimated) for c in found.columns] == [("", False), ("", True), ("", False)]
     assert [c.centre for c in guess(log)[0].columns] == ["", "5 V", ""]
 
 
