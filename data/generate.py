@@ -41,6 +41,17 @@ PNEUMATIC_RUNS = {  # (speed [m/s], for [s])
 }
 COMMAND_STEP = 1e-4  # [V], of the log
 
+ATMOSPHERE = 101325.0  # [Pa(a)], from which that rig's pressures count
+OWN_SAMPLE, WIRE = 2e-3, (0.0, 10.0)  # [s], and what the wire of that rig's valve may carry [V]
+OWN_LOOP = {"pid.Kp": 1.5, "pid.Ki": 25.0}
+OWN_RUNS = {  # (speed [m/s], for [s]): strokes of 30 to 90 mm about the middle, some with a stop behind
+    "run_01": (
+        *((0.1, 0.6), (0.0, 0.4), (-0.06, 0.8), (0.25, 0.35), (-0.25, 0.35), (0.0, 0.3), (-0.04, 0.9), (0.12, 0.6)),
+        *((0.0, 0.2), (-0.3, 0.25), (0.06, 0.9), (0.0, 0.3), (-0.1, 0.5), (0.35, 0.25), (-0.15, 0.5), (0.03, 0.8)),
+    ),
+    "run_02": ((0.15, 0.5), (0.0, 0.2), (-0.08, 0.8), (0.3, 0.25), (-0.2, 0.35), (0.05, 0.9), (0.0, 0.3), (-0.1, 0.7)),
+}
+
 
 def truth(rig: str) -> dict[str, Any]:
     """The generating values of a rig [SI], by parameter; and its table [rig], if it has one."""
@@ -55,6 +66,8 @@ def main() -> None:
         write(HERE / "force_rig" / f"{name}.csv", force_run(levels, rng))
     for seed, (name, speeds) in enumerate(PNEUMATIC_RUNS.items(), SEED):
         write(HERE / "pneumatic_rig" / f"{name}.csv", pneumatic_run(speeds, seed))
+    for seed, (name, speeds) in enumerate(OWN_RUNS.items(), SEED):
+        write_foreign(HERE / "own_rig" / f"{name}.csv", own_run(speeds, seed))
 
 
 def step_run(steps: tuple[tuple[float, float], ...], rng: np.random.Generator) -> dict[str, Array]:
@@ -108,6 +121,27 @@ def pneumatic_run(speeds: tuple[tuple[float, float], ...], seed: int) -> dict[st
     return columns | {f"pressure_{side} [bar(a)]": quantised(run[f"pressure_{side}"] * 1e-5, step) for side in "ab"}
 
 
+def own_run(speeds: tuple[tuple[float, float], ...], seed: int) -> dict[str, Array]:
+    """A rig as its owner logs it, under a hand-tuned speed loop: 4 to 8 s at 500 Hz, gauge pressures, 0 to 10 V."""
+    values = truth("own_rig")
+    said, centre = values.pop("rig"), values.pop("valve.centre")
+    drive = po.PneumaticDrive(friction=po.Karnopp(po.Stribeck()))
+    loop = po.ClosedLoop(drive.system(), po.PID(sample_time=OWN_SAMPLE))
+    known = po.catalog.s32()[1]
+    hardware = {n: known.value(n) for n in drive.parameters if n in known}
+    rig = po.Rig(loop, sensors(said), encoder=po.Encoder(filter=said["speed_filter"]))
+    limits = dict(zip(("pid.lower", "pid.upper"), (end - centre for end in WIRE), strict=True))
+    p = loop.parameters.with_values(hardware | values | OWN_LOOP | limits)
+    reference = np.concatenate([np.full(round(seconds / OWN_SAMPLE), speed) for speed, seconds in speeds])
+    t = np.round(np.arange(len(reference)) * OWN_SAMPLE, 6)
+    run = po.record(rig, po.Trajectory(t, {"reference": reference}), p, seed=seed).experiment.trajectory
+    gauge = {side: (run[f"pressure_{side}"] - ATMOSPHERE) * 1e-5 for side in "ab"}
+    columns = {"t [ms]": t * 1e3, "U_valve [V]": quantised(run["valve_voltage"] + centre, said["command_resolution"])}
+    columns |= {"x [mm]": quantised(run["position"] * 1e3, said["position_resolution"] * 1e3)}
+    step = said["pressure_resolution"] * 1e-5
+    return columns | {f"p{side.upper()} [bar]": quantised(gauge[side], step) for side in "ab"}
+
+
 def sensors(said: dict[str, float]) -> dict[str, po.Sensor]:
     """Of the pneumatic rig: an encoder and two pressure sensors."""
     pressure = po.Sensor(said["pressure_lag"], said["pressure_noise"], said["pressure_resolution"])
@@ -118,6 +152,13 @@ def sensors(said: dict[str, float]) -> dict[str, po.Sensor]:
 def quantised(values: Array, step: float) -> Array:
     """Rounded to whole steps of a sensor; ten digits keep the file free of binary noise."""
     return np.round(np.round(values / step) * step, 10)
+
+
+def write_foreign(path: Path, columns: dict[str, Array]) -> None:
+    """As a recorder writes it: a line above the header, semicolons between the columns."""
+    write(path, columns)
+    text = path.read_text(encoding="utf-8").replace(",", ";")
+    path.write_text("Recorder 3, gauge pressures\n" + text, encoding="utf-8", newline="\n")
 
 
 def write(path: Path, columns: dict[str, Array]) -> None:
