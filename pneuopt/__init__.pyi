@@ -116,6 +116,7 @@ from .plotting import (
 from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
 from .quantities.intersample import Intersample
 from .quantities.parameters import Parameter, ParameterSet, Quantity
+from .quantities.progress import Progress
 from .quantities.report import Report
 from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
@@ -210,6 +211,7 @@ __all__ = [
     "Presliding",
     "PressureDependent",
     "Profile",
+    "Progress",
     "PropagatedValue",
     "ProportionalValve",
     "Quantity",

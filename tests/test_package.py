@@ -140,6 +140,7 @@ PUBLIC_NAMES = [
     "Profile",
     "profile",
     "propagate_error",
+    "Progress",
     "PropagatedValue",
     "proportional_band",
     "proportional_gain",

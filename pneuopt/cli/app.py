@@ -177,6 +177,7 @@ def simulate_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
     plot: Plot = None,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate a closed loop, or predict a log."""
     with _report_errors():
@@ -190,7 +191,7 @@ def simulate_command(
         if tuning is not None:
             raise typer.Exit(run_simulate(fit, tuning, outputs))
         if log is not None:
-            raise typer.Exit(run_predict(fit, log, window, outputs))
+            raise typer.Exit(run_predict(fit, log, window, outputs, quiet))
 
 
 @app.command("study")

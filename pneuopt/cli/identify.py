@@ -122,18 +122,20 @@ def run_select(
     return finish(outputs, {}, tables, chosen.fits[chosen.recommended].status)
 
 
-def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs) -> int:
+def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, quiet: bool = False) -> int:
     """Predict a log in open loop, in windows if asked for; returns the exit status."""
     outputs.check([fit, log, log.with_suffix(".toml")])
     model, parameters = read_drive(fit)
     system = model.system()
     experiment = read_log(log, plant=system, ambient_pressure=ambient_pressure(parameters))
     warn_of_status(fit)
-    table = validate(system, [experiment], parameters, window=window)
+    with progress("predicting", quiet=quiet) as report_progress:
+        table = validate(system, [experiment], parameters, window=window, progress=report_progress)
     show_report(make_console(), report_agreement(table))
     writers: Writers = {}
     if outputs.output is not None or outputs.plot is not None:
-        run = predict(system, experiment, parameters, window=window)
+        with progress("simulating", quiet=quiet) as report_progress:
+            run = predict(system, experiment, parameters, window=window, progress=report_progress)
         if outputs.plot is not None:
             writers |= figure_writers(outputs.plot, {"": plot_prediction([run], [experiment], label="predicted")})
         if outputs.output is not None:

@@ -2,8 +2,10 @@
 
 import os
 import sys
+import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich.console import Console
@@ -14,6 +16,8 @@ from rich.text import Text
 from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.status import ProgressCallback
 
+SECONDS_A_LINE = 5.0
+"""Time between two lines of progress [s] where there is no terminal: less fills a record, more looks like a hang."""
 _TONE_STYLES = {
     Tone.PLAIN: "",
     Tone.HEADING: "bold",
@@ -32,13 +36,14 @@ def make_console(*, error: bool = False) -> Console:
 
 @contextmanager
 def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
-    """Show the latest report and the time in one line; nothing if quiet, or where standard error is no terminal.
+    """Show the latest report and the time: in one line of a terminal, elsewhere in a line every few seconds.
 
     Parameters
     ----------
     label : str
         Shown until there is a report.
     quiet : bool
+        Show nothing.
 
     Yields
     ------
@@ -46,13 +51,37 @@ def progress(label: str, *, quiet: bool) -> Iterator[ProgressCallback]:
         Takes a line of text.
     """
     console = make_console(error=True)
-    silent = quiet or not console.is_terminal
-    clock = TimeElapsedColumn(table_column=Column(min_width=7))
-    news = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
-    columns = SpinnerColumn(), clock, news
-    with Progress(*columns, console=console, transient=True, disable=silent) as bar:
-        task = bar.add_task(label, total=None)
-        yield lambda text: bar.update(task, description=text)
+    if quiet:
+        yield lambda _: None
+    elif not console.is_terminal or console.is_dumb_terminal or console.color_system is None:
+        with _print_lines(label) as report:
+            yield report
+    else:
+        clock = TimeElapsedColumn(table_column=Column(min_width=7))
+        news = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
+        with Progress(SpinnerColumn(), clock, news, console=console, transient=True) as bar:
+            task = bar.add_task(label, total=None)
+            yield lambda text: bar.update(task, description=text)
+
+
+@contextmanager
+def _print_lines(label: str) -> Iterator[ProgressCallback]:
+    """Print the latest report on standard error every `SECONDS_A_LINE`, by a thread: a step may take longer."""
+    begun, ended, latest, stream = time.monotonic(), threading.Event(), [""], sys.stderr
+
+    def print_latest() -> None:
+        while not ended.wait(SECONDS_A_LINE):
+            news = f": {latest[0]}" if latest[0] else ""
+            with suppress(OSError, ValueError):  # whoever read it has closed the pipe; the work goes on
+                print(f"{label}, {time.monotonic() - begun:.0f} s{news}", file=stream, flush=True)
+
+    thread = threading.Thread(target=print_latest, daemon=True)
+    thread.start()
+    try:
+        yield lambda text: latest.__setitem__(0, text)
+    finally:
+        ended.set()
+        thread.join(SECONDS_A_LINE)
 
 
 def show_report(console: Console, report: Report) -> None:

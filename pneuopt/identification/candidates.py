@@ -65,6 +65,7 @@ def fit_candidates(
     order = sorted(candidates, key=lambda n: len(candidates[n].parameters.free_names))
     first: dict[str, IdentificationResult] = {}
     for name in order:
+        alike.announce(name, len(first) + 1, len(order))
         first[name] = alike.fit(candidates[name], candidates[name].parameters)
         alike = alike.with_window_of(first[name])
     widths, out = _common_widths(first), dict[str, IdentificationResult]()
@@ -96,6 +97,11 @@ class _Alike:
         method = self.method if self.window is None else replace(self.method, segment_time=self.window)
         window, logs = self.window, self.experiments
         return identify(candidate.system, logs, given, method=method, window=window, start=start, throw=False)
+
+    def announce(self, name: str, number: int, count: int) -> None:
+        """Say whose fit begins."""
+        if self.method.progress is not None:
+            self.method.progress(f"fitting {name}, {number} of {count} candidates")
 
     def with_window_of(self, fit: IdentificationResult) -> "_Alike":
         """The same with the window that a fit has needed; a fit whose states jump needs one, too."""

@@ -4,7 +4,7 @@ The system is any ODE with named signals that proposes its own starts (`System.s
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -29,20 +29,11 @@ from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
 from pneuopt.identification.order import hold_order
-from pneuopt.identification.problem import (
-    EstimationProblem,
-    apply_conditions,
-    as_estimation_model,
-)
+from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
 from pneuopt.identification.repairs import input_behaviour, known_runs, window_runs
 from pneuopt.identification.result import ChosenWindow, IdentificationResult
 from pneuopt.identification.review import review_fit
-from pneuopt.identification.statistics import (
-    agreement,
-    confidence_interval,
-    cross_correlation,
-    ljung_box,
-)
+from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
 from pneuopt.identification.width_bias import suspect_widths
 from pneuopt.identification.widths import choose_widths
 from pneuopt.identification.windows import check_window, fit_in_windows, run_freely
@@ -51,6 +42,7 @@ from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.provenance import provenance
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
@@ -84,6 +76,7 @@ def identify(
     start: IdentificationResult | None = None,
     cpu_seconds: float = math.inf,
     throw: bool = True,
+    progress: Callable[[Progress], None] | None = None,
 ) -> IdentificationResult:
     """Fit the free parameters and every log's start state to the logs; no guess is needed from the user.
 
@@ -115,6 +108,8 @@ def identify(
         status then says so first, and is `Code.BUDGET`.
     throw : bool
         Raise if the fit did not converge; otherwise its status shows it.
+    progress : callable, optional
+        Receives a `Progress`, a line of text with the time, an iteration; in place of the method's own.
 
     Returns
     -------
@@ -128,6 +123,8 @@ def identify(
         If no candidate start converged; the error's `solution` is the result, marked.
     """
     method, model = method or LeastSquares(), as_estimation_model(system)
+    if progress is not None:
+        method = replace(method, progress=ProgressReporter(progress, "identify"))
     if math.isfinite(cpu_seconds):
         method = replace(method, budget=CpuBudget(cpu_seconds))
     check_smooth(model)
@@ -186,6 +183,7 @@ def validate(
     parameters: ParameterSet,
     *,
     window: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> "pd.DataFrame":
     """Predict logs with known parameters: the start state is fitted, then an independent simulation runs freely.
 
@@ -198,6 +196,8 @@ def validate(
     window : float, optional
         Start the simulation anew after this time [s], from a fitted state: a plant that integrates runs away from a
         long log for the smallest misfit.
+    progress : callable, optional
+        As of `identify`.
 
     Returns
     -------
@@ -212,10 +212,10 @@ def validate(
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, parameters)
     fixed = _fixed_parameters(model, find_centre(model, logs, parameters))
-    rows = []
+    rows, method = [], LeastSquares(progress=ProgressReporter(progress, "validate"))
     for experiment in logs:
-        free = _predict_log(model, experiment, fixed)
-        run = free if window is None else _predict_log(model, experiment, fixed, window)
+        free = _predict_log(model, experiment, fixed, None, method)
+        run = free if window is None else _predict_log(model, experiment, fixed, window, method)
         rows += [
             row | _residual_diagnosis(model, experiment, run, str(row["channel"]))
             for row in _agreement_rows(model, experiment, run, free)
@@ -224,7 +224,12 @@ def validate(
 
 
 def predict(
-    system: HasSystem | ClosedLoop, experiment: Experiment, parameters: ParameterSet, *, window: float | None = None
+    system: HasSystem | ClosedLoop,
+    experiment: Experiment,
+    parameters: ParameterSet,
+    *,
+    window: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> Trajectory:
     """Simulate a log freely with known parameters, as `validate` does to compare.
 
@@ -233,7 +238,7 @@ def predict(
     system : drive, System or ClosedLoop
     experiment : Experiment
     parameters : ParameterSet
-    window : float, optional
+    window, progress
         As of `validate`.
 
     Returns
@@ -244,7 +249,8 @@ def predict(
     model = as_estimation_model(system)
     check_argument("experiment", experiment, Experiment, "an Experiment, as read_log(path) gives it")
     (log,) = logs = check_logs(model, experiment, parameters)
-    return _predict_log(model, log, _fixed_parameters(model, find_centre(model, logs, parameters)), window)
+    fixed, method = _fixed_parameters(model, find_centre(model, logs, parameters)), LeastSquares()
+    return _predict_log(model, log, fixed, window, replace(method, progress=ProgressReporter(progress, "predict")))
 
 
 def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSet:
@@ -253,13 +259,13 @@ def _fixed_parameters(system: Fittable, parameters: ParameterSet) -> ParameterSe
 
 
 def _predict_log(
-    system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None = None
+    system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None, method: LeastSquares
 ) -> Trajectory:
     inputs, known = experiment.trajectory, apply_conditions(fixed, experiment)
     behaviour = input_behaviour(system, experiment)
     if not system.states:
         return simulate(system, inputs, known, initial={}, intersample=behaviour)
-    initial, columns = _fit_states(system, experiment, fixed, window), dict[str, Array]()
+    initial, columns = _fit_states(system, experiment, fixed, window, method), dict[str, Array]()
     runs = known_runs(experiment) if window is None else window_runs(experiment, window)
     for begin, end in runs:
         state = {s.name: float(initial[s.name][begin]) for s in system.states}
@@ -269,12 +275,14 @@ def _predict_log(
     return Trajectory(inputs.t, columns)
 
 
-def _fit_states(system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None) -> Trajectory:
+def _fit_states(
+    system: Fittable, experiment: Experiment, fixed: ParameterSet, window: float | None, method: LeastSquares
+) -> Trajectory:
     """The states of a log with known parameters; over a whole log in one segment, stiction would trap the start."""
-    problem = EstimationProblem(system, (experiment,), fixed, LeastSquares())
+    problem = EstimationProblem(system, (experiment,), fixed, method)
     if window is None:
         return solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method).trajectories[0]
-    windows = replace(problem, window=window, method=LeastSquares(segment_time=window))
+    windows = replace(problem, window=window, method=replace(method, segment_time=window))
     check_window(windows)
     fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
     return solve_least_squares(windows.transcription(windows.start_from(fit)), windows.method).trajectories[0]
@@ -371,20 +379,8 @@ def _estimates(
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
         ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
         mark = misfit.mark(is_optimum=status.converged and not at_bound[i] and not leaning[i])
-        rows[name] = [
-            p.value,
-            deviation,
-            dof,
-            low,
-            high,
-            *ends,
-            p.lower,
-            p.upper,
-            bool(at_bound[i]),
-            mark,
-            p.unit,
-            p.source,
-        ]
+        figures = [p.value, deviation, dof, low, high, *ends, p.lower, p.upper]
+        rows[name] = [*figures, bool(at_bound[i]), mark, p.unit, p.source]
     return pd.DataFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
 
 

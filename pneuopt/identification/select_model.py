@@ -2,8 +2,8 @@
 
 import fnmatch
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.runnable import HasSystem, as_system
@@ -19,6 +19,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.report import Report, Shown
 from pneuopt.shooting.least_squares import LeastSquares
 
@@ -74,6 +75,7 @@ def select_model(
     held_out: Experiment | Sequence[Experiment] = (),
     method: LeastSquares | None = None,
     window: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> ModelSelection:
     """Fit every candidate alike and recommend one.
 
@@ -91,6 +93,8 @@ def select_model(
     method : LeastSquares, optional
     window : float, optional
         As of `identify`; by default the longest that a candidate needs.
+    progress : callable, optional
+        Receives a `Progress`, a line of text with the time, a candidate and an iteration.
 
     Returns
     -------
@@ -121,6 +125,8 @@ def select_model(
     check_parameters(parameters)
     given = {name: _candidate_parameters(system, parameters, free) for name, system in systems.items()}
     _check_names(given, parameters, free)
+    if progress is not None:
+        method = replace(method or LeastSquares(), progress=ProgressReporter(progress, "select_model"))
     fits = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
     converged = [n for n, fit in fits.items() if fit.status.converged]
     if not converged:

@@ -5,14 +5,14 @@ computed in waves, by their distance from the one nearest to the given parameter
 comes out does not depend on the order in which processes finish.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from math import inf, isfinite, nan
 from typing import TYPE_CHECKING
 
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import ProgressCallback
+from pneuopt.quantities.progress import Progress
 from pneuopt.studies.outcome import CaseFunction
 from pneuopt.studies.sweep import grid, sweep
 
@@ -33,7 +33,7 @@ def sweep_from_neighbours(
     value: str,
     starts: Mapping[str, str],
     executor: Executor | None = None,
-    progress: ProgressCallback | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> "pd.DataFrame":
     """Compute a search in every cell of a grid, each from the result of the best neighbour that is known already.
 
@@ -105,7 +105,7 @@ def search_again(
     value: str,
     starts: Mapping[str, str],
     executor: Executor | None = None,
-    progress: ProgressCallback | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> "pd.DataFrame":
     """Compute cells of a grid again that are three times worse than a neighbour, or failed, from that one's result.
 

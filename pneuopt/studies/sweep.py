@@ -6,7 +6,7 @@ spawned, not forked, on every system: the function is pickled once for each of t
 """
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from contextlib import closing, suppress
 from math import nan
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import ProgressCallback
+from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.units import write_value
 from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, Outcome
 from pneuopt.studies.processes import run_in_executor, run_in_processes
@@ -68,7 +68,7 @@ def sweep(
     cases: Mapping[str, CaseValues],
     *,
     executor: Executor | None = None,
-    progress: ProgressCallback | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> "pd.DataFrame":
     """Evaluate a function of a `ParameterSet` for each case.
 
@@ -84,7 +84,7 @@ def sweep(
     executor : concurrent.futures.Executor, optional
         Where to compute: threads, a cluster's (dask: ``client.get_executor()``). By default one process a CPU.
     progress : callable, optional
-        Called with a line of text after each case.
+        Called with a `Progress`, a line of text that knows how many cases are done, after each case.
 
     Returns
     -------
@@ -112,14 +112,13 @@ def sweep(
     require(len(cases) > 0, "a study needs a case")
     runs = {str(name): _case_parameters(parameters, case, str(name)) for name, case in cases.items()}
     outcomes = run_in_processes(fn, runs) if executor is None else run_in_executor(executor, fn, runs)
-    found: dict[str, Outcome] = {}
+    found, report = dict[str, Outcome](), ProgressReporter(progress, "sweep")
     with closing(outcomes), suppress(KeyboardInterrupt):
         for name, outcome in outcomes:
             if outcome.error == INTERRUPTED_CASE:
                 break
             found[name] = outcome
-            if progress is not None:
-                progress(_progress_text(found, len(runs)))
+            report(_progress_text(found, len(runs)), len(found), len(runs))
     return _study_table(parameters, runs, found)
 
 

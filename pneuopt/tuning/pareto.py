@@ -1,6 +1,6 @@
 """`pareto_front`: what one requirement costs in terms of another, as a table of certified designs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.specification import specify
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import ProgressCallback
+from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.tuning.front import Front
 from pneuopt.tuning.method import Method
 from pneuopt.tuning.tune import prepare_search, prepare_task
@@ -39,7 +39,7 @@ def pareto_front(
     until: float | None = None,
     max_steps: float = MAX_STEPS,
     method: Method | None = None,
-    progress: ProgressCallback | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> "pd.DataFrame":
     """Tune for every compromise between two requirements: designs none of which is better than another by both.
 
@@ -94,7 +94,7 @@ def pareto_front(
     require(last is None or last < upper_limit(second), message)
     spec = specify({first: 1.0, second: 1.0}, subject_to)
     task = prepare_task(loop, references, parameters, spec, scenarios, max_steps=max_steps)
-    both = prepare_search(task, method, progress)
+    both = prepare_search(task, method, ProgressReporter(progress, "pareto_front"))
     front = Front(both, first, second, last)
     with suppress(KeyboardInterrupt):
         front.find_designs(points)

@@ -7,7 +7,7 @@ numbers are proven.
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
 
@@ -29,6 +29,7 @@ from pneuopt.evaluation.specification import Objective, Specification, specify
 from pneuopt.quantities.arguments import as_tuple, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.tuning.certifier import certified_objective
 from pneuopt.tuning.feasibility import check_feasibility
@@ -63,7 +64,7 @@ def tune(
     max_steps: float = MAX_STEPS,
     method: Method | None = None,
     throw: bool = True,
-    progress: ProgressCallback | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> TuningResult:
     """Find the free gains, and dither, with the least objective on the references within the limits.
 
@@ -101,7 +102,7 @@ def tune(
     throw : bool
         Raise an error if no design is certified; otherwise the result's status says so.
     progress : callable, optional
-        Receives a line of text a generation, start or program.
+        Receives a `Progress`, a line of text with the time, a generation, start or program.
 
     Returns
     -------
@@ -139,7 +140,7 @@ def tune(
     if rig is not None:
         check_rig(rig, task)
     _warn_of_swing(task)
-    search, result = _search(task, method, progress)
+    search, result = _search(task, method, ProgressReporter(progress, "tune"))
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     result = confirm_refusal(search, result) if result.status.code is Code.NOT_CERTIFIED else result
     tuned = search.space.names
@@ -174,7 +175,7 @@ def _warn_of_swing(task: TuningTask) -> None:
         warnings.warn(told, PhysicsWarning, stacklevel=3)
 
 
-def _search(task: TuningTask, method: Method | None, progress: ProgressCallback | None) -> tuple[Search, TuningResult]:
+def _search(task: TuningTask, method: Method | None, progress: ProgressCallback) -> tuple[Search, TuningResult]:
     """The search of a method, by default the first that suits, and where its answer is in doubt the better of two."""
     search = prepare_search(task, method, progress)
     result = search.run()

@@ -1,13 +1,14 @@
 import io
 import math
 import re
+import threading
 from collections.abc import Callable
 
 import pandas as pd
 import pytest
 from rich.console import Console
 
-from pneuopt.cli.terminal import show_sentence
+from pneuopt.cli.terminal import make_console, progress, show_report, show_sentence
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
@@ -27,6 +28,7 @@ from pneuopt.evaluation.requirements import (
     StepEnvelope,
 )
 from pneuopt.models.linear import FirstOrder, Integrator
+from pneuopt.quantities.report import Line, Report, Table, Tone, text_columns
 from pneuopt.tuning.report import report_active, report_gains
 from pneuopt.tuning.validation import validate_design
 
@@ -155,3 +157,36 @@ def test_the_plants_are_told_verdict_first_and_what_would_help() -> None:
     assert "assumed tolerances: plant.gain +-5 %\n" in text
     assert "these gains hold on 100 of 100\n" in text
     assert 'add to the tuning\'s file: [scenarios.corners] "plant.gain" = "5 %"' in text
+
+
+def test_in_a_pipe_progress_is_a_line_every_few_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("pneuopt.cli.terminal.SECONDS_A_LINE", 0.01)
+    with progress("identifying", quiet=False) as report:
+        report("stage 2 of 6")
+        ended = threading.Event()
+        ended.wait(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert set(lines) == {"identifying, 0 s: stage 2 of 6"}
+    with progress("identifying", quiet=True) as report:
+        report("stage 2 of 6")
+        ended.wait(0.05)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_no_color_leaves_no_escape(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    verdict = Report((Line("converged", Tone.GOOD), Table(text_columns("parameter"), (("load.mass",),))))
+    show_report(make_console(), verdict)
+    assert "\x1b[" in capsys.readouterr().out
+    monkeypatch.setenv("NO_COLOR", "1")
+    show_report(make_console(), verdict)
+    assert "\x1b" not in capsys.readouterr().out
+    monkeypatch.setattr("pneuopt.cli.terminal.SECONDS_A_LINE", 0.01)
+    with progress("tuning", quiet=False) as report:
+        report("generation 3")
+        threading.Event().wait(0.1)
+    said = capsys.readouterr().err
+    assert said.startswith("tuning, 0 s: generation 3\n")
+    assert "\x1b" not in said

@@ -27,6 +27,7 @@ from pneuopt.models.friction import Asymmetric, Coulomb, LuGre
 from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.progress import Progress
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.sweep import grid, sweep
 
@@ -126,8 +127,9 @@ def test_a_bad_axis_is_refused(axes: dict[str, list[float]], said: str) -> None:
 
 def test_processes_give_what_a_loop_gives_in_the_order_of_the_cases(functions: ModuleType) -> None:
     cases = grid(RIG, {"load.mass": [8.0, 2.0, 4.0], "load.force": [0.0, 20.0]})
-    news: list[str] = []
+    news: list[Progress] = []
     table = sweep(functions.acceleration, RIG, cases, progress=news.append)
+    assert [(n.job, n.done, n.total) for n in news] == [("sweep", k, 6) for k in range(1, 7)]
     assert list(table.columns) == ["case", "load.mass", "load.force", "value", "seconds", "error"]
     assert table["case"].tolist() == list(cases)
     expected = [functions.acceleration(RIG.with_values(case)) for case in cases.values()]
