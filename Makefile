@@ -1,4 +1,5 @@
 # A fresh machine needs Python >= 3.11 and make, nothing else: `make demo` runs the main job, `make test` all fast checks.
+# Where no C compiler is on the path, the extra `compiler` is installed, too (100 MB); PNEUOPT_CC= leaves it out.
 PYTHON ?= python3
 ifeq ($(OS),Windows_NT)
 BIN := .venv/Scripts
@@ -36,6 +37,9 @@ format: .venv/installed
 	$(PYTHON) -m venv .venv
 	$(PY) -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
 	$(PY) -m pip install --quiet --disable-pip-version-check --editable . --group dev
+	$(PY) -c "import os, sys; from pneuopt.dynamics.compiled.toolchain import find_compiler; sys.exit(not (find_compiler() or os.environ.get('PNEUOPT_CC') == ''))" \
+		|| $(PY) -m pip install --quiet --disable-pip-version-check --editable ".[compiler]" \
+		|| $(PY) -c "print('no C compiler could be installed: everything runs without one, more slowly')"
 	$(PY) -c "open('.venv/installed', 'w').close()"
 
 clean:

@@ -17,7 +17,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
-from pneuopt.dynamics.compiled import compiler, library_cache
+from pneuopt.dynamics.compiled import compiler, library_cache, toolchain
 from pneuopt.dynamics.compiled import pieces as kernels
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import Symbols, System, define
@@ -37,7 +37,8 @@ hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "desk")
 CACHES = (
     compiler.compile_library,
     compiler.warn_once,
-    compiler._compiler_version,
+    toolchain._packaged_compiler,
+    toolchain._read_version,
     library_cache._temporary_folder,
     kernels.prepare_by_content,
 )

@@ -234,16 +234,16 @@ def info_command() -> None:
     from importlib.metadata import version
 
     from pneuopt.cli.terminal import make_console, show_pairs
-    from pneuopt.dynamics.compiled.compiler import find_compiler
     from pneuopt.dynamics.compiled.library_cache import cache_directory
+    from pneuopt.dynamics.compiled.toolchain import find_compiler
 
     packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
     with _report_errors():
         machine = {
             "python": f"{platform.python_version()} ({sys.executable})",
             "platform": f"{platform.platform()}, {os.cpu_count()} CPUs",
-            "compiler": find_compiler() or "none found: models run on the CasADi VM, more slowly",
-            "cache": cache_directory(),
+            "compiler": str(find_compiler() or "none found: models run on the CasADi VM, more slowly"),
+            "cache": str(cache_directory()),
         }
         show_pairs(make_console(), {n: version(n) for n in packages} | machine)
 

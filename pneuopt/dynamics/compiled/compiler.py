@@ -6,16 +6,21 @@ import functools
 import logging
 import os
 import platform
-import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pneuopt.dynamics.compiled.library_cache import cache_directory, discard_library, find_library, keep_library
+from pneuopt.dynamics.compiled.toolchain import (
+    COMPILER_FLAGS,
+    LINKER_FLAGS,
+    Compiler,
+    explain_missing_compiler,
+    find_compiler,
+)
 
-COMPILER_FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 COMPILE_TIMEOUT = 300  # [s]; below, large models on slow machines fall back to the VM; above, a hung compiler blocks
 logger = logging.getLogger("pneuopt")
 
@@ -33,7 +38,7 @@ def compile_library(source: str, *definitions: str) -> ctypes.CDLL | None:
     """
     cc = find_compiler()
     if cc is None:
-        warn_once("no C compiler found: models run in the CasADi VM, with the same answers, about ten times slower")
+        warn_once(explain_missing_compiler())
         return None
     detail = ""
     for definition in definitions or ("",):
@@ -49,14 +54,6 @@ def compile_library(source: str, *definitions: str) -> ctypes.CDLL | None:
     return None
 
 
-def find_compiler() -> str | None:
-    """Path of the C compiler that is used: ``$PNEUOPT_CC``, ``$CC``, gcc, clang, cc; None if none is found."""
-    chosen = os.environ.get("PNEUOPT_CC", os.environ.get("CC"))
-    if chosen is not None:
-        return shutil.which(chosen) if chosen else None
-    return next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
-
-
 def _reason(error: OSError | subprocess.SubprocessError) -> str:
     """The compiler's error text, or the signal that killed it."""
     if isinstance(error, subprocess.CalledProcessError) and not error.stderr:
@@ -67,8 +64,8 @@ def _reason(error: OSError | subprocess.SubprocessError) -> str:
     return str(getattr(error, "stderr", None) or error)
 
 
-def _load_library(cc: str, flags: tuple[str, ...], source: str) -> ctypes.CDLL:
-    identity = "\0".join([source, *flags, _compiler_version(cc), platform.processor(), _cpu_identity()])
+def _load_library(cc: Compiler, flags: tuple[str, ...], source: str) -> ctypes.CDLL:
+    identity = "\0".join([source, *flags, str(cc), cc.identity, platform.processor(), _cpu_identity()])
     folder = cache_directory()
     binary = find_library(folder, identity)
     if binary is not None:
@@ -79,19 +76,28 @@ def _load_library(cc: str, flags: tuple[str, ...], source: str) -> ctypes.CDLL:
     return ctypes.CDLL(str(_compile(cc, flags, source, folder, identity)))
 
 
-def _compile(cc: str, flags: tuple[str, ...], source: str, cache: Path, identity: str) -> Path:
+def _compile(cc: Compiler, flags: tuple[str, ...], source: str, cache: Path, identity: str) -> Path:
     """Compile in a temporary folder, then move the binary: another process may do the same, or this one be killed."""
     with tempfile.TemporaryDirectory(dir=cache) as folder:
         text, product = Path(folder) / "model.c", Path(folder) / "model.so"
         text.write_text(source, encoding="utf-8")
-        _run_compiler([cc, *flags, str(text), "-o", str(product), "-lm"])
+        # what zig keeps for all libraries, its C runtime, has its place; what it makes for this one is not wanted
+        folders = {"ZIG_GLOBAL_CACHE_DIR": str(cache / "zig"), "ZIG_LOCAL_CACHE_DIR": folder}
+        command = [*cc.command, *flags, str(text), "-o", str(product), *LINKER_FLAGS]
+        _run_compiler(command, {**folders, **os.environ})
         return keep_library(cache, identity, product)
 
 
-def _run_compiler(command: Sequence[str]) -> None:
+def _run_compiler(command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
     """Run a compiler; where we are interrupted, or it hangs, all its processes end with it."""
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", start_new_session=True
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        start_new_session=True,
     ) as process:
         try:
             out, err = process.communicate(timeout=COMPILE_TIMEOUT)
@@ -117,12 +123,6 @@ def _end_with_children(process: "subprocess.Popen[str]") -> None:
 def warn_once(message: str) -> None:
     """Warn, but not again in the same words."""
     logger.warning("%s", message)
-
-
-@functools.cache
-def _compiler_version(cc: str) -> str:
-    result = subprocess.run([cc, "--version"], capture_output=True, text=True, timeout=30, check=False)
-    return cc + result.stdout
 
 
 @functools.cache

@@ -7,12 +7,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pneuopt.dynamics.compiled import c_writer as emission
-from pneuopt.dynamics.compiled import compiler
 from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.dynamics.compiled.toolchain import find_compiler
 from pneuopt.quantities.arrays import Array
 
-needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 EDGES = np.array([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, 5e-324, 1e-310, 720.0, -720.0, -744.0, -760.0, 1e308])
 
 

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pneuopt.dynamics.compiled import compiler, library_cache
+from pneuopt.dynamics.compiled import compiler, library_cache, toolchain
 from pneuopt.dynamics.compiled.functions import compile_function
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 
 Forget = Callable[[], None]
-needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(toolchain.find_compiler() is None, reason="no C compiler")
 needs_shell = pytest.mark.skipif(os.name == "nt", reason="the compilers here are shell scripts")
 
 
@@ -98,7 +98,7 @@ def test_a_broken_compiler_is_a_warning_not_a_crash(
 
 def test_a_compiler_that_is_not_there_counts_as_none(monkeypatch: pytest.MonkeyPatch, forget: Forget) -> None:
     monkeypatch.setenv("PNEUOPT_CC", "no-such-compiler")
-    assert compiler.find_compiler() is None
+    assert toolchain.find_compiler() is None
 
 
 @needs_compiler
@@ -144,16 +144,17 @@ def test_a_library_damaged_anywhere_is_built_anew(monkeypatch: pytest.MonkeyPatc
     """Cut at twenty places, or with a byte changed there: none of them is handed to the loader."""
     source = "int answer(void) { return 42; }"
     monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path))
-    cc = compiler.find_compiler()
+    cc = toolchain.find_compiler()
     assert cc is not None
-    compiler._load_library(cc, compiler.COMPILER_FLAGS, source)
+    compiler._load_library(cc, toolchain.COMPILER_FLAGS, source)
     (binary,) = tmp_path.iterdir()
     whole = binary.read_bytes()
     identity = "\0".join(
         [
             source,
-            *compiler.COMPILER_FLAGS,
-            compiler._compiler_version(cc),
+            *toolchain.COMPILER_FLAGS,
+            str(cc),
+            cc.identity,
             platform.processor(),
             compiler._cpu_identity(),
         ]
@@ -230,7 +231,7 @@ def test_without_a_home_models_are_compiled_in_a_folder_that_is_removed(home: st
 def test_a_compiler_without_vectors_gives_one_lane(
     monkeypatch: pytest.MonkeyPatch, forget: Forget, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    usual, cc = fallen(fall()), compiler.find_compiler()
+    usual, cc = fallen(fall()), toolchain.find_compiler()
     forget()
     text = f'#!/bin/sh\ncase "$*" in *SIMD*) echo "no vectors" >&2; exit 1;; esac\nexec {cc} "$@"\n'
     monkeypatch.setenv("PNEUOPT_CC", script(tmp_path, text))
@@ -250,7 +251,7 @@ def test_an_interrupted_compilation_leaves_nothing_behind(
 ) -> None:
     monkeypatch.setenv("PNEUOPT_CACHE", str(tmp_path))
 
-    def interrupted(command: list[str]) -> None:
+    def interrupted(command: list[str], _: object) -> None:
         Path(command[-2]).write_bytes(b"half a fi")
         raise KeyboardInterrupt
 

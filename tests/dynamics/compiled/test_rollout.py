@@ -16,6 +16,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.compiled import compiler, vm
 from pneuopt.dynamics.compiled import rollout as codegen
 from pneuopt.dynamics.compiled.rollout import MAX_SUBSTEPS, Pieces, Rollout
+from pneuopt.dynamics.compiled.toolchain import find_compiler
 from pneuopt.dynamics.system import DiscreteSystem, discretise, parameter_vector
 from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import Coulomb, LuGre, PressureDependent, Stribeck
@@ -23,7 +24,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError
 
 Forget = Callable[[], None]
-needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 
 def loop() -> DiscreteSystem:
