@@ -1,17 +1,22 @@
-"""`examine_logs`: what the log doctor finds in logs of a plant; `check_content` refuses logs for it."""
+"""`examine_logs`: what the log doctor finds in logs of a plant; `check_content` refuses logs for it.
+
+`pose_problem` makes the estimation problem of logs that pass.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem
-from pneuopt.identification.checks import as_experiments, check_logs
-from pneuopt.identification.problem import as_estimation_model
+from pneuopt.identification.checks import as_experiments, check_free, check_logs
+from pneuopt.identification.command_centre import find_centre
+from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.stated_axis import stated_axis
 from pneuopt.logs.checks.findings import LogFinding
 from pneuopt.logs.doctor import examine
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.shooting.least_squares import LeastSquares
 
 QUIET_CHECKS = ("sampling",)
 """Checks whose notes are no doubts of the log: they would stand in the status of every fit."""
@@ -41,6 +46,27 @@ def examine_logs(
     """
     model = as_estimation_model(system)
     return tuple(_find(model, check_logs(model, as_experiments(experiments), parameters), parameters))
+
+
+def pose_problem(
+    system: HasSystem | ClosedLoop,
+    experiments: Experiment | Iterable[Experiment],
+    parameters: ParameterSet,
+    method: LeastSquares,
+) -> EstimationProblem:
+    """The estimation problem of logs that `identify` accepts, before any width is chosen.
+
+    Raises
+    ------
+    InputError
+        If logs, system and parameters do not fit together.
+    """
+    model = as_estimation_model(system)
+    logs = check_logs(model, experiments, parameters)
+    parameters = find_centre(model, logs, parameters)
+    check_free(logs, parameters)
+    check_content(model, logs, parameters)
+    return EstimationProblem(model, tuple(logs), model.parameters | parameters, method)
 
 
 def check_content(system: Fittable, experiments: Sequence[Experiment], parameters: ParameterSet) -> tuple[str, ...]:

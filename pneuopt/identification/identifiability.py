@@ -16,9 +16,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.excitation import Lack
 from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.runnable import HasSystem, check_smooth
-from pneuopt.identification.checks import check_free, check_logs
-from pneuopt.identification.command_centre import find_centre
-from pneuopt.identification.examination import check_content
+from pneuopt.identification.examination import pose_problem
 from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion, with_values_in_words
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.profiles import Profile
@@ -93,13 +91,8 @@ def identifiability(
     InputError
         If logs, system and parameters do not fit together.
     """
-    model = as_estimation_model(system)
-    check_smooth(model)
-    logs = check_logs(model, experiments, parameters)
-    parameters = find_centre(model, logs, parameters)
-    check_free(logs, parameters)
-    check_content(model, logs, parameters)
-    problem = EstimationProblem(model, tuple(logs), model.parameters | parameters, method or LeastSquares())
+    check_smooth(as_estimation_model(system))
+    problem = pose_problem(system, experiments, parameters, method or LeastSquares())
     return verdict_from_sensitivities(problem, problem.candidates()[0])
 
 

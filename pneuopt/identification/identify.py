@@ -96,7 +96,7 @@ def identify(
         Take each channel's noise from its residuals, whatever the logs declare.
     window : float, optional
         Cut the logs into windows of this time [s], each with a start state of its own; by default only where the model
-        does not follow whole logs, and of the length that gives the narrowest intervals (`result.window`).
+        does not follow whole logs, and of the length with the narrowest intervals (`result.window`); math.inf: never.
     accept : sequence of str
         Checks that the logs need not pass, for they are right: "motion", "speed", "work", "command", "scale", "jumps",
         "stops", "mass", "pressures". What these find stands in the status.
@@ -144,9 +144,9 @@ def identify(
         method,
         noise_is_stated=stated,
         window=math.inf if window is None else window,
+        is_whole=window == math.inf,
     )
-    if window is not None:
-        check_window(problem)
+    check_window(problem)
     result = _fit_and_review(problem, loss, start, estimate_noise=estimate_noise)
     if log_warnings:
         result = replace(result, status=result.status.with_remedies(*log_warnings))

@@ -48,6 +48,8 @@ class EstimationProblem:
         Whether the logs state the noise of all outputs; otherwise it is estimated from them.
     window : float
         Time after which a log starts anew with a state of its own [s]; math.inf where it never does.
+    is_whole : bool
+        Whether logs stay whole also where the model does not follow them.
     """
 
     system: Fittable
@@ -58,6 +60,7 @@ class EstimationProblem:
     held: Mapping[str, float] = field(default_factory=dict)
     noise_is_stated: bool = False
     window: float = math.inf
+    is_whole: bool = False
 
     @property
     def has_gaps(self) -> bool:
@@ -72,7 +75,10 @@ class EstimationProblem:
         return self.system.starts({e.name: Log(e.trajectory, *known[e.name]) for e in self.experiments})
 
     def start_from(self, fit: Fit | IdentificationResult, label: str = "fit") -> Start:
-        """The start from a fit of these logs; parameters without an estimate begin at their given values."""
+        """The start from a fit of these logs, by the parameters that both have.
+
+        Parameters without an estimate begin at their given values.
+        """
         if isinstance(fit, IdentificationResult):
             runs, found = (
                 tuple(fit.trajectories.values()),
@@ -81,7 +87,7 @@ class EstimationProblem:
         else:
             runs, found = fit.trajectories, {n: fit.parameters.value(n) for n in fit.parameters.free_names}
         given = self.unknowns()
-        values = {n: v if math.isfinite(v) else given.value(n) for n, v in found.items()}
+        values = {n: v if math.isfinite(v) else given.value(n) for n, v in found.items() if n in given}
         return Start(dict(zip((e.name for e in self.experiments), runs, strict=True)), values, label)
 
     def unknowns(self) -> ParameterSet:

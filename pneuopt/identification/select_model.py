@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.runnable import HasSystem, as_system
 from pneuopt.dynamics.system import System, names
-from pneuopt.identification.candidates import Candidate, fit_candidates
+from pneuopt.identification.candidates import Candidate, Refutation, fit_candidates
 from pneuopt.identification.checks import as_experiments
 from pneuopt.identification.excitation import remedy
 from pneuopt.identification.identify import validate
@@ -44,7 +44,8 @@ class ModelSelection(Shown):
     Attributes
     ----------
     table : DataFrame
-        A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's),
+        A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's;
+        all three at least so large where a short search has refuted the candidate, and p_value at most so large),
         contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
         unidentifiable and at_bound (names of parameters), unphysical (which order of
         `Excitation.at_least` it breaks), message.
@@ -53,7 +54,7 @@ class ModelSelection(Shown):
     reason : str
         One sentence.
     fits : mapping of str to IdentificationResult
-        The fit of every candidate, whatever its status.
+        The fit of every candidate that short searches have not refuted, whatever its status.
     """
 
     table: "pd.DataFrame"
@@ -92,7 +93,7 @@ def select_model(
         Runs that no fit sees; a richer model that predicts them worse than a simpler one is not recommended.
     method : LeastSquares, optional
     window : float, optional
-        As of `identify`; by default the longest that a candidate needs.
+        As of `identify`; by default whole logs, or the windows of the candidate that follows them best.
     progress : callable, optional
         Receives a `Progress`, a line of text with the time, a candidate and an iteration.
 
@@ -127,13 +128,14 @@ def select_model(
     _check_names(given, parameters, free)
     if progress is not None:
         method = replace(method or LeastSquares(), progress=ProgressReporter(progress, "select_model"))
-    fits = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
+    found = fit_candidates({n: Candidate(s, given[n]) for n, s in systems.items()}, experiments, method, window)
+    fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
     converged = [n for n, fit in fits.items() if fit.status.converged]
     if not converged:
         message = "; ".join(f"{n}: {fit.status.verdict}" for n, fit in fits.items())
         raise ConvergenceError(f"none of the candidates converged: {message}", fits)
     predicted = {n: _mean_nrmse(systems[n], held_out, fits[n]) for n in converged}
-    rows = _candidate_rows(systems, fits, predicted)
+    rows = _candidate_rows(systems, found, predicted)
     chosen, why = _choose(rows)
     reason = _selection_reason(rows, chosen, why, _separate(rows, chosen, fits, systems))
     return ModelSelection(_selection_table(rows), chosen, reason, fits)
@@ -201,26 +203,39 @@ def _mean_nrmse(system: System, held_out: Sequence[Experiment], fit: Identificat
 
 def _candidate_rows(
     candidates: Mapping[str, System],
-    fits: Mapping[str, IdentificationResult],
+    found: Mapping[str, IdentificationResult | Refutation],
     predicted: Mapping[str, float],
 ) -> dict[str, _CandidateRow]:
     """A row for each candidate, the lowest BIC first, those that did not converge last."""
+    fits = {n: fit for n, fit in found.items() if isinstance(fit, IdentificationResult)}
     best = min(predicted, key=lambda n: _chi_square(fits[n]))
     scale = _variance(fits[best]) * fits[best].stats["variance_inflation"]
     count = _residual_count(fits[best]) / fits[best].stats["variance_inflation"]
+    comparable = {n: fit for n, fit in found.items() if n in predicted or n not in fits}
     rows = {}
-    for name, fit in fits.items():
-        k, deviance = len(fit.estimates), _chi_square(fit) / scale
-        inside, p, bic = "", math.nan, math.nan
-        if name in predicted:
-            inside, bic = _largest_submodel(name, candidates, fits, predicted), bayes_information(deviance, k, count)
-        if inside:
-            p = likelihood_ratio_p(_chi_square(fits[inside]) / scale - deviance, k - len(fits[inside].estimates))
-        held_out = predicted.get(name, math.nan)
-        notes = ", ".join(_names_noted(fit, UNIDENTIFIABLE_NOTE)), ", ".join(_names_noted(fit, AT_BOUND_NOTE))
-        said = _unphysical(fit, candidates[name].excitation.at_least), fit.status.message
-        rows[name] = _CandidateRow(fit.status.converged, k, deviance, bic, inside, p, held_out, *notes, *said)
+    for name, fit in found.items():
+        k, deviance, inside, p, bic = len(_free_names(fit)), _chi_square(fit) / scale, "", math.nan, math.nan
+        if name in comparable:
+            inside, bic = _largest_submodel(name, candidates, comparable), bayes_information(deviance, k, count)
+        if inside and name in predicted:
+            less = k - len(_free_names(found[inside]))
+            p = likelihood_ratio_p(_chi_square(found[inside]) / scale - deviance, less)
+        rows[name] = _CandidateRow(
+            name in predicted, k, deviance, bic, inside, p, predicted.get(name, math.nan), *_said(candidates[name], fit)
+        )
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
+
+
+def _said(system: System, fit: IdentificationResult | Refutation) -> tuple[str, str, str, str]:
+    """What is unidentifiable, what is at a bound, what is unphysical, and the message."""
+    if isinstance(fit, Refutation):
+        return "", "", "", fit.reason
+    notes = ", ".join(_names_noted(fit, UNIDENTIFIABLE_NOTE)), ", ".join(_names_noted(fit, AT_BOUND_NOTE))
+    return *notes, _unphysical(fit, system.excitation.at_least), fit.status.message
+
+
+def _free_names(fit: IdentificationResult | Refutation) -> set[str]:
+    return {*fit.free} if isinstance(fit, Refutation) else {str(n) for n in fit.estimates.index}
 
 
 def _unphysical(fit: IdentificationResult, at_least: Mapping[str, str]) -> str:
@@ -236,21 +251,18 @@ def _names_noted(fit: IdentificationResult, note: str) -> list[str]:
 
 
 def _largest_submodel(
-    name: str,
-    candidates: Mapping[str, System],
-    fits: Mapping[str, IdentificationResult],
-    converged: Mapping[str, float],
+    name: str, candidates: Mapping[str, System], fits: Mapping[str, IdentificationResult | Refutation]
 ) -> str:
-    """The richest converged candidate whose free parameters and states are among this one's; "" if there is none."""
-    own, states = set(fits[name].estimates.index), set(names(candidates[name].states))
-    simpler = [
-        n for n in converged if set(fits[n].estimates.index) < own and set(names(candidates[n].states)) <= states
-    ]
-    return max(simpler, key=lambda n: len(fits[n].estimates), default="")
+    """The richest candidate whose free parameters and states are among this one's; "" if there is none."""
+    own, states = _free_names(fits[name]), set(names(candidates[name].states))
+    simpler = [n for n in fits if _free_names(fits[n]) < own and set(names(candidates[n].states)) <= states]
+    return max(simpler, key=lambda n: len(_free_names(fits[n])), default="")
 
 
-def _chi_square(fit: IdentificationResult) -> float:
-    """The sum of squared residuals, in variances of the declared noise."""
+def _chi_square(fit: IdentificationResult | Refutation) -> float:
+    """The sum of squared residuals, in variances of the declared noise; at least that of one that is refuted."""
+    if isinstance(fit, Refutation):
+        return fit.chi_square
     return float(((fit.fit["rmse"] / fit.fit["noise"]) ** 2 * fit.fit["samples"]).sum())
 
 

@@ -32,6 +32,9 @@ from pneuopt.shooting.transcription import Transcription
 CHOSEN_WIDTH = "chosen by identify from the logs"
 """Source of a width that `choose_widths` has set."""
 
+COMMON_WIDTH = "common to all candidates"
+"""Source of a width that is the same in all candidates of a selection."""
+
 # gaps and iterations of a trial: with tighter gaps, or more iterations, it takes as long as a search; with looser gaps,
 # or fewer, a wrong width looks as good as a right one
 TRIAL_STAGE = Stage(3e-3, 6)
@@ -114,7 +117,8 @@ def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[
 def advise_widths(problem: EstimationProblem) -> tuple[str, ...]:
     """Other values for the widths that the user has stated, each tried in a short search; empty if none is better."""
     given = problem.parameters
-    stated = {w.name for w in _present(problem) if not given[w.name].free and not _is_open(problem, w.name)}
+    known = [w.name for w in _present(problem) if given[w.name].source != COMMON_WIDTH]
+    stated = {n for n in known if not given[n].free and not _is_open(problem, n)}
     if not stated:
         return ()
     found = _race_widths(problem, stated)[0].widths

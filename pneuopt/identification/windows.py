@@ -76,13 +76,15 @@ class _Trial(NamedTuple):
 
 
 def check_window(problem: EstimationProblem) -> None:
-    """Refuse a window that no log of a problem can be cut into.
+    """Refuse a window that no log of a problem can be cut into; an infinite one cuts none.
 
     Raises
     ------
     InputError
         If it holds fewer than two samples, is longer than every log, or cuts a loop whose controller goes on.
     """
+    if problem.window == math.inf:
+        return
     logs = [e.trajectory for e in problem.experiments]
     step = max(float(np.median(np.diff(log.t))) for log in logs)
     n, longest = round(problem.window / step), max(len(log) for log in logs)
@@ -149,7 +151,7 @@ def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
 def _has_failed_by_gaps(problem: EstimationProblem, fit: Fit) -> bool:
     """Whether gaps have taken the misfit of a search that ended by itself, of a plant that windows can cut."""
     absorbed = fit.stats["gap_share"] > MAX_GAP_SHARE and math.isfinite(fit.stats["cost"])
-    can_cut = bool(problem.system.states) and problem.system.motion().sample_time is None
+    can_cut = not problem.is_whole and bool(problem.system.states) and problem.system.motion().sample_time is None
     return fit.status.code is Code.NOT_CONVERGED and absorbed and can_cut
 
 

@@ -5,16 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System
+from pneuopt.identification.identify import identify
 from pneuopt.identification.select_model import ModelSelection, _CandidateRow, _choose, select_model
+from pneuopt.identification.trials import try_candidate
 from pneuopt.logs.experiments import Experiment
-from pneuopt.models.drive import MotionDrive
+from pneuopt.models.drive import ForceDrive, MotionDrive
 from pneuopt.models.friction import FrictionModel
-from pneuopt.models.friction_laws import friction_ladder
+from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import LeastSquares
 
 FREE = ("friction.coulomb", "friction.viscous", "friction.static", "friction.stribeck_velocity", "friction.*_asymmetry")
 PAIR = ("friction.coulomb", "friction.viscous", "friction.*_asymmetry")
@@ -158,6 +163,67 @@ def test_a_tie_is_decided_by_held_out_runs_and_the_reason_says_what_would_separa
 
 def row(*, free: int, deviance: float, bic: float, held_out: float) -> _CandidateRow:
     return _CandidateRow(True, free, deviance, bic, "", math.nan, held_out, "", "", "", "")
+
+
+FORCED = {"load.mass": 5.0, "load.force": 0.0}
+
+
+def stick_slip(model: FrictionModel, seconds: float = 1.5) -> Experiment:
+    """A load that slides, sticks and turns under a known force, at 500 Hz, with 20 um of noise."""
+    drive = ForceDrive(model)
+    t = np.arange(0, seconds, 2e-3)
+    force = 60 * np.sin(2 * np.pi * t) + 40 * np.sin(2 * np.pi * 2.3 * t)
+    held = {"force": Intersample.HELD}
+    run = simulate(
+        drive.system(), Trajectory(t, {"force": force}), drive.parameters.with_values(FORCED), intersample=held
+    )
+    noisy = run["position"] + 2e-5 * np.random.default_rng(0).standard_normal(t.size)
+    log = Experiment(Trajectory(t, {"force": force, "position": noisy}), {"position": 2e-5}, name="stick-slip")
+    return log.with_intersample(held)
+
+
+def selected(truth: str, *others: str) -> ModelSelection:
+    """The choice among some laws by a log that the first one has made, with the mass known."""
+    ladder = friction_ladder()
+    systems = {n: ForceDrive(ladder[n]).system() for n in (truth, *others)}
+    free = [n for n in usual_unknowns() if any(n in s.parameters for s in systems.values())]
+    return select_model(systems, stick_slip(ladder[truth]), ParameterSet(), free=free)
+
+
+def test_hopeless_models_are_refuted_by_short_searches_and_do_not_cut_the_logs() -> None:
+    """Viscous friction alone follows windows of 20 ms at most, in which nothing tells the others apart."""
+    found = selected("stribeck", "viscous", "coulomb", "asymmetric stribeck")
+    assert found.recommended == "stribeck"
+    assert set(found.fits) == {"stribeck", "asymmetric stribeck"}
+    assert all(fit.window is None for fit in found.fits.values())
+    assert found.fits["asymmetric stribeck"].provenance["start"] == "a given fit"
+    columns = found.table.to_dict()
+    for name in ("viscous", "coulomb"):
+        assert not columns["converged"][name]
+        assert columns["deviance"][name] > 4 * columns["deviance"]["stribeck"]
+        assert "short searches with loose gaps leave" in columns["message"][name]
+    assert columns["contains"]["stribeck"] == "coulomb"
+    assert columns["p_value"]["stribeck"] < 1e-6
+    assert "refuted: " in found.reason
+
+
+def test_bristles_that_made_the_log_are_recommended() -> None:
+    found = selected("lugre", "coulomb", "stribeck")
+    assert found.recommended == "lugre"
+    assert set(found.fits) == {"lugre"}
+
+
+def test_a_short_search_leaves_no_more_squares_than_the_whole_one() -> None:
+    """So what it leaves is a bound: gaps only relax a fit."""
+    ladder = friction_ladder()
+    log, free = stick_slip(ladder["stribeck"]), ("friction.coulomb", "friction.viscous")
+    for name in ("coulomb", "stribeck"):
+        drive = ForceDrive(ladder[name])
+        given = drive.parameters.with_values(FORCED).freed(*free)
+        trial = try_candidate(drive.system(), [log], given, LeastSquares())
+        whole = identify(drive.system(), log, given, window=math.inf, throw=False)
+        assert whole.window is None
+        assert trial.least <= trial.squares <= 2 * whole.stats["cost"] * (1 + 1e-6), name
 
 
 def test_bad_input_is_named() -> None:
