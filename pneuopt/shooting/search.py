@@ -138,10 +138,11 @@ class Search:
         before = self._snapshot()
         self._enter_stage(self.method.stages[-1], self.current.nodes, self.current.z)
         if math.isfinite(self.current.cost):
-            self._finish_stage(JUMP_ITERATIONS)
-            found = self._convergence_status(self.current)
-            if found.converged and self._is_noise(self.current.cost):
-                return found
+            self._run_stage(JUMP_ITERATIONS)
+            if self._is_noise(self.current.cost):  # finer steps are lost on what has not come near the noise by then
+                self._finish_stage(JUMP_ITERATIONS)
+                if (found := self._convergence_status(self.current)).converged and self._is_noise(self.current.cost):
+                    return found
         self._restore(before)
         return None
 

@@ -74,3 +74,25 @@ def test_derivatives_are_computed_anew_only_where_finer_steps_change_much(
     search._correct_residuals(4)
     assert evaluate.call_count == runs
     assert search.output_substeps == 4
+
+
+def test_a_last_stage_that_stays_above_the_noise_is_not_integrated_by_finer_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A log with hysteresis in the valve lost two thirds of its search to that."""
+    monkeypatch.setattr("pneuopt.shooting.search.JUMP_ITERATIONS", 1)
+    is_noise, jumps = Search._is_noise, list[bool]()
+
+    def only_loose(search: Search, cost: float) -> bool:
+        return search.stage is FIRST and is_noise(search, cost)
+
+    def jumped(search: Search) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(Search, "_is_noise", only_loose)
+            patch.setattr(Search, "_apply_finer_steps", lambda *_: pytest.fail("finer steps"))
+            jumps.append(jump(search) is None)
+
+    jump = Search._jump_to_last_stage
+    monkeypatch.setattr(Search, "_jump_to_last_stage", jumped)
+    assert solve_least_squares(two_logs(), LeastSquares()).status.converged
+    assert jumps == [True]
