@@ -240,13 +240,23 @@ class _Race:
             if method.budget is not None:
                 method.budget.check()
             raise KeyboardInterrupt
-        too_stiff = fit.stats["iterations"] == 0 and _is_too_stiff(transcription, method)
+        too_stiff = fit.stats["iterations"] == 0 and is_too_stiff(transcription, method)
         cost = inf if too_stiff or not fit.stats["cost"] < inf else fit.stats["cost"]
         return _Trial(widths, cost, fit.count, fit.parameters, too_stiff)
 
 
-def _is_too_stiff(transcription: Transcription, method: LeastSquares) -> bool:
-    """Whether a search refuses its start for the integration steps that it takes."""
+def is_too_stiff(transcription: Transcription, method: LeastSquares) -> bool:
+    """Whether a search refuses its start for the integration steps that it takes.
+
+    Parameters
+    ----------
+    transcription : Transcription
+    method : LeastSquares
+
+    Returns
+    -------
+    bool
+    """
     segments = segment(transcription)
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     needed = method.substeps or stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA)
