@@ -52,7 +52,8 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
         With the values held, the weights and the noise levels that the fit ended with.
     fit : Fit
         A wrong basin can converge, too, but leaves residuals above the noise; so more starts are tried until two of
-        them agree on the least cost.
+        them agree on the least cost. Where a search explains the logs but for a parameter that does not settle, that
+        one is held and one more start is tried.
     label : str
         The label of its start.
 
@@ -72,10 +73,12 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
             if _explains_to_noise(held, fit) and not held.held:
                 return held, fit, start.label
+            interrupted = fit.status.code is Code.INTERRUPTED
+            if not interrupted and _is_at_noise(held, fit):
+                held, fit = fit_a_part(held, fit, start.label)
             fits.append((held, fit, start.label))
             fits.sort(key=lambda each: _rank(each[1], tightest))
-            interrupted = fit.status.code is Code.INTERRUPTED
-            if interrupted or (len(fits) > 1 and _are_alike(fits[0][1], fits[1][1])):
+            if interrupted or _are_enough(fits):
                 break
     except KeyboardInterrupt:
         if not fits:
@@ -238,9 +241,12 @@ def _explains_to_noise(problem: EstimationProblem, fit: Fit) -> bool:
 
     Where a log declares too little noise, the white part of the residuals counts in its place.
     """
-    if not fit.status.converged or fit.jumps is not None:
-        return False
-    return (
+    return fit.status.converged and _is_at_noise(problem, fit)
+
+
+def _is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
+    """Whether the residuals of a fit, converged or not, are those of the noise."""
+    return fit.jumps is None and (
         fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
         or fit.chi_square <= ACCEPTED_CHI_SQUARE_RATIO * white_chi_square(problem, fit)
     )
@@ -269,6 +275,14 @@ def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
     if fit.jumps is not None:
         return 1, cost
     return 0 if 2 * cost <= MAX_CHI_SQUARE_RATIO * fit.count else 2, cost
+
+
+def _are_enough(fits: Sequence[Candidate]) -> bool:
+    """Whether two starts agree, or the better of them explains the logs to their noise with what it holds."""
+    if len(fits) < 2:
+        return False
+    (held, best, _), (_, second, _) = fits[:2]
+    return _are_alike(best, second) or _explains_to_noise(held, best)
 
 
 def _are_alike(best: Fit, second: Fit) -> bool:

@@ -250,3 +250,24 @@ def test_a_lone_start_that_is_far_off_is_searched_to_its_end(monkeypatch: pytest
     _, fit, _ = starting.fit_from_starts(problem)
     assert fit.status.converged
     assert tried == [ABANDONED_START.verdict, fit.status.verdict]
+
+
+def test_a_fit_at_the_noise_that_leaves_one_parameter_unsettled_takes_one_more_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All starts used to be settled and searched, for minutes, before that parameter was held."""
+    problem, labels = posed(Stribeck()), list[str]()
+
+    def unsettled(problem: EstimationProblem, start: Start, _: float) -> tuple[EstimationProblem, Fit]:
+        labels.append(start.label)
+        fit = solve_least_squares(problem.transcription(start), problem.method)
+        status = Status(Code.NOT_CONVERGED, (f"{VELOCITY} would still move by 14 standard deviations",))
+        return problem, replace(fit, status=status, unsettled=(VELOCITY,))
+
+    monkeypatch.setattr(starting, "fit_holding_unidentifiable", unsettled)
+    monkeypatch.setattr(starting, "ACCEPTED_CHI_SQUARE_RATIO", 2.0)  # this log has 1.6
+    monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
+    held, fit, _ = starting.fit_from_starts(problem)
+    assert fit.status.converged
+    assert set(held.held) == {VELOCITY}
+    assert labels == [c.label for c in problem.candidates()[:2]]
