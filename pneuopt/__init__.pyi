@@ -61,6 +61,7 @@ from .evaluation.requirements import (
 from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
 from .files.drive import read_drive, write_fit
+from .files.results import load_result
 from .files.tuning import read_tuning, write_tuned
 from .identification.assumptions import Assumption
 from .identification.checkup import Checkup, check
@@ -273,6 +274,7 @@ __all__ = [
     "judge_compensators",
     "judge_dither",
     "linear_plant",
+    "load_result",
     "margins",
     "mean_start",
     "open_loop",

@@ -95,6 +95,7 @@ PUBLIC_NAMES = [
     "LeastSquares",
     "LimitCycle",
     "linear_plant",
+    "load_result",
     "Linearisation",
     "Load",
     "LoadDependent",

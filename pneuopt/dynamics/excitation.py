@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+from pneuopt.quantities.archive import NOT_SAVED
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -122,7 +123,7 @@ class Excitation:
         Parameters that no plant has below another one: static friction below Coulomb friction.
     """
 
-    needs: Mapping[str, Need] = field(default_factory=dict)
+    needs: Mapping[str, Need] = field(default_factory=dict, metadata=NOT_SAVED)
     runs: tuple[SeparatingRun, ...] = ()
     widths: tuple[Width, ...] = ()
     at_least: Mapping[str, str] = field(default_factory=dict)

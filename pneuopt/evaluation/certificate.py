@@ -43,7 +43,8 @@ from pneuopt.evaluation.report import relevant_units, report_certificate
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report, Shown
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.shown import Shown
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,7 +18,8 @@ from pneuopt.evaluation.report import report_verdict
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report, Shown
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.shown import Shown
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,7 +18,8 @@ from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report, Shown, Tone
+from pneuopt.quantities.report import Report, Tone
+from pneuopt.quantities.shown import Shown
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,7 +11,8 @@ from pneuopt.identification.marks import UNIDENTIFIABLE_NOTE as UNIDENTIFIABLE_N
 from pneuopt.identification.marks import Mark as Mark  # noqa: PLC0414
 from pneuopt.identification.report import report_fit
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report, Shown
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.shown import Shown
 from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value

@@ -20,7 +20,8 @@ from pneuopt.quantities.arguments import check_argument, check_parameters
 from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.quantities.report import Report, Shown
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.shown import Shown
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ import math
 import re
 import shutil
 import textwrap
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -146,20 +145,6 @@ class Report:
     def to_html(self) -> str:
         """A fragment of HTML, as a notebook shows it."""
         return f"<div>{''.join(map(_part_to_html, self.parts))}</div>"
-
-
-class Shown(ABC):
-    """A result that prints, and shows in a notebook, as its report."""
-
-    @abstractmethod
-    def summary(self) -> Report:
-        """What there is to know, verdict first: print it, or take its `to_text(width)` or `to_html()`."""
-
-    def __repr__(self) -> str:
-        return self.summary().to_text()
-
-    def _repr_html_(self) -> str:
-        return self.summary().to_html()
 
 
 def text_columns(*headings: str) -> tuple[Column, ...]:

@@ -18,7 +18,8 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report, Shown
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.shown import Shown
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.relaxation import describe_relaxations
 from pneuopt.tuning.report import report_tuning

@@ -23,7 +23,8 @@ from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report, Shown
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.shown import Shown
 from pneuopt.tuning.advice import LANE_DEFECTS, NO_REST, advise, find_breaks
 from pneuopt.tuning.report import report_validation, report_validation_verdict
 from pneuopt.tuning.simulator import Simulator

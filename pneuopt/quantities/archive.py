@@ -1,0 +1,192 @@
+"""Results as text: `encode` makes plain JSON values of a result's dataclasses, `decode` makes the result again.
+
+A dataclass is an object with a member a field; a mapping, an object; a sequence, a list; an enumeration, its value;
+what is not finite, "nan", "inf" or "-inf". A table is an object with "index" and "columns", lists of [name, kind,
+values], where kind is "number", "integer", "flag" or "text", and null is a missing text. Numbers have all their digits.
+"""
+
+import dataclasses
+import math
+import types
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+NOT_SAVED = {"saved": False}
+"""Metadata of a dataclass's field that a file leaves out, as it is no data; it comes back as its default."""
+_NONFINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+_PLAIN_TYPES: dict[Any, tuple[type, ...]] = {str: (str,), int: (int,), bool: (bool,), types.NoneType: (types.NoneType,)}
+_KIND_TYPES: dict[str, Any] = {"number": float, "integer": int, "flag": bool}
+
+
+class DamagedError(ValueError):
+    """What was read is not what `encode` makes; the message says where."""
+
+
+def encode(value: Any) -> Any:
+    """Plain values that JSON can hold, from a dataclass and what is in it."""
+    import pandas as pd
+
+    if isinstance(value, pd.DataFrame):
+        return _encode_frame(value)
+    if isinstance(value, Enum):
+        return value.value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: encode(getattr(value, f.name)) for f in _saved_fields(type(value))}
+    if isinstance(value, Mapping):
+        return {str(k): encode(v) for k, v in value.items()}
+    if isinstance(value, frozenset):
+        return sorted(encode(v) for v in value)
+    if isinstance(value, np.ndarray | Sequence) and not isinstance(value, str):
+        return [encode(v) for v in value]
+    return _encode_scalar(value)
+
+
+def decode(kind: Any, data: Any, where: str = "result") -> Any:
+    """The value of a type, from what `encode` has made of it.
+
+    Parameters
+    ----------
+    kind : type, or what stands in annotations
+    data : object
+    where : str
+        What the message of an error begins with.
+
+    Raises
+    ------
+    DamagedError
+        If the data are not of that kind; the values' own checks may raise an `InputError`.
+    """
+    import pandas as pd
+
+    origin, arguments = get_origin(kind), get_args(kind)
+    if kind is float:
+        return _decode_number(data, where)
+    if kind in _PLAIN_TYPES:
+        _expect(type(data) in _PLAIN_TYPES[kind], where)
+        return data
+    if origin in (Union, types.UnionType):
+        return _decode_union(arguments, data, where)
+    if kind is pd.DataFrame:
+        return _decode_frame(data, where)
+    if kind is ParameterSet:
+        return ParameterSet(decode(Mapping[str, Parameter], data, where))
+    if origin is np.ndarray:
+        return np.array(decode(tuple[float, ...], data, where), dtype=float)
+    if origin in (tuple, frozenset):
+        _expect(isinstance(data, list), where)
+        return origin(decode(arguments[0], entry, f"{where}[{k}]") for k, entry in enumerate(data))
+    if origin is not None and issubclass(origin, Mapping):
+        _expect(isinstance(data, dict), where)
+        return {name: decode(arguments[1], entry, f"{where}.{name}") for name, entry in data.items()}
+    return _decode_object(kind, data, where)
+
+
+def _decode_object(kind: Any, data: Any, where: str) -> Any:
+    """An enumeration's member, or a dataclass."""
+    import pandas as pd
+
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        _expect(data in [member.value for member in kind], where)
+        return kind(data)
+    _expect(isinstance(data, dict), where)
+    hints = get_type_hints(kind, localns={"pd": pd})
+    known = {f.name: f for f in _saved_fields(kind)}
+    unknown = sorted(set(data) - set(known))
+    _expect(not unknown, f"{where}.{unknown[0]}" if unknown else where)
+    for name, field in known.items():
+        optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+        _expect(name in data or optional, f"{where}.{name}")
+    return kind(**{name: decode(hints[name], entry, f"{where}.{name}") for name, entry in data.items()})
+
+
+def _saved_fields(kind: Any) -> list[dataclasses.Field[Any]]:
+    return [f for f in dataclasses.fields(kind) if f.metadata.get("saved", True)]
+
+
+def _encode_scalar(value: Any) -> Any:
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{type(value).__name__} is nothing that a result is saved with")
+
+
+def _decode_number(data: Any, where: str) -> float:
+    if isinstance(data, str):
+        _expect(data in _NONFINITE, where)
+        return _NONFINITE[data]
+    _expect(isinstance(data, int | float) and not isinstance(data, bool), where)
+    return float(data)
+
+
+def _decode_union(kinds: tuple[Any, ...], data: Any, where: str) -> Any:
+    """The first kind that the data are of; the last one's error where they are of none."""
+    for kind in kinds[:-1]:
+        try:
+            return decode(kind, data, where)
+        except DamagedError:
+            continue
+    return decode(kinds[-1], data, where)
+
+
+def _encode_frame(frame: "pd.DataFrame") -> dict[str, Any]:
+    levels = [frame.index.get_level_values(k) for k in range(frame.index.nlevels)]
+    return {
+        "index": [_encode_column(level.name, level) for level in levels],
+        "columns": [_encode_column(name, column) for name, column in frame.items()],
+    }
+
+
+def _encode_column(name: Any, column: Any) -> list[Any]:
+    kinds = {"f": "number", "i": "integer", "b": "flag"}
+    kind = kinds.get(getattr(column.dtype, "kind", ""), "text")
+    values = column.tolist()
+    if kind == "text":
+        values = [None if isinstance(v, float) and math.isnan(v) else v for v in values]
+        kind = "flag" if values and all(isinstance(v, bool) for v in values) else kind
+    return [name, kind, encode(values)]
+
+
+def _decode_frame(data: Any, where: str) -> "pd.DataFrame":
+    import pandas as pd
+
+    _expect(isinstance(data, dict) and set(data) == {"index", "columns"} and len(data["index"]) > 0, where)
+    levels = [_decode_column(level, f"{where}.index") for level in data["index"]]
+    columns = [_decode_column(column, f"{where}.columns") for column in data["columns"]]
+    lengths = {len(values) for _, values in (*levels, *columns)}
+    _expect(len(lengths) == 1, where)
+    names = [name for name, _ in levels]
+    index = (
+        pd.Index(levels[0][1], name=names[0])
+        if len(levels) == 1
+        else pd.MultiIndex.from_arrays([values for _, values in levels], names=names)
+    )
+    frame = pd.DataFrame(dict(enumerate(values for _, values in columns)), index=index)
+    return frame.set_axis([name for name, _ in columns], axis=1)
+
+
+def _decode_column(data: Any, where: str) -> tuple[str | None, Any]:
+    """Name and values of a column, or of a level of the index."""
+    _expect(isinstance(data, list) and len(data) == 3 and isinstance(data[2], list), where)
+    name, kind, values = data
+    _expect(isinstance(name, str | None), where)
+    if kind == "text":
+        _expect(all(isinstance(v, str | None) for v in values), f"{where}.{name}")
+        return name, [math.nan if v is None else v for v in values]
+    _expect(kind in _KIND_TYPES, f"{where}.{name}")
+    plain = _KIND_TYPES[kind]
+    return name, np.array([decode(plain, v, f"{where}.{name}") for v in values], dtype=plain)
+
+
+def _expect(condition: bool, where: str) -> None:
+    if not condition:
+        raise DamagedError(where)
