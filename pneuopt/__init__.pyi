@@ -123,6 +123,7 @@ from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
+from .studies.journal import Journal
 from .studies.neighbours import search_again, sweep_from_neighbours
 from .studies.sweep import grid, sweep
 from .tuning.pareto import pareto_front
@@ -182,6 +183,7 @@ __all__ = [
     "Intersample",
     "IsentropicNozzle",
     "Iso6358",
+    "Journal",
     "Karnopp",
     "Knocker",
     "LeastSquares",

@@ -90,6 +90,7 @@ PUBLIC_NAMES = [
     "ITAE",
     "judge_compensators",
     "judge_dither",
+    "Journal",
     "Karnopp",
     "Knocker",
     "LeastSquares",

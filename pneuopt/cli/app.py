@@ -1,7 +1,8 @@
 """The command line: `pneuopt init | check | identify | tune | simulate | study | keys | info`.
 
-Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 130
-interrupted. Each command imports what it needs, so that `--help` waits for no heavy import.
+Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
+error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it
+needs, so that `--help` waits for no heavy import.
 """
 
 import sys
@@ -15,12 +16,15 @@ from typing import Annotated
 import typer
 
 from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED
+from pneuopt.cli.guard import run_guarded
+from pneuopt.cli.interruption import interruption_status
 from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
+from pneuopt.quantities.source import read_once
 
 app = typer.Typer(
     name="pneuopt",
     help="Identify and optimally tune pneumatic drives: friction from logs, PID and dither together, certified.",
-    epilog="Exit status: 0 good, 1 not converged or not certified, 2 bad input, 130 interrupted.",
+    epilog="Exit status: 0 good, 1 not converged or not certified, 2 bad input, 70 a bug, 130 interrupted.",
     add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -42,11 +46,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
 
 def main() -> None:
-    """Run the command line."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a console that lacks a letter shows "?" instead of failing
-            stream.reconfigure(errors="replace")
-    app()
+    """Run the command line; `pneuopt.__main__` does the same, and listens to signals while this is imported."""
+    run_guarded(lambda: app)
 
 
 @app.callback(invoke_without_command=True)
@@ -252,7 +253,7 @@ def info_command() -> None:
 def _report_errors() -> Iterator[None]:
     """Turn an error that a user can mend into one message and an exit status, and a `PhysicsWarning` into one line."""
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), read_once():
             warnings.simplefilter("always", PhysicsWarning)
             warnings.showwarning = _warning_printer()
             yield
@@ -264,7 +265,7 @@ def _report_errors() -> Iterator[None]:
         raise typer.Exit(EXIT_FAILURE) from None
     except KeyboardInterrupt:
         _say("interrupted: no file was left half-written")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+        raise typer.Exit(interruption_status() or EXIT_INTERRUPTED) from None
 
 
 def _say(sentence: str) -> None:

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
-from pneuopt.cli.shared import Outputs, figure_writers, finish
+from pneuopt.cli.shared import Outputs, finish
 from pneuopt.cli.terminal import make_console, show_sentence
 from pneuopt.dynamics.system import System
 from pneuopt.files.assumptions import read_option_assumptions
@@ -39,8 +40,7 @@ def run_check(drive: Path, logs: Sequence[Path], outputs: Outputs, accept: Seque
     found = check(system, experiments, parameters)
     found = replace(found, assumptions=(*found.assumptions, *read_option_assumptions(drive)))
     typer.echo(found.format(make_console().width))
-    writers = {} if outputs.plot is None else figure_writers(outputs.plot, _figures(found))
-    finish(outputs, writers, found.to_dict(), None)
+    finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found))
     if errors:
         return EXIT_BAD_INPUT
     return EXIT_FAILURE if found.is_refused else EXIT_SUCCESS

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
-    figure_writers,
     file_hashes,
     finish,
     stats_and_provenance,
@@ -19,7 +18,7 @@ from pneuopt.cli.shared import (
     warn_of_status,
     write_csv,
 )
-from pneuopt.cli.terminal import make_console, progress, show_report
+from pneuopt.cli.terminal import progress
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
 from pneuopt.identification.checkup import MODEL_CHECK, check
@@ -46,6 +45,7 @@ from pneuopt.plotting import (
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
@@ -79,7 +79,6 @@ def run_identify(
         result = identify(
             system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
         )
-    show_report(make_console(), result.summary())
     tables = {
         "estimates": records(result.estimates),
         "fit": records(result.fit),
@@ -87,12 +86,14 @@ def run_identify(
         "widths": [asdict(width) for width in result.widths],
         "window": asdict(result.window) if result.window else None,
     }
-    writers: Writers = {}
-    if outputs.output is not None:
-        writers[outputs.output] = partial(write_fit, outputs.output, drive, result)
-    if outputs.plot is not None:
-        writers |= figure_writers(outputs.plot, _fit_figures(system, result, experiments, found.findings))
-    return finish(outputs, writers, tables | stats_and_provenance(result), result.status)
+    return finish(
+        outputs,
+        {} if outputs.output is None else {outputs.output: partial(write_fit, source=drive, result=result)},
+        tables | stats_and_provenance(result),
+        result.status,
+        figures=partial(_fit_figures, system, result, experiments, found.findings),
+        report=result.summary(),
+    )
 
 
 def run_select(
@@ -117,9 +118,9 @@ def run_select(
             window=window,
             method=LeastSquares(progress=report_progress),
         )
-    show_report(make_console(), chosen.summary())
     tables = {"recommended": chosen.recommended, "reason": chosen.reason, "candidates": records(chosen.table)}
-    return finish(outputs, {}, tables, chosen.fits[chosen.recommended].status)
+    status = chosen.fits[chosen.recommended].status
+    return finish(outputs, {}, tables, status, report=chosen.summary())
 
 
 def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, quiet: bool = False) -> int:
@@ -131,18 +132,23 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
     warn_of_status(fit)
     with progress("predicting", quiet=quiet) as report_progress:
         table = validate(system, [experiment], parameters, window=window, progress=report_progress)
-    show_report(make_console(), report_agreement(table))
-    writers: Writers = {}
+    runs = list[Trajectory]()
     if outputs.output is not None or outputs.plot is not None:
         with progress("simulating", quiet=quiet) as report_progress:
-            run = predict(system, experiment, parameters, window=window, progress=report_progress)
-        if outputs.plot is not None:
-            writers |= figure_writers(outputs.plot, {"": plot_prediction([run], [experiment], label="predicted")})
-        if outputs.output is not None:
-            given = {q.name: experiment.trajectory[q.name] for q in system.inputs}
-            columns = {q.name: (q.name, q.unit) for q in (*system.inputs, *system.outputs)}
-            writers[outputs.output] = partial(write_csv, outputs.output, run.with_columns(given), columns)
-    return finish(outputs, writers, {"fit": records(table), "provenance": file_hashes(fit, log)}, None)
+            runs.append(predict(system, experiment, parameters, window=window, progress=report_progress))
+    writers: Writers = {}
+    if outputs.output is not None:
+        given = {q.name: experiment.trajectory[q.name] for q in system.inputs}
+        columns = {q.name: (q.name, q.unit) for q in (*system.inputs, *system.outputs)}
+        writers[outputs.output] = partial(write_csv, run=runs[0].with_columns(given), columns=columns)
+    hashes = file_hashes(fit) | {f"sha256[{log.name}]": experiment.sha256}
+    tables = {"fit": records(table), "provenance": hashes}
+    figures = partial(_prediction_figures, runs, experiment)
+    return finish(outputs, writers, tables, None, figures=figures, report=report_agreement(table))
+
+
+def _prediction_figures(runs: Sequence[Trajectory], experiment: Experiment) -> dict[str, "Figure"]:
+    return {"": plot_prediction(runs, [experiment], label="predicted")}
 
 
 @contextmanager
@@ -155,8 +161,8 @@ def _draw_refusal(outputs: Outputs) -> Iterator[None]:
             raise
         if outputs.plot is None:
             raise LogError(f"{error}; --plot refusal.png draws it", error.finding) from None
-        figure = {REFUSAL_FIGURE: plot_finding(error.finding)}
-        finish(replace(outputs, json=None), figure_writers(outputs.plot, figure), {}, None)
+        figures = {REFUSAL_FIGURE: plot_finding(error.finding)}
+        finish(replace(outputs, json=None), {}, {}, None, figures=lambda: figures)
         raise
 
 

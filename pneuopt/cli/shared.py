@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
-from pneuopt.cli.terminal import make_console, show_output_files, show_sentence
+from pneuopt.cli.interruption import interruption_status, without_interruption
+from pneuopt.cli.terminal import make_console, show_output_files, show_report, show_sentence
 from pneuopt.files.drive import read_drive, read_marks, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.plotting import check_figure_path, save_figure
+from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.output import check_output_paths, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.source import read_toml_source
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.tune import TuningResult
@@ -26,7 +30,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Columns = Mapping[str, tuple[str, str]]
-Writers = dict[Path, Callable[[], None]]
+Writers = dict[Path, Callable[[Path], None]]
+Figures = Callable[[], Mapping[str, "Figure"]]
+
+
+INTERRUPTED_STEM = "interrupted"
+"""What the name of an interrupted command's file ends in where a file is there already."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +60,83 @@ class Outputs:
         check_output_paths([self.output, self.json, *figures], inputs)
 
 
-def finish(outputs: Outputs, writers: Writers, tables: Mapping[str, Any], status: Status | None) -> int:
-    """Write all files and say which; returns the exit status."""
+def finish(
+    outputs: Outputs,
+    writers: Writers,
+    tables: Mapping[str, Any],
+    status: Status | None,
+    *,
+    figures: Figures | None = None,
+    report: Report | None = None,
+) -> int:
+    """Write all files, then show the result and say which are written; returns the exit status.
+
+    Each file is tried, whatever becomes of the others. An interrupted command draws no figures, and replaces no file:
+    its own stand beside those that are there.
+
+    Parameters
+    ----------
+    outputs : Outputs
+    writers : mapping of Path to callable
+        How to write each file but the JSON and the figures.
+    tables : mapping of str to object
+        What the JSON file holds.
+    status : Status or None
+    figures : callable, optional
+        Draws the figures, by the name that is added to the path of the first, which has none.
+    report : Report, optional
+        What is shown of the result.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
     ended = {"status": {"code": status.code.value, "message": status.message}} if status else {}
     if outputs.json is not None:
-        writers = {**writers, outputs.json: partial(write_json, outputs.json, {**ended, **tables})}
-    for write in writers.values():
-        write()
-    show_output_files(make_console(), list(writers))
+        writers = {**writers, outputs.json: partial(write_json, document={**ended, **tables})}
+    interrupted = interruption_status() is not None or (status is not None and status.code is Code.INTERRUPTED)
+    written, failures = write_files(writers, beside=interrupted)
+    if figures is not None and outputs.plot is not None and not interrupted:
+        drawn, missed = _draw(outputs.plot, figures)
+        written, failures = written + drawn, failures + missed
+    if report is not None:
+        show_report(make_console(), report)
+    show_output_files(make_console(), written)
+    if failures:
+        raise InputError("; ".join(map(str, failures)))
     if status is None or status.code in (Code.CONVERGED, Code.PARTIAL):
         return EXIT_SUCCESS
-    return EXIT_INTERRUPTED if status.code is Code.INTERRUPTED else EXIT_FAILURE
+    return EXIT_INTERRUPTED if interrupted else EXIT_FAILURE
+
+
+def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], list[InputError]]:
+    """Try to write each file, with no interruption within; those that are written, and why others are not.
+
+    Parameters
+    ----------
+    writers : mapping of Path to callable
+    beside : bool
+        Whether a file that is there already stays, and the new one gets a name of its own.
+    """
+    written, failures = list[Path](), list[InputError]()
+    with without_interruption():
+        for path, write in writers.items():
+            place = add_to_stem(path, INTERRUPTED_STEM) if beside and path.exists() else path
+            try:
+                write(place)
+                written.append(place)
+            except InputError as error:
+                failures.append(error)
+    return written, failures
+
+
+def _draw(path: Path, figures: Figures) -> tuple[list[Path], list[InputError]]:
+    """Draw and write the figures; Ctrl-C leaves out those that are not drawn yet."""
+    try:
+        return write_files(figure_writers(path, figures()))
+    except KeyboardInterrupt:
+        return [], []
 
 
 def read_fit_and_tuning(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
@@ -90,7 +165,7 @@ def warn(message: str) -> None:
 def figure_writers(path: Path, figures: Mapping[str, "Figure"]) -> Writers:
     """Each figure in a file of its own, the one without a name at the path itself."""
     places = {name: add_to_stem(path, name) if name else path for name in figures}
-    return {places[name]: partial(save_figure, figure, places[name]) for name, figure in figures.items()}
+    return {places[name]: partial(save_figure, figure) for name, figure in figures.items()}
 
 
 def add_to_stem(path: Path, name: str) -> Path:
@@ -112,5 +187,5 @@ def stats_and_provenance(result: IdentificationResult | TuningResult) -> dict[st
 
 
 def file_hashes(*paths: Path) -> dict[str, str]:
-    """The SHA-256 of each file, for provenance."""
-    return {f"sha256[{path.name}]": hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    """The SHA-256 of each TOML file as it was read, for provenance."""
+    return {f"sha256[{path.name}]": hashlib.sha256(read_toml_source(path)).hexdigest() for path in paths}

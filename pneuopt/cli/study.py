@@ -1,23 +1,25 @@
 """`pneuopt study`: a loop certified over a grid of parameters, or tuned along a Pareto front."""
 
+import hashlib
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pneuopt import __version__
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
-    figure_writers,
     file_hashes,
     finish,
     read_fit_and_tuning,
+    warn,
     warn_of_status,
 )
 from pneuopt.cli.show_studies import report_cases, report_front
-from pneuopt.cli.terminal import make_console, progress, show_report
+from pneuopt.cli.terminal import progress
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.metric import Requirement, Sense
@@ -42,7 +44,10 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.source import read_once, read_toml_source
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
+from pneuopt.studies.journal import Journal
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.sweep import grid, sweep
@@ -79,58 +84,83 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
         cases = grid(parameters, {axis.name: axis.points for axis in axes})
     except InputError as error:
         raise InputError(f"{file}: [axes] {error}") from None
-    table = _tune_cells(study, task, parameters, axes, quiet) if study.tune else None
-    if table is None:
+    journal = _open_journal(study, outputs, len(cases))
+    if study.tune:
+        table = _tune_cells(study, task, parameters, axes, quiet, journal)
+    else:
         band = study.band or task.specification.band
         certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
         with progress("certifying", quiet=quiet) as report_progress:
-            table = sweep(certify, parameters, cases, progress=report_progress)
+            table = sweep(certify, parameters, cases, progress=report_progress, journal=journal)
     verdict, status = _grid_verdict(table, len(task.references))
     seen = _worst_of_references(table, axes, study.show)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     breaks = table["case"][table["breaks"]] if study.tune else ()
     flags = tuple(Line(f"{case}: breaks with its neighbours, also searched from their gains") for case in breaks)
-    show_report(make_console(), _lead(verdict, status) + report_cases(seen, written, metrics) + Report(flags))
+    report = _lead(verdict, status) + report_cases(seen, written, metrics) + Report(flags)
     writers: Writers = {}
     if outputs.output is not None:
         text = _grid_csv(table, {n: parameters[n].unit for n in written}, task.loop)
-        writers[outputs.output] = partial(write_text, outputs.output, text)
-    if outputs.plot is not None:
-        writers |= figure_writers(outputs.plot, {"": plot_map(seen, written, metrics)})
+        writers[outputs.output] = partial(write_text, text=text)
     tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
-    finish(outputs, writers, tables, None)
+    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
+    finish(outputs, writers, tables, stopped, figures=lambda: {"": plot_map(seen, written, metrics)}, report=report)
+    if journal is not None:
+        journal.close(finished=stopped is None)
     return status
 
 
+def _open_journal(study: Study, outputs: Outputs, count: int) -> Journal | None:
+    """Where the cases are kept as they come: beside the file that is asked for."""
+    place = outputs.output or outputs.json
+    if place is None:
+        return None
+    used = (study.path, study.drive, study.tuning)
+    made_of = [__version__.encode(), *(hashlib.sha256(read_toml_source(path)).digest() for path in used)]
+    journal = Journal(place.with_name(f"{place.name}.journal"), hashlib.sha256(b"".join(made_of)).hexdigest())
+    if journal.known:
+        warn(f"{journal.path}: {len(journal.known)} of {count} cases are known from an earlier run of this study")
+    return journal
+
+
 def _tune_cells(
-    study: Study, task: Tuning, parameters: ParameterSet, axes: Sequence[SweptAxis], quiet: bool
+    study: Study,
+    task: Tuning,
+    parameters: ParameterSet,
+    axes: Sequence[SweptAxis],
+    quiet: bool,
+    journal: Journal | None,
 ) -> "pd.DataFrame":
     """Tune every cell of the grid, each from the gains of its neighbours: a row a cell, with metrics and gains."""
     require(bool(task.specification.weights), f"{study.tuning}: has nothing to minimise; add [minimise]")
     free = task.parameters.free_names
     require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
     points = {axis.name: axis.points for axis in axes}
-    with progress("tuning", quiet=quiet) as report_progress:
+    with progress("tuning", quiet=quiet) as report_progress, read_once() as sources:
         table = sweep_from_neighbours(
-            partial(tune_cell, study.drive, study.tuning),
+            partial(tune_cell, sources, study.drive, study.tuning),
             parameters,
             points,
             value=OBJECTIVE,
             starts={f"{FOUND} {n}": n for n in free},
             progress=report_progress,
+            journal=journal,
         )
     return table.rename(columns={f"{FOUND} {n}": n for n in free})
 
 
-def tune_cell(drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
+def tune_cell(sources: Mapping[str, bytes], drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
     """One cell of a study: the certified metrics of the gains tuned for it, the objective and the gains.
+
+    The files are those that the study has read: in another process they may have moved.
 
     Raises
     ------
     ConvergenceError
         If no design is certified.
     """
-    task = read_tuning(tuning, read_drive(drive)[0].system(), parameters)
+    with read_once(sources):
+        task = read_tuning(tuning, read_drive(drive)[0].system(), parameters)
     result = tune(
         task.loop,
         task.references,
@@ -176,16 +206,16 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
         {n: parameters[n].unit for n in front if n in free},
     )
     verdict, status = _front_verdict(front, pair)
-    show_report(make_console(), _lead(verdict, status) + report_front(front, pair, gains))
+    report = _lead(verdict, status) + report_front(front, pair, gains)
     writers: Writers = {}
     if outputs.output is not None:
         claimed = {f"claimed {n}": unit for n, unit in pair.items()}
         units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
-        writers[outputs.output] = partial(write_text, outputs.output, _to_csv(front, units))
-    if outputs.plot is not None:
-        writers |= figure_writers(outputs.plot, {"": plot_front(front, pair)})
-    tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}}
-    finish(outputs, writers, tables | {"provenance": file_hashes(study.path, study.drive, study.tuning)}, None)
+        writers[outputs.output] = partial(write_text, text=_to_csv(front, units))
+    hashes = file_hashes(study.path, study.drive, study.tuning)
+    tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
+    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
+    finish(outputs, writers, tables, stopped, figures=lambda: {"": plot_front(front, pair)}, report=report)
     return status
 
 

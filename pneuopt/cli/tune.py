@@ -1,5 +1,6 @@
 """`pneuopt tune` and `pneuopt simulate`: a loop's gains, and its response."""
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -7,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pneuopt.cli.exit_status import EXIT_INTERRUPTED
+from pneuopt.cli.interruption import interruption_status
 from pneuopt.cli.shared import (
     Columns,
     Outputs,
     Writers,
     add_to_stem,
-    figure_writers,
     file_hashes,
     finish,
     read_fit_and_tuning,
     stats_and_provenance,
     write_csv,
+    write_files,
 )
-from pneuopt.cli.terminal import make_console, progress, show_report, show_sentence
+from pneuopt.cli.terminal import make_console, progress, show_output_files, show_report, show_sentence
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop
@@ -61,20 +62,24 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     with progress("tuning", quiet=quiet) as report_progress:
         result = _tune_task(task, parameters, fit, rig, report_progress)
     result = replace(result, provenance={**result.provenance, **file_hashes(*inputs)})
-    console = make_console()
+    stopped = result.status.code is Code.INTERRUPTED or interruption_status() is not None
+    gains: Writers = {}
+    if outputs.output is not None:
+        gains[outputs.output] = partial(write_tuned, source=tuning, result=result, wire=task.wire)
+    saved, failures = write_files(gains, beside=stopped)  # before the search without dither, which takes as long
+    console, shown = make_console(), _design_tables(result)
     was = _initial_metrics(task, parameters) if result.status.converged and result.on_rig is None else None
     show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
-    shown = _design_tables(result) | _compare_dither(console, task, parameters, result, quiet)
-    if result.status.code is Code.INTERRUPTED:
-        show_sentence(console, "no file is written")
-        return EXIT_INTERRUPTED
-    writers: Writers = {}
-    if outputs.output is not None:
-        writers[outputs.output] = partial(write_tuned, outputs.output, tuning, result, task.wire)
-    if outputs.plot is not None:
-        before_gains = parameters if result.status.converged else None
-        writers |= figure_writers(outputs.plot, _loop_figures(task, result.parameters, before_gains))
-    return finish(outputs, writers, _tuning_tables(result) | shown | stats_and_provenance(result), result.status)
+    with suppress(KeyboardInterrupt):
+        shown |= _compare_dither(console, task, parameters, result, quiet)
+    show_output_files(console, saved)
+    before_gains = parameters if result.status.converged else None
+    figures = partial(_loop_figures, task, result.parameters, before_gains)
+    tables = _tuning_tables(result) | shown | stats_and_provenance(result)
+    status = finish(outputs, {}, tables, result.status, figures=figures)
+    if failures:
+        raise failures[0]
+    return status
 
 
 def _tune_task(
@@ -114,19 +119,18 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
         envelope=task.specification.envelope,
         max_steps=task.max_steps,
     )
-    limits = metric_limits(task.specification.limits)
-    show_report(make_console(), report_metrics(metrics, relevant_units(task.loop), limits=limits))
     writers: Writers = {}
     if outputs.output is not None:
         runs = [_as_logged(r, task.centre) for r in _simulate_responses(task, parameters)]
         paths = number_paths(outputs.output, len(runs))
         check_output_paths(paths, [fit, tuning])
         columns = _loop_columns(task.loop)
-        writers |= {p: partial(write_csv, p, run, columns) for p, run in zip(paths, runs, strict=True)}
-    if outputs.plot is not None:
-        writers |= figure_writers(outputs.plot, _loop_figures(task, parameters, None))
+        writers |= {p: partial(write_csv, run=run, columns=columns) for p, run in zip(paths, runs, strict=True)}
     tables = {"certified": records(metrics.T), "provenance": file_hashes(fit, tuning)}
-    return finish(outputs, writers, tables, None)
+    figures = partial(_loop_figures, task, parameters, None)
+    limits = metric_limits(task.specification.limits)
+    report = report_metrics(metrics, relevant_units(task.loop), limits=limits)
+    return finish(outputs, writers, tables, None, figures=figures, report=report)
 
 
 def _design_tables(result: TuningResult) -> dict[str, Any]:
@@ -140,11 +144,16 @@ def _design_tables(result: TuningResult) -> dict[str, Any]:
 def _compare_dither(
     console: "Console", task: Tuning, before: ParameterSet, result: TuningResult, quiet: bool
 ) -> dict[str, Any]:
-    """Show whether a certified design's dither is worth its price; returns the table of that."""
-    if not result.status.converged:
+    """Show whether a certified design's dither is worth its price; returns the table of that.
+
+    An interrupted command computes nothing more.
+    """
+    if not result.status.converged or interruption_status() is not None:
         return {}
     if task.loop.dither_period(result.parameters) is not None:
         rival = tune_rival(console, task, before, quiet)
+        if interruption_status() is not None:
+            return {}
         return _show_dither_verdict(console, task, result.parameters, rival)
     if DITHER_AMPLITUDE in result.parameters.free_names:
         show_sentence(console, "the dither's amplitude is 0: the tuning found no use for it")
@@ -194,7 +203,9 @@ def _show_dither_verdict(
 
 
 def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
-    """The metrics with the gains as given; None where that loop cannot be simulated."""
+    """The metrics with the gains as given; None where that loop cannot be simulated, or no time is left for it."""
+    if interruption_status() is not None:
+        return None
     try:
         return evaluate(
             task.loop,
@@ -205,7 +216,7 @@ def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | 
             envelope=task.specification.envelope,
             max_steps=task.max_steps,
         )
-    except (ConvergenceError, InputError):
+    except (ConvergenceError, InputError, KeyboardInterrupt):
         return None
 
 

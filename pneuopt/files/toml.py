@@ -17,6 +17,7 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import PARAMETER_KEYS, Takes
 from pneuopt.quantities.output import plain_value
 from pneuopt.quantities.parameters import Parameter
+from pneuopt.quantities.source import MAX_REASON, read_toml_source
 from pneuopt.quantities.units import read_value, write_value
 
 Made = TypeVar("Made")
@@ -43,14 +44,13 @@ def read_toml(path: str | Path) -> tomlkit.TOMLDocument:
     InputError
         If the file cannot be read, or is not TOML; the message names the line.
     """
+    raw = read_toml_source(path)
     try:
-        return tomlkit.parse(Path(path).read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
+        return tomlkit.parse(raw.decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8; save it so") from None
-    except TOMLKitError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    except (TOMLKitError, ValueError, RecursionError) as error:  # ValueError: a number of thousands of digits
+        raise InputError(f"{path}: not valid TOML: {' '.join(str(error).split())[:MAX_REASON]}") from None
 
 
 @dataclass(frozen=True)

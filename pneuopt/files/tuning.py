@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +51,7 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Takes
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.status import Code
 from pneuopt.quantities.units import count_gauge_from, read_value, write_value
 from pneuopt.tuning.method import Method
 
@@ -165,18 +167,26 @@ def write_tuned(
     document = read_toml(source)
     for name in TUNED_SECTIONS:
         document.pop(name, None)
-    status = {"code": result.status.code.value, "message": result.status.message}
+    status: dict[str, Any] = {"code": result.status.code.value, "message": result.status.message}
     if result.status.converged:
         _write_gains(document, result.parameters, source)
         rows = result.certified.to_dict(orient="dict")
         document["certified"] = toml_table({str(name): inline_table(row) for name, row in rows.items()})
     else:
         status["gains"] = f"as in {Path(source).name}: not tuned"
+        if result.status.code is Code.INTERRUPTED:
+            status["best_so_far"] = inline_table(_rejected_gains(result))
     if wire:
         document["wire"] = toml_table(wire)
     document["status"] = toml_table(status)
     document["provenance"] = toml_table(plain_value(result.provenance))
     write_text(path, tomlkit.dumps(document))
+
+
+def _rejected_gains(result: "TuningResult") -> dict[str, float]:
+    """The gains that an interrupted search had found [SI], which do not stand."""
+    found = {n.removeprefix("rejected."): v for n, v in result.stats.items() if n.startswith("rejected.")}
+    return {n: v for n, v in found.items() if isfinite(v)}
 
 
 def read_scenarios(table: Mapping[str, Any], where: str, parameters: ParameterSet) -> Scenarios:

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from pneuopt.quantities.errors import InputError, LogError
+from pneuopt.quantities.source import MAX_REASON
 
-MAX_REASON = 200
-"""Length of a library's own words in a message [character]: more may show the whole file."""
 MAX_SECONDS = 120.0
 """Time for a library [s] in a process of its own: more looks like a hang; less refuses logs of 100 MB."""
 

@@ -7,15 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pneuopt.logs.budget import MAX_NESTING, MAX_SIDECAR_BYTES, read_bytes
+from pneuopt.logs.budget import read_bytes
 from pneuopt.logs.experiments import Experiment, experiment_from_table
 from pneuopt.logs.plant_channels import Plant
 from pneuopt.logs.readers import read_table
 from pneuopt.logs.sidecar_keys import ACCEPTED_CHECKS, INTERSAMPLE_KEY, SIDECAR_KEYS
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.intersample import Intersample
+from pneuopt.quantities.source import MAX_TOML_BYTES, check_nesting
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import ATMOSPHERE, count_gauge_from, read_si, read_value
 
@@ -85,7 +84,7 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
     side = path.with_suffix(".toml") if sidecar is None else Path(sidecar)
     if sidecar is None and not side.exists():
         return side, {}
-    sections = _parse_toml(side, read_bytes(side, MAX_SIDECAR_BYTES))
+    sections = _parse_toml(side, read_bytes(side, MAX_TOML_BYTES))
     other = f"{side}: is a drive, but has the name of the sidecar of {path.name}; rename one of them"
     require(sidecar is not None or "drive" not in sections, other, LogError)
     check_names("key", sections, SIDECAR_KEYS, str(side))
@@ -102,9 +101,7 @@ def _read_sidecar(path: Path, sidecar: str | Path | None) -> tuple[Path, Mapping
 
 
 def _parse_toml(path: Path, raw: bytes) -> dict[str, Any]:
-    brackets = np.frombuffer(raw, np.uint8)
-    depth = np.cumsum(np.isin(brackets, list(b"[{")).astype(int) - np.isin(brackets, list(b"]}")))
-    require(depth.max(initial=0) <= MAX_NESTING, f"{path}: too many brackets in brackets; a sidecar has 2", LogError)
+    check_nesting(path, raw, LogError)
     try:
         return tomllib.loads(raw.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # of which TOMLDecodeError and UnicodeDecodeError are

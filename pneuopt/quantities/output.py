@@ -1,8 +1,11 @@
 """Files written whole or not at all, and refused before the work where they could not be written after it."""
 
+import contextlib
 import json
 import math
 import os
+import secrets
+import stat
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,23 +39,28 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     Parameters
     ----------
     path : str or Path
+        A link is followed: the file that it names is replaced. A file that is there keeps its mode and owner.
     content : bytes
 
     Raises
     ------
     InputError
-        If the folder does not exist, or cannot be written to.
+        If the folder does not exist or cannot be written to, or the path is a device, a pipe or write-protected.
     """
-    path = Path(path)
-    require(path.parent.is_dir(), f"{path}: the folder does not exist; make it first")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    place = _check_place(Path(path))
+    part = place.with_name(f".{secrets.token_hex(6)}.part")
     try:
-        part.write_bytes(content)
-        part.replace(path)
+        with part.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        _keep_mode(place, part)
+        part.replace(place)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder") from None
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def write_records(path: str | Path, frame: "pd.DataFrame") -> None:
@@ -121,16 +129,50 @@ def check_output_paths(outputs: Iterable[Path | None], inputs: Iterable[Path]) -
     InputError
         The message names the file and the remedy.
     """
-    read = {path.resolve() for path in inputs}
+    read = {os.path.realpath(path) for path in inputs}
     taken: set[Path] = set()
     for path in (p for p in outputs if p is not None):
-        place = path.resolve()
-        require(place not in read, f"{path}: is an input of this command; give the output another name")
+        place = _check_place(path)
+        require(str(place) not in read, f"{path}: is an input of this command; give the output another name")
         require(place not in taken, f"{path}: is named for two outputs; give each a name of its own")
-        require(place.parent.is_dir(), f"{path}: the folder does not exist; make it first")
-        require(not place.is_dir(), f"{path}: is a folder; name a file in it")
         require(os.access(place.parent, os.W_OK), f"{path}: the folder cannot be written to; choose another")
         taken.add(place)
+
+
+def _check_place(path: Path) -> Path:
+    """The file that a path names, behind links; refused where a plain file cannot be put in its place."""
+    try:
+        place = Path(os.path.realpath(path))
+        require(place.parent.is_dir(), f"{path}: the folder does not exist; make it first")
+        entry = _stat_if_there(place)
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{str(path)!r}"[1:-1] + f": cannot be written ({reason}); choose another name") from None
+    if entry is not None:
+        require(not stat.S_ISDIR(entry.st_mode), f"{path}: is a folder; name a file in it")
+        require(stat.S_ISREG(entry.st_mode), f"{path}: is a pipe or a device, no file; name a file")
+        require(os.access(place, os.W_OK), f"{path}: is write-protected; choose another name, or unlock it")
+    return place
+
+
+def _stat_if_there(place: Path) -> os.stat_result | None:
+    """A file's state; None where it is not there. A name that is too long, or no name, raises."""
+    try:
+        return place.lstat()
+    except FileNotFoundError:
+        return None
+
+
+def _keep_mode(place: Path, part: Path) -> None:
+    """Give a file's mode, and its owner if we may, to the one that takes its place."""
+    entry = _stat_if_there(place)
+    if entry is None:
+        return
+    with contextlib.suppress(OSError, AttributeError):  # AttributeError: Windows has no owners
+        os.chown(part, entry.st_uid, entry.st_gid)
+    part.chmod(stat.S_IMODE(entry.st_mode))
 
 
 def _to_json(value: Any) -> str:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress
-from pneuopt.studies.outcome import CaseFunction
+from pneuopt.studies.journal import Journal
+from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction
 from pneuopt.studies.sweep import grid, sweep
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def sweep_from_neighbours(
     starts: Mapping[str, str],
     executor: Executor | None = None,
     progress: Callable[[Progress], None] | None = None,
+    journal: Journal | None = None,
 ) -> "pd.DataFrame":
     """Compute a search in every cell of a grid, each from the result of the best neighbour that is known already.
 
@@ -44,6 +46,8 @@ def sweep_from_neighbours(
     ----------
     fn, parameters, executor, progress
         As for `sweep`.
+    journal : Journal, optional
+        As for `sweep`; what is computed again at the end is not in it.
     axes : mapping of str to sequence of float
         As for `grid`.
     value, starts
@@ -82,15 +86,23 @@ def sweep_from_neighbours(
     places = {n: _places(axes[n]) for n in axes}
     for wave in _waves(parameters, cases, axes):
         chosen = {name: cases[name] | _start_beside(table, cases[name], places, value, starts) for name in wave}
-        found = sweep(fn, parameters, chosen, executor=executor, progress=progress)
+        found = sweep(fn, parameters, chosen, executor=executor, progress=progress, journal=journal)
         found = found.drop(columns=[n for n in starts.values() if n in found])
         found = found.assign(**{n: [cases[name][n] for name in wave] for n in axes})
         table = pd.concat([table, found], ignore_index=True)
+        if (found["error"] == INTERRUPTED_CASE).any():
+            break
+    rest = [name for name in cases if name not in set(table["case"])]
+    if rest:
+        left_out = [{"case": name, **cases[name], "seconds": nan, "error": INTERRUPTED_CASE} for name in rest]
+        table = pd.concat([table, pd.DataFrame(left_out)], ignore_index=True)
     columns = ["case", *axes, *(n for n in table if n not in ("case", *axes, "seconds", "error")), "seconds", "error"]
     table = table.set_index("case").loc[list(cases)].reset_index()[columns]
     missing = {value, *starts} - set(table)
     if missing:  # every cell failed: no result to start from
         return table.assign(**dict.fromkeys(sorted(missing), nan), again=False, breaks=True)
+    if (table["error"] == INTERRUPTED_CASE).any():
+        return table.assign(again=False, breaks=False)
     return search_again(
         fn, parameters, table, axes=list(axes), value=value, starts=starts, executor=executor, progress=progress
     )

@@ -16,6 +16,7 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.units import write_value
+from pneuopt.studies.journal import Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, Outcome
 from pneuopt.studies.processes import run_in_executor, run_in_processes
 
@@ -69,6 +70,7 @@ def sweep(
     *,
     executor: Executor | None = None,
     progress: Callable[[Progress], None] | None = None,
+    journal: Journal | None = None,
 ) -> "pd.DataFrame":
     """Evaluate a function of a `ParameterSet` for each case.
 
@@ -85,6 +87,8 @@ def sweep(
         Where to compute: threads, a cluster's (dask: ``client.get_executor()``). By default one process a CPU.
     progress : callable, optional
         Called with a `Progress`, a line of text that knows how many cases are done, after each case.
+    journal : Journal, optional
+        Keeps each case on the disk as it comes; those that it has already are not computed again.
 
     Returns
     -------
@@ -111,13 +115,17 @@ def sweep(
     """
     require(len(cases) > 0, "a study needs a case")
     runs = {str(name): _case_parameters(parameters, case, str(name)) for name, case in cases.items()}
-    outcomes = run_in_processes(fn, runs) if executor is None else run_in_executor(executor, fn, runs)
-    found, report = dict[str, Outcome](), ProgressReporter(progress, "sweep")
+    found = {} if journal is None else {name: journal.known[name] for name in runs if name in journal.known}
+    missing = {name: values for name, values in runs.items() if name not in found}
+    outcomes = run_in_processes(fn, missing) if executor is None else run_in_executor(executor, fn, missing)
+    report = ProgressReporter(progress, "sweep")
     with closing(outcomes), suppress(KeyboardInterrupt):
-        for name, outcome in outcomes:
+        for name, outcome in outcomes if missing else ():
             if outcome.error == INTERRUPTED_CASE:
                 break
             found[name] = outcome
+            if journal is not None:
+                journal.add(name, outcome)
             report(_progress_text(found, len(runs)), len(found), len(runs))
     return _study_table(parameters, runs, found)
 

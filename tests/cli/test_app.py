@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +214,7 @@ def test_an_interruption_elsewhere_writes_nothing(folder: Path, monkeypatch: pyt
     assert set(folder.iterdir()) == before
 
 
-def test_an_interrupted_tuning_shows_the_best_so_far_and_writes_nothing(
+def test_an_interrupted_tuning_writes_the_best_so_far_and_replaces_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(*args: Any, **options: Any) -> TuningResult:
@@ -224,13 +225,17 @@ def test_an_interrupted_tuning_shows_the_best_so_far_and_writes_nothing(
         return tune(*args, **(options | {"progress": stop}))
 
     monkeypatch.setattr(tune_module, "tune", stopped)
-    before = set(folder.iterdir())
-    result = run("tune drive.toml tuning.toml -o tuned.toml --json tuned.json")
+    Path("tuned.toml").write_text("# of an earlier tuning", encoding="utf-8")
+    result = run("tune drive.toml tuning.toml -o tuned.toml --json tuned.json --plot tuned.png")
     assert result.exit_code == 130
     assert result.stdout.startswith("NOT converged (interrupted): the best of 160 simulations so far ")
     assert "the gains of tuning.toml stand; best so far: pid.Kp " in result.stdout
-    assert result.stdout.endswith("no file is written\n")
-    assert set(folder.iterdir()) == before
+    assert result.stdout.endswith("wrote tuned_interrupted.toml\nwrote tuned.json\n")
+    assert Path("tuned.toml").read_text("utf-8") == "# of an earlier tuning"
+    assert not Path("tuned.png").exists()
+    said = tomllib.loads(Path("tuned_interrupted.toml").read_text("utf-8"))["status"]
+    assert said["code"] == "interrupted"
+    assert 10 < said["best_so_far"]["pid.Kp"] < 600
 
 
 def test_a_fit_that_fails_is_written_and_marked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,18 +271,20 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Ctrl-C cannot be sent to another process there")
-def test_ctrl_c_ends_a_real_process_with_130(folder: Path) -> None:
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_signal_ends_a_real_process_with_its_status(name: str, status: int, folder: Path) -> None:
     code = (
-        "import os, signal\n"
+        "import os, signal, sys\n"
         "from pneuopt.cli import tune\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a job in the background inherits it as ignored
-        "tune.tune = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\n"
-        "from pneuopt.cli.app import main\n"
+        "number = getattr(signal, sys.argv.pop(1))\n"
+        "tune.tune = lambda *a, **k: os.kill(os.getpid(), number)\n"
+        "from pneuopt.__main__ import main\n"
         "main()\n"
     )
-    arguments = [sys.executable, "-c", code, "tune", "drive.toml", "tuning.toml", "-o", "tuned.toml"]
+    arguments = [sys.executable, "-c", code, name, "tune", "drive.toml", "tuning.toml", "-o", "tuned.toml"]
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (130, "interrupted: no file was left half-written\n")
+    assert (done.returncode, done.stderr) == (status, "interrupted: no file was left half-written\n")
     assert not Path("tuned.toml").exists()
 
 

@@ -122,9 +122,9 @@ def tuned(front: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_study_tunes_each_cell_from_the_gains_of_its_neighbours(tuned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun = dict[float, float]()
 
-    def cell(drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
+    def cell(sources: dict[str, bytes], drive: Path, tuning: Path, parameters: ParameterSet) -> dict[str, float]:
         begun[parameters.value("load.mass")] = parameters.value("pid.Kp")
-        return tune_cell(drive, tuning, parameters)
+        return tune_cell(sources, drive, tuning, parameters)
 
     monkeypatch.setattr(study_module, "tune_cell", cell)
     result = run("study study.toml -o cases.csv --json cases.json --plot map.png")
@@ -144,7 +144,7 @@ def test_a_cell_that_breaks_with_its_neighbours_is_searched_again_and_named(
 ) -> None:
     searched = list[float]()
 
-    def cell(_: Path, __: Path, parameters: ParameterSet) -> dict[str, float]:
+    def cell(_: object, __: Path, ___: Path, parameters: ParameterSet) -> dict[str, float]:
         mass = parameters.value("load.mass")
         searched.append(mass)
         long = 0.4 if mass == 6.0 else 0.1

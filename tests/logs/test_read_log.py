@@ -302,7 +302,7 @@ def test_a_log_has_a_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_only_files_are_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.csv")
     for name in (tmp_path / "pipe.csv", Path("/dev/zero")):
-        with pytest.raises(LogError, match="is a pipe or a device; save the log in a file"):
+        with pytest.raises(LogError, match="is a pipe or a device; give the name of a file"):
             read_log(name)
     with pytest.raises(LogError, match=r"cannot be read \(.*null"):
         read_log("a\0b.csv")

@@ -1,5 +1,7 @@
 import json
 import math
+import os
+import stat
 from pathlib import Path
 
 import pandas as pd
@@ -20,7 +22,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["out.toml"]
     with pytest.raises(InputError, match="the folder does not exist; make it first"):
         write_text(tmp_path / "none" / "out.toml", "")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="is a folder; name a file in it"):
         write_text(tmp_path, "")
 
 
@@ -58,3 +60,75 @@ def test_outputs_are_refused_before_the_work(tmp_path: Path) -> None:
         check_output_paths([tmp_path / "none" / "a"], [given])
     with pytest.raises(InputError, match="is a folder"):
         check_output_paths([tmp_path], [given])
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links, modes and pipes are POSIX")
+def test_a_link_stays_and_the_file_behind_it_keeps_its_mode(tmp_path: Path) -> None:
+    real = tmp_path / "real.toml"
+    real.write_text("before")
+    real.chmod(0o640)
+    link = tmp_path / "fit.toml"
+    link.symlink_to(real)
+    write_text(link, "after\n")
+    assert link.is_symlink()
+    assert (real.read_text(), stat.S_IMODE(real.stat().st_mode)) == ("after\n", 0o640)
+    old = os.umask(0o027)
+    try:
+        write_text(tmp_path / "new.toml", "")
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE((tmp_path / "new.toml").stat().st_mode) == 0o640
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(InputError, match="loop: "):
+        write_text(tmp_path / "loop", "")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links, modes and pipes are POSIX")
+def test_a_pipe_and_a_device_are_never_replaced(tmp_path: Path) -> None:
+    """As root, `-o /dev/null` made a file of the machine's null device."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    (tmp_path / "null").symlink_to("/dev/null")
+    for path in (pipe, tmp_path / "null", Path("/dev/null")):
+        for attempt in (lambda p: write_text(p, "x"), lambda p: check_output_paths([p], [])):
+            with pytest.raises(InputError, match="is a pipe or a device, no file; name a file"):
+                attempt(path)
+    assert stat.S_ISFIFO(pipe.lstat().st_mode)
+    assert stat.S_ISCHR(Path("/dev/null").lstat().st_mode)
+
+
+@pytest.mark.parametrize(("name", "said"), [("x" * 300, "File name too long"), ("a\0b", r"a\\x00b: cannot be written")])
+def test_a_name_that_no_file_can_have_is_refused_before_the_work(name: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=said):
+        check_output_paths([tmp_path / name], [])
+
+
+def test_a_name_of_250_characters_is_written(tmp_path: Path) -> None:
+    path = tmp_path / f"{'x' * 245}.toml"
+    check_output_paths([path], [])
+    write_text(path, "a")
+    assert path.read_text() == "a"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_write_protected_file_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "fit.toml"
+    path.write_text("kept")
+    allowed = os.access
+    monkeypatch.setattr(os, "access", lambda p, mode: Path(p) != path.resolve() and allowed(p, mode))  # root may all
+    with pytest.raises(InputError, match="is write-protected; choose another name, or unlock it"):
+        write_text(path, "lost")
+    assert path.read_text() == "kept"
+
+
+def test_a_disk_that_is_full_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "fit.toml"
+    path.write_text("kept")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="cannot be written \\(No space left on device\\)"):
+        write_text(path, "lost")
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["kept"]
