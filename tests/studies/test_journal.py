@@ -43,8 +43,9 @@ def test_a_study_goes_on_where_it_was_and_ends_in_the_same_table(tmp_path: Path)
     second = sweep_with(path, again)
     assert sorted(again) == [2.0, 3.0, 4.0]  # the one that failed, the one that was cut, the one not reached
     assert (second["error"] == "").all()
-    third = sweep_with(path, none := [])
-    assert none == []
+    nothing = list[float]()
+    third = sweep_with(path, nothing)
+    assert nothing == []
     pd.testing.assert_frame_equal(second.drop(columns="seconds"), third.drop(columns="seconds"))
     assert third["third"].tolist() == [m / 3 for m in (1.0, 2.0, 3.0, 4.0)]
 
