@@ -1,10 +1,4 @@
-"""Transfer-function plants with named signals: first order, second order, integrator; dead time.
-
-A dead time is a Padé approximant of order 1 to 5. Its states form a lossless ladder and keep the input's unit and size
-at every dead time, so that the dead time is an ordinary, differentiable parameter. Its fastest pole is at 2, 3.5, 5.1,
-6.8, 8.5 over the dead time (orders 1 to 5), and RK4 steps of h are stable for dead times above 0.72, 1.22, 1.87, 2.57,
-3.26 h, the lower limit. At zero the approximant is singular; `pade_order=0` leaves it out.
-"""
+"""Transfer-function plants with named signals: first order, second order, integrator; dead time."""
 
 import re
 from collections.abc import Callable
@@ -15,6 +9,7 @@ import casadi as ca
 
 from pneuopt.dynamics.system import Symbols, System, define, names
 from pneuopt.logs.columns import CHANNELS
+from pneuopt.models.dead_time import delay_line, pade_delay
 from pneuopt.models.declaration import DriveKind, FirstFiles, Structure
 from pneuopt.models.drive import FORCE, POSITION, SPEED
 from pneuopt.models.friction import FrictionModel
@@ -27,7 +22,6 @@ from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.quantities.units import read_si
 
 VALVE_VOLTAGE = Quantity("valve_voltage", "V", nominal=5.0)
-MAX_PADE_ORDER = 5  # the greatest order whose stability limit is known (see above)
 USUAL_PADE_ORDER = 3  # of a dead time in a file: it follows the delay up to 4.6 rad of phase, with three states
 Dynamics = Callable[[ca.SX, Symbols, Symbols], dict[str, ca.SX]]
 
@@ -256,7 +250,7 @@ def _assemble_plant(
 ) -> System:
     """Assemble a plant from its dynamics, its gain and its dead time."""
     order, source = plant.pade_order, plant.input
-    line = _delay_line(source, order)
+    line = delay_line(source, order)
     parameters = ParameterSet({"plant.gain": gain}) | shaping
     if order:
         parameters = parameters | ParameterSet(
@@ -273,7 +267,7 @@ def _assemble_plant(
         )
 
     def rhs(_: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Symbols, Symbols]:
-        late, rates = _pade_delay(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
+        late, rates = pade_delay(u[source.name], [x[q.name] for q in line], p.get("plant.dead_time", ca.SX(0)))
         moving = dynamics(late, x, p) | {q.name: r for q, r in zip(line, rates, strict=True)}
         return moving, {plant.output.name: x[plant.output.name]}
 
@@ -298,29 +292,6 @@ def _friction_polynomials(w: float, damping: float) -> Polynomials:
 
 def _integrator_polynomials() -> Polynomials:
     return [1.0], [1.0, 0.0]
-
-
-def _delay_line(source: Quantity, order: int) -> tuple[Quantity, ...]:
-    valid = isinstance(order, int) and 0 <= order <= MAX_PADE_ORDER
-    require(valid, f"pade_order must be 0 to {MAX_PADE_ORDER}, got {order}", ModelError)
-    return tuple(Quantity(f"{source.name}_delay_{k}", source.unit, 2 * source.nominal) for k in range(1, order + 1))
-
-
-def _pade_delay(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[ca.SX]]:
-    """Padé approximant [n/n] of a delay as an LC ladder, by Lambert's continued fraction of tanh(s/2).
-
-    ``exp(-s) = (1 - tanh(s/2)) / (1 + tanh(s/2))`` is, but for its sign, the reflection of a wave u from inductors and
-    capacitors of 1 / (2 (2k - 1)) in turn; with v the voltage at the port, the delayed wave is u - v.
-    """
-    if not x:
-        return u, []
-    along, across = sum(x[0::2], ca.SX(0)), sum(x[1::2], ca.SX(0))
-    voltage, current = (across, 2 * u - across) if len(x) % 2 == 0 else (2 * u - along, along)
-    rates = []
-    for k in range(1, len(x) + 1):
-        passed = sum(x[k % 2 : k - 1 : 2], ca.SX(0))
-        rates.append(2 * (2 * k - 1) / dead_time * ((current if k % 2 == 0 else voltage) - passed))
-    return u - voltage, rates
 
 
 def _gain_parameter(source: Quantity, output: Quantity, per: str) -> Parameter:
