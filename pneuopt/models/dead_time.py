@@ -7,7 +7,10 @@ is singular; order 0 leaves it out.
 """
 
 import casadi as ca
+import numpy as np
+from scipy import signal
 
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Quantity
 
@@ -36,3 +39,33 @@ def pade_delay(u: ca.SX, x: list[ca.SX], dead_time: ca.SX) -> tuple[ca.SX, list[
         passed = sum(x[k % 2 : k - 1 : 2], ca.SX(0))
         rates.append(2 * (2 * k - 1) / dead_time * ((current if k % 2 == 0 else voltage) - passed))
     return u - voltage, rates
+
+
+def delay_states(u: Array, step: float, order: int, dead_time: float) -> Array:
+    """The states along an input that is held over each step, from rest at its first value.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n,)
+    step : float
+        [s]
+    order : int
+        At least 1.
+    dead_time : float
+        [s]
+
+    Returns
+    -------
+    ndarray, shape (n, order)
+        In the input's unit.
+    """
+    x, source = ca.SX.sym("x", order), ca.SX.sym("u")
+    _, rates = pade_delay(source, ca.vertsplit(x), ca.SX(dead_time))
+    linear = [np.array(ca.DM(ca.jacobian(ca.vertcat(*rates), symbol))) for symbol in (x, source)]
+    A, B, *_ = signal.cont2discrete((*linear, np.eye(order), np.zeros((order, 1))), step)
+    rest = np.linalg.solve(np.eye(order) - A, B[:, 0]) * u[0]
+    states = np.empty((len(u), order))
+    states[0] = rest
+    for k in range(1, len(u)):
+        states[k] = A @ states[k - 1] + B[:, 0] * u[k - 1]
+    return states

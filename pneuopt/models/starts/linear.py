@@ -12,6 +12,7 @@ import numpy as np
 from scipy import optimize, signal
 
 from pneuopt.dynamics.hooks import Log, Start
+from pneuopt.models.dead_time import delay_states
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.intersample import Intersample
@@ -118,7 +119,9 @@ class LinearStarts:
             drive = drive + lead * fit.gain * fit.coulomb * record.sign
         columns = {n: np.zeros(len(record.t)) for n in (*self.zero_states, *self.delay_line)}
         if self.delay_line:
-            columns[self.delay_line[0]] = 2 * record.u
+            dead_time = fit.values[len(self.shape.names)]
+            line = delay_states(record.u, float(record.t[1] - record.t[0]), len(self.delay_line), dead_time)
+            columns |= dict(zip(self.delay_line, line.T, strict=True))
         return Trajectory(record.t + record.start_time, columns | {self.output: response, "drive": drive})
 
 

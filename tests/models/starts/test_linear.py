@@ -58,6 +58,18 @@ def test_the_states_along_the_log_are_those_of_the_model() -> None:
     assert np.std(states["speed"] - log.measured["speed"]) < 0.012 * np.abs(log.measured["speed"]).max()
 
 
+@pytest.mark.parametrize("order", [1, 2, 3, 5])
+def test_the_delay_line_along_the_log_is_that_of_the_model(order: int) -> None:
+    """At rest along the log it would say that nothing measured depends on the dead time."""
+    system = SecondOrder(pade_order=order).system()
+    log = logged(system, SECOND | {"plant.dead_time": 0.05}, (0.0, 2.0, -1.0))
+    start = system.starts({"run": log})[0]
+    given = system.parameters.with_values(start.parameters)
+    run = simulate(system, log.measured.select(["valve_voltage"]), given)
+    for name in (n for n in names(system.states) if "delay" in n):
+        assert start.states["run"][name] == pytest.approx(run[name], abs=0.02), name
+
+
 def test_several_logs_are_joined_and_need_not_begin_at_rest() -> None:
     system = SecondOrder().system()
     whole = logged(system, SECOND, (0.0, 2.0, -1.0, 1.0, 0.5, 0.0))
