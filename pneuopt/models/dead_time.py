@@ -61,8 +61,8 @@ def delay_states(u: Array, step: float, order: int, dead_time: float) -> Array:
     """
     x, source = ca.SX.sym("x", order), ca.SX.sym("u")
     _, rates = pade_delay(source, ca.vertsplit(x), ca.SX(dead_time))
-    linear = [np.array(ca.DM(ca.jacobian(ca.vertcat(*rates), symbol))) for symbol in (x, source)]
-    A, B, *_ = signal.cont2discrete((*linear, np.eye(order), np.zeros((order, 1))), step)
+    slopes = [np.array(ca.DM(ca.jacobian(ca.vertcat(*rates), symbol))) for symbol in (x, source)]
+    A, B, *_ = signal.cont2discrete((slopes[0], slopes[1], np.eye(order), np.zeros((order, 1))), step)
     rest = np.linalg.solve(np.eye(order) - A, B[:, 0]) * u[0]
     states = np.empty((len(u), order))
     states[0] = rest
