@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ESTIMATE_COLUMNS = [
-    *("value", "stderr", "dof", "ci_low", "ci_high", "range_low", "range_high"),
-    *("lower", "upper", "at_bound", "mark", "unit", "source"),
+    *("value", "ci_low", "ci_high", "unit", "mark", "stderr", "dof", "range_low", "range_high"),
+    *("lower", "upper", "at_bound", "source"),
 ]
 NOTHING_IDENTIFIABLE = Status(
     Code.NOT_CONVERGED,
@@ -207,7 +207,7 @@ def validate(
         little white by chance (`ljung_box`); of each input how much is left in them (`cross_correlation`, about 3 is
         what chance reaches) and at which lag in samples: "correlation[force]", "lag[force]".
     """
-    import pandas as pd
+    from pneuopt.quantities.frames import WideFrame
 
     model = as_estimation_model(system)
     logs = check_logs(model, experiments, parameters)
@@ -220,7 +220,7 @@ def validate(
             row | _residual_diagnosis(model, experiment, run, str(row["channel"]))
             for row in _agreement_rows(model, experiment, run, free)
         ]
-    return pd.DataFrame(rows).set_index(["log", "channel"])
+    return WideFrame(rows).set_index(["log", "channel"])
 
 
 def predict(
@@ -329,11 +329,11 @@ def _result(
 
 
 def _fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":
-    import pandas as pd
+    from pneuopt.quantities.frames import WideFrame
 
     runs = zip(problem.experiments, fit.trajectories, run_freely(problem, fit), strict=True)
     rows = [row for e, run, free in runs for row in _agreement_rows(problem.system, e, run, free)]
-    return pd.DataFrame(rows).set_index(["log", "channel"])
+    return WideFrame(rows).set_index(["log", "channel"])
 
 
 def _agreement_rows(
@@ -369,7 +369,7 @@ def _estimates(
     status: Status,
     misfit: Misfit,
 ) -> "pd.DataFrame":
-    import pandas as pd
+    from pneuopt.quantities.frames import WideFrame
 
     usable = covariance is not None and status.converged and not misfit.is_excessive
     stderr = np.sqrt(np.diag(covariance)) if usable and covariance is not None else np.full(len(parameters), math.nan)
@@ -379,9 +379,9 @@ def _estimates(
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
         ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
         mark = misfit.mark(is_optimum=status.converged and not at_bound[i] and not leaning[i])
-        figures = [p.value, deviation, dof, low, high, *ends, p.lower, p.upper]
-        rows[name] = [*figures, bool(at_bound[i]), mark, p.unit, p.source]
-    return pd.DataFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
+        shown = [p.value, low, high, p.unit, mark]
+        rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
+    return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)
 
 
 def _move(p: Parameter, change: float) -> float:

@@ -156,8 +156,8 @@ class IdentificationResult(Shown):
         does an unidentifiable one, unless the logs reject that value or identify it only together with another: then
         it has the value that belongs to the other estimates.
     estimates : DataFrame
-        A row a free parameter ("name[log]" for one of a log): value, stderr, dof (degrees of freedom of that, for
-        Student's t), ci_low, ci_high (95 %), range_low, range_high, lower, upper, at_bound, mark (a `Mark`), unit,
+        A row a free parameter ("name[log]" for one of a log): value, ci_low, ci_high (95 %), unit, mark (a `Mark`),
+        stderr, dof (degrees of freedom of that, for Student's t), range_low, range_high, lower, upper, at_bound,
         source, note. The value is NaN where the mark is "unidentifiable". No interval there, at a bound, without
         convergence, or with a status of `Code.MISFIT`. Where a linear interval would be wrong it is the profile
         likelihood's, infinite at an open end. The range is what the estimate becomes when a sixth of the logs' time,

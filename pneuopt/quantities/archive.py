@@ -159,6 +159,8 @@ def _encode_column(name: Any, column: Any) -> list[Any]:
 def _decode_frame(data: Any, where: str) -> "pd.DataFrame":
     import pandas as pd
 
+    from pneuopt.quantities.frames import WideFrame
+
     _expect(isinstance(data, dict) and set(data) == {"index", "columns"} and len(data["index"]) > 0, where)
     levels = [_decode_column(level, f"{where}.index") for level in data["index"]]
     columns = [_decode_column(column, f"{where}.columns") for column in data["columns"]]
@@ -170,7 +172,7 @@ def _decode_frame(data: Any, where: str) -> "pd.DataFrame":
         if len(levels) == 1
         else pd.MultiIndex.from_arrays([values for _, values in levels], names=names)
     )
-    frame = pd.DataFrame(dict(enumerate(values for _, values in columns)), index=index)
+    frame = WideFrame(dict(enumerate(values for _, values in columns)), index=index)
     return frame.set_axis([name for name, _ in columns], axis=1)
 
 

@@ -159,7 +159,7 @@ def _progress_text(found: Mapping[str, Outcome], total: int) -> str:
 def _study_table(
     parameters: ParameterSet, runs: Mapping[str, ParameterSet], found: Mapping[str, Outcome]
 ) -> "pd.DataFrame":
-    import pandas as pd
+    from pneuopt.quantities.frames import WideFrame
 
     swept = list(dict.fromkeys(n for values in runs.values() for n in values if _differs(n, values, parameters)))
     outcomes = {
@@ -171,7 +171,7 @@ def _study_table(
     columns |= {n: [v.value(n) if n in v else nan for v in runs.values()] for n in swept}
     columns |= {n: [outcome.results.get(n, nan) for outcome in outcomes.values()] for n in results}
     columns |= {n: [getattr(outcome, n) for outcome in outcomes.values()] for n in ("seconds", "error")}
-    return pd.DataFrame(columns)
+    return WideFrame(columns)
 
 
 def _differs(name: str, values: ParameterSet, parameters: ParameterSet) -> bool:
