@@ -11,6 +11,7 @@ apart. Candidates that such searches show to be hopeless beside the leader's fit
 """
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -211,7 +212,9 @@ class _Alike:
     def fit(self, candidate: Candidate, start: IdentificationResult | None = None) -> IdentificationResult:
         """The fit of a candidate; one whose states jump within whole logs has not converged."""
         given, logs, method = candidate.parameters, self.experiments, self._own_method
-        fit = identify(candidate.system, logs, given, method=method, window=self.window, start=start, throw=False)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="before the search")  # the table says what is unidentifiable
+            fit = identify(candidate.system, logs, given, method=method, window=self.window, start=start, throw=False)
         if self.window == math.inf and fit.status.converged and _has_jumps(fit, self.method):
             words = "it follows whole logs only with jumps of its states", *fit.status.sentences
             fit = replace(fit, status=Status(Code.NOT_CONVERGED, words))

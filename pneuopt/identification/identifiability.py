@@ -20,7 +20,8 @@ from pneuopt.identification.examination import pose_problem
 from pneuopt.identification.excitation import missing_excitation, remedy, summarise_motion, with_values_in_words
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.profiles import Profile
-from pneuopt.identification.result import Verdict
+from pneuopt.identification.result import Verdict, join_names
+from pneuopt.identification.widths import excerpts
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -59,6 +60,7 @@ REJECTION_CONFIDENCE = 0.95
 
 MAX_REDUCTION_SEGMENTS = 2000  # segments whose sensitivities are reduced together: more at once take memory, fewer time
 
+UNIDENTIFIED = "the logs do not identify"
 VAGUER_THAN_PRIOR = "its standard deviation is as wide as a factor of ten"
 
 
@@ -131,6 +133,38 @@ def verdict_from_covariance(
     if keep.any():
         root[np.ix_(keep, keep)] = _root_of_inverse(searched[np.ix_(keep, keep)])
     return _make_verdict(problem, fit, root, inside_bounds=keep, trusted=trusted)
+
+
+def foresee_unidentifiable(problem: EstimationProblem) -> tuple[str, ...]:
+    """Find what logs cannot identify, before the search: the motion does not show it, and no output depends on it.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+
+    Returns
+    -------
+    tuple of str
+        A sentence with the remedy for the parameters of each reason; empty where the motion shows all, or the outputs
+        of stretches of the logs, at the noise alone, tell what the motion shows too little of.
+    """
+    if not problem.system.states:  # a static map is fitted as soon
+        return ()
+    start, free, excitation = problem.candidates()[0], problem.unknowns().free_names, problem.system.plant.excitation
+    values = problem.parameters.with_values({n: v for n, v in start.parameters.items() if n in problem.parameters})
+    seen = summarise_motion(problem.experiments, start.states, values, problem.parameters)
+    lacking = [n for n in free if missing_excitation(excitation, n, free, seen) is not None]
+    if not lacking:
+        return ()
+    part = replace(problem, experiments=excerpts(problem.experiments))
+    verdict = verdict_from_sensitivities(part, part.candidates()[0])
+    alike, table = {n for group in verdict.indistinguishable for n in group}, verdict.table
+    by_reason: dict[str, list[str]] = {}
+    for name in (n for n in lacking if n in verdict.reasons):  # a stretch has own names for what each log has its own
+        relative = table["relative"][name]
+        if name in alike if math.isnan(relative) else relative > MAX_EXPECTED_DEVIATION:
+            by_reason.setdefault(verdict.reasons[name], []).append(name)
+    return tuple(f"before the search: {UNIDENTIFIED} {join_names(n)}: {reason}" for reason, n in by_reason.items())
 
 
 def add_profiles(verdict: Verdict, profiles: Mapping[str, Profile]) -> Verdict:

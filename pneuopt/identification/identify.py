@@ -4,6 +4,7 @@ The system is any ODE with named signals that proposes its own starts (`System.s
 """
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -24,7 +25,7 @@ from pneuopt.identification.checks import (
 )
 from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import check_content
-from pneuopt.identification.identifiability import leans_on_prior, rests_on_prior
+from pneuopt.identification.identifiability import foresee_unidentifiable, leans_on_prior, rests_on_prior
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
@@ -40,7 +41,7 @@ from pneuopt.identification.windows import check_window, fit_in_windows, run_fre
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array, Mask
-from pneuopt.quantities.errors import ConvergenceError
+from pneuopt.quantities.errors import ConvergenceError, PhysicsWarning
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.provenance import provenance
@@ -160,6 +161,9 @@ def _fit_and_review(
 ) -> IdentificationResult:
     """Choose widths, fit from the model's starts or a given one, in windows if need be, and review the intervals."""
     window = problem.window
+    if start is None:
+        for sentence in foresee_unidentifiable(problem):
+            warnings.warn(sentence, PhysicsWarning, stacklevel=3)
     problem, widths = choose_widths(problem)
     if start is None:
         held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)

@@ -69,6 +69,11 @@ class EstimationProblem:
 
     def candidates(self) -> Sequence[Start]:
         """The model's own starts from all logs together."""
+        return self._candidates
+
+    @cached_property
+    def _candidates(self) -> Sequence[Start]:
+        """The starts, which several readers share."""
         known = {
             e.name: (apply_conditions(self.parameters, e), input_behaviour(self.system, e)) for e in self.experiments
         }

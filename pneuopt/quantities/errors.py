@@ -63,7 +63,7 @@ class HardwareError(InputError):
 
 
 class PhysicsWarning(UserWarning):
-    """A simulation leaves what its model describes (end stop, empty chamber), or a log contradicts the model."""
+    """A simulation leaves what its model describes (end stop, empty chamber); a log contradicts it, or says little."""
 
 
 class ConvergenceError(PneuoptError):
