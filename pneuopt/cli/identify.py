@@ -1,6 +1,7 @@
 """`pneuopt identify` and `pneuopt simulate --log`: from logs to parameters, and back to logs."""
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -74,6 +75,7 @@ def run_identify(
     found = check(system, experiments, parameters)
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
+    warnings.filterwarnings("ignore", message="before the search")  # the check has said it
     with _draw_refusal(outputs), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
         result = identify(

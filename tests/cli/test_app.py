@@ -98,6 +98,7 @@ def test_an_unidentifiable_parameter_is_named_before_and_after_the_fit(folder: P
     Path("steady.csv").write_text("\n".join(["time [s],force [N],position [mm]", *rows]) + "\n", encoding="utf-8")
     result = run("identify drive.toml steady.csv --json fit.json")
     assert "warning: before the fit: the logs do not identify" in result.stderr
+    assert "before the search" not in result.stderr  # `identify` says it where nothing has been checked
     assert "friction.viscous: nearly all speeds lie between" in result.stderr.replace("\n", " ")
     said = json.loads(Path("fit.json").read_text(encoding="utf-8"))
     assert said["verdict"]["sentences"]
