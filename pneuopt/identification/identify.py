@@ -29,7 +29,7 @@ from pneuopt.identification.identifiability import foresee_unidentifiable, leans
 from pneuopt.identification.losses import Loss, fit_robustly
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.multistart import fit_from_starts, fit_holding_unidentifiable
-from pneuopt.identification.order import hold_order
+from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem, apply_conditions, as_estimation_model
 from pneuopt.identification.repairs import input_behaviour, known_runs, window_runs
 from pneuopt.identification.result import ChosenWindow, IdentificationResult
@@ -175,7 +175,7 @@ def _fit_and_review(
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
     held, fit = hold_order(held, fit, label)
-    result = replace(review_fit(held, *_result(held, fit, label, loss)), widths=widths, window=chosen)
+    result = replace(mark_order(held, review_fit(held, *_result(held, fit, label, loss))), widths=widths, window=chosen)
     if problem.method.budget is not None:
         result = replace(result, status=problem.method.budget.name_end(result.status))
     return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
@@ -382,7 +382,7 @@ def _estimates(
         deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
         ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
-        mark = misfit.mark(is_optimum=status.converged and not at_bound[i] and not leaning[i])
+        mark = misfit.mark(is_optimum=status.converged and math.isfinite(deviation) and not leaning[i])
         shown = [p.value, low, high, p.unit, mark]
         rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import read_drive, read_marks, write_fit
+from pneuopt.identification import identify as identification
 from pneuopt.identification.identify import identify
 from pneuopt.identification.misfit import Misfit
 from pneuopt.identification.profiles import profile
@@ -23,7 +24,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.status import Code
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 
 TIME = np.arange(0, 4.0, 2e-3)
@@ -186,3 +187,12 @@ def test_a_width_that_the_logs_refute_marks_all_estimates() -> None:
     assert wide.is_suspect
     assert not replace(wide, signals=("speed",)).is_suspect
     assert not plain.is_suspect
+
+
+def test_an_estimate_without_a_deviation_is_not_exact() -> None:
+    """Static friction of 29.99 N in a one-way log was, without a deviation."""
+    plain = Misfit(None, np.full(2, 9.0), 1.0, np.zeros((2, 2)), 1.0, noisy_states=False, is_excessive=False)
+    own, none = DRIVE.parameters.select(FREE[:2]), np.zeros(2, dtype=bool)
+    status = Status(Code.CONVERGED, ("converged",))
+    found = identification._estimates(own, np.diag([1.0, np.nan]), none, none, status, plain)
+    assert found["mark"].tolist() == [Mark.EXACT, Mark.BIAS_POSSIBLE]

@@ -3,12 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import pneuopt as po
 from pneuopt.identification.checks import check_logs
-from pneuopt.identification.order import hold_order
+from pneuopt.identification.order import hold_order, mark_order
 from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.result import IdentificationResult
+from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.least_squares import solve_least_squares
 from pneuopt.shooting.solution import Fit
 
@@ -69,3 +72,20 @@ def test_a_fit_in_order_is_not_fitted_again() -> None:
     problem, fit = problem_and_fit(45.0, 0.02, given, {STATIC: 40.0, VELOCITY: 0.02}, {})
     assert fit.parameters.value(STATIC) == pytest.approx(45.0, abs=1.0)
     assert hold_order(problem, fit, "again") == (problem, fit)
+
+
+def test_friction_that_no_drive_has_is_named_and_marked() -> None:
+    """An answer of 10 +- 1 N beside 30 +- 1 N was "exact" without a word; 27 N is within chance."""
+    given = SYSTEM.parameters.freed(COULOMB, STATIC)
+    log = po.Experiment(po.Trajectory(T, {"force": 60 * np.sin(T), "position": 0.1 * np.cos(T)}), {"position": 1e-5})
+    problem = EstimationProblem(SYSTEM, tuple(check_logs(SYSTEM, [log], given)), given, po.LeastSquares())
+    marks = {}
+    for static in (10.0, 27.0, 40.0):
+        estimates = pd.DataFrame({"value": {COULOMB: 30.0, STATIC: static}, "mark": po.Mark.EXACT})
+        covariance = pd.DataFrame(np.eye(2), estimates.index, estimates.index)
+        values, status = given.with_values({COULOMB: 30.0, STATIC: static}), Status(Code.CONVERGED, ("converged",))
+        fit = IdentificationResult(values, estimates, covariance, pd.DataFrame(), {}, status, {}, {})
+        found = mark_order(problem, fit)
+        marks[static] = set(found.estimates["mark"])
+        assert ("which no drive has" in str(found.status)) == (static == 10.0)
+    assert marks == {10.0: {po.Mark.BIAS_POSSIBLE}, 27.0: {po.Mark.EXACT}, 40.0: {po.Mark.EXACT}}
