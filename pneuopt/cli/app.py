@@ -5,7 +5,6 @@ error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 
 needs, so that `--help` waits for no heavy import.
 """
 
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -229,24 +228,11 @@ def keys_command(
 
 @app.command("info")
 def info_command() -> None:
-    """Show versions, compiler and cache, to be quoted in a question or a bug report."""
-    import os
-    import platform
-    from importlib.metadata import version
-
-    from pneuopt.cli.terminal import make_console, show_pairs
-    from pneuopt.dynamics.compiled.library_cache import cache_directory
-    from pneuopt.dynamics.compiled.toolchain import find_compiler
-
-    packages = ("pneuopt", "casadi", "numpy", "scipy", "pandas", "matplotlib", "pint", "tomlkit", "typer", "rich")
+    """Show versions, compiler, cache, a self-check and the speed, to be quoted in a question or a bug report."""
     with _report_errors():
-        machine = {
-            "python": f"{platform.python_version()} ({sys.executable})",
-            "platform": f"{platform.platform()}, {os.cpu_count()} CPUs",
-            "compiler": str(find_compiler() or "none found: models run on the CasADi VM, more slowly"),
-            "cache": str(cache_directory()),
-        }
-        show_pairs(make_console(), {n: version(n) for n in packages} | machine)
+        from pneuopt.cli.info import run_info
+
+        raise typer.Exit(run_info())
 
 
 @contextmanager

@@ -12,7 +12,13 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pneuopt.dynamics.compiled.library_cache import cache_directory, discard_library, find_library, keep_library
+from pneuopt.dynamics.compiled.library_cache import (
+    COMPILE_FOLDER_PREFIX,
+    cache_directory,
+    discard_library,
+    find_library,
+    keep_library,
+)
 from pneuopt.dynamics.compiled.toolchain import (
     COMPILER_FLAGS,
     LINKER_FLAGS,
@@ -78,7 +84,7 @@ def _load_library(cc: Compiler, flags: tuple[str, ...], source: str) -> ctypes.C
 
 def _compile(cc: Compiler, flags: tuple[str, ...], source: str, cache: Path, identity: str) -> Path:
     """Compile in a temporary folder, then move the binary: another process may do the same, or this one be killed."""
-    with tempfile.TemporaryDirectory(dir=cache) as folder:
+    with tempfile.TemporaryDirectory(prefix=COMPILE_FOLDER_PREFIX, dir=cache) as folder:
         text, product = Path(folder) / "model.c", Path(folder) / "model.so"
         text.write_text(source, encoding="utf-8")
         # what zig keeps for all libraries, its C runtime, has its place; what it makes for this one is not wanted

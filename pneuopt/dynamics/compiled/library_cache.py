@@ -13,8 +13,19 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 from pathlib import Path
 
+# Age [s] since its last use at which a library is deleted, half a year. Below, models of last month are compiled anew;
+# above, those of old versions stay for nothing.
+LARGEST_AGE = 180 * 24 * 3600.0
+# Size [bytes] of all libraries above which those that were not used for longest are deleted, some thousand models.
+# Below, studies of many models compile them again and again; above, it is much for a cache folder.
+LARGEST_SIZE = 200 * 2**20
+# Time [s] after which a use is noted again, and a folder in which nothing is compiled any more is deleted, a day.
+# Below, libraries are written to at each use; above, the order of their use is lost.
+NOTICE_TIME = 24 * 3600.0
+COMPILE_FOLDER_PREFIX = "compile-"
 logger = logging.getLogger("pneuopt")
 
 
@@ -45,6 +56,7 @@ def find_library(folder: Path, identity: str) -> Path | None:
     """
     for path in sorted(folder.glob(f"{_digest(identity)}-*.so")):
         if _is_own(path) and path.name == _library_name(identity, path.read_bytes()):
+            _note_use(path)
             return path
         logger.debug("%s is damaged, or another user's: it is built anew", path)
         discard_library(path)
@@ -60,7 +72,44 @@ def keep_library(folder: Path, identity: str, product: Path) -> Path:
     place = folder / _library_name(identity, content)
     with contextlib.suppress(PermissionError):  # Windows: another process has just loaded its own
         product.replace(place)
+    trim_cache(folder, keep=place)
     return place
+
+
+def cached_libraries(folder: Path) -> dict[Path, os.stat_result]:
+    """The libraries in a cache, the one that was used last first."""
+    found = dict[Path, os.stat_result]()
+    for path in folder.glob("*.so"):
+        with contextlib.suppress(OSError):  # another process has just deleted it
+            found[path] = path.lstat()
+    return dict(sorted(found.items(), key=lambda item: -item[1].st_mtime))
+
+
+def trim_cache(folder: Path, keep: Path | None = None) -> None:
+    """Delete libraries that were not used for long, or are too many, and what killed processes left behind.
+
+    Parameters
+    ----------
+    folder : Path
+    keep : Path, optional
+        A library that stays in any case.
+    """
+    now, size = time.time(), 0
+    for path, entry in cached_libraries(folder).items():
+        size += entry.st_size
+        if path != keep and (size > LARGEST_SIZE or now - entry.st_mtime > LARGEST_AGE):
+            discard_library(path)
+    for path in folder.glob(f"{COMPILE_FOLDER_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            if now - path.lstat().st_mtime > NOTICE_TIME:
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def _note_use(path: Path) -> None:
+    """Set a library's time to now, once a day."""
+    with contextlib.suppress(OSError):
+        if time.time() - path.stat().st_mtime > NOTICE_TIME:
+            os.utime(path)
 
 
 def discard_library(path: Path) -> None:

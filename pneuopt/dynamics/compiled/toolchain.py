@@ -20,9 +20,10 @@ _ARITHMETIC = ("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
 _LIBRARY = ("-shared",) if os.name == "nt" else ("-shared", "-fPIC")
 COMPILER_FLAGS = ("-O2", _NATIVE, *_ARITHMETIC, *_LIBRARY)
 LINKER_FLAGS = () if os.name == "nt" else ("-lm",)
-# What one line says where models run without a compiler. The times are those of data/force_rig.
+# What one line says where models run without a compiler. On data/force_rig a tuning takes three and a fit eight times
+# as long; of a pneumatic drive, whose states and sensitivities are many, a fit takes more than twenty times as long.
 NO_COMPILER = (
-    "models run in the CasADi VM, with the same answers, three to eight times slower (a fit 3 s in place of 0.4 s); "
+    "models run in the CasADi VM, with the same answers, three to thirty times slower (seconds become minutes); "
     'pip install "pneuopt[compiler]" adds a compiler (100 MB), gcc or clang on the path do as well'
 )
 
