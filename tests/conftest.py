@@ -42,6 +42,7 @@ CACHES = (
     library_cache._temporary_folder,
     kernels.prepare_by_content,
 )
+AXIS_TRUTH = {"load.mass": 6.0, "friction.coulomb": 25.0, "friction.viscous": 40.0, "friction.smoothing": 5e-3}
 DRIVE = """# my axis
 [drive]
 kind = "force"
@@ -108,12 +109,17 @@ def count_calls(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[
 @pytest.fixture(scope="session")
 def axis_truth() -> dict[str, float]:
     """What made the logs of `folder`."""
-    return {"load.mass": 6.0, "friction.coulomb": 25.0, "friction.viscous": 40.0, "friction.smoothing": 5e-3}
+    return dict(AXIS_TRUTH)
 
 
 @pytest.fixture(scope="session")
-def axis_logs(axis_truth: dict[str, float]) -> dict[str, str]:
-    """Two generated logs (ForceDrive with Coulomb friction, 20 um of noise) as text, by name."""
+def axis_logs() -> dict[str, str]:
+    """The logs of `folder`."""
+    return generate_axis_logs()
+
+
+def generate_axis_logs() -> dict[str, str]:
+    """Two logs (ForceDrive with Coulomb friction, 20 um of noise) as text, by name."""
     system = ForceDrive(Coulomb()).system()
     texts = {}
     for seed, name in enumerate(("run_01", "run_02")):
@@ -122,7 +128,7 @@ def axis_logs(axis_truth: dict[str, float]) -> dict[str, str]:
         run = simulate(
             system,
             Trajectory(t, {"force": force}),
-            system.parameters.with_values(axis_truth),
+            system.parameters.with_values(AXIS_TRUTH),
             rtol=1e-6,
             intersample={"force": Intersample.LINEAR},
         )

@@ -2,7 +2,8 @@
 
 import hashlib
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,14 +85,14 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
         cases = grid(parameters, {axis.name: axis.points for axis in axes})
     except InputError as error:
         raise InputError(f"{file}: [axes] {error}") from None
-    journal = _open_journal(study, outputs, len(cases))
-    if study.tune:
-        table = _tune_cells(study, task, parameters, axes, quiet, journal)
-    else:
-        band = study.band or task.specification.band
-        certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
-        with progress("certifying", quiet=quiet) as report_progress:
-            table = sweep(certify, parameters, cases, progress=report_progress, journal=journal)
+    with _keep_cases(study, outputs, len(cases)) as journal:
+        if study.tune:
+            table = _tune_cells(study, task, parameters, axes, quiet, journal)
+        else:
+            band = study.band or task.specification.band
+            certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
+            with progress("certifying", quiet=quiet) as report_progress:
+                table = sweep(certify, parameters, cases, progress=report_progress, journal=journal)
     verdict, status = _grid_verdict(table, len(task.references))
     seen = _worst_of_references(table, axes, study.show)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
@@ -105,22 +106,27 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
     tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
     finish(outputs, writers, tables, stopped, figures=lambda: {"": plot_map(seen, written, metrics)}, report=report)
-    if journal is not None:
-        journal.close(finished=stopped is None)
+    if journal is not None and stopped is None:
+        journal.path.unlink(missing_ok=True)
     return status
 
 
-def _open_journal(study: Study, outputs: Outputs, count: int) -> Journal | None:
-    """Where the cases are kept as they come: beside the file that is asked for."""
+@contextmanager
+def _keep_cases(study: Study, outputs: Outputs, count: int) -> Iterator[Journal | None]:
+    """Keep the cases as they come, beside the file that is asked for."""
     place = outputs.output or outputs.json
     if place is None:
-        return None
+        yield None
+        return
     used = (study.path, study.drive, study.tuning)
     made_of = [__version__.encode(), *(hashlib.sha256(read_toml_source(path)).digest() for path in used)]
     journal = Journal(place.with_name(f"{place.name}.journal"), hashlib.sha256(b"".join(made_of)).hexdigest())
     if journal.known:
         warn(f"{journal.path}: {len(journal.known)} of {count} cases are known from an earlier run of this study")
-    return journal
+    try:
+        yield journal
+    finally:
+        journal.close(finished=False)
 
 
 def _tune_cells(

@@ -38,6 +38,7 @@ class Journal:
             lines = self.path.read_bytes().splitlines() if self.path.exists() else []
             same = bool(lines) and _parse(lines[0]) == {"study": identity}
             self.known: Mapping[str, Outcome] = _read_outcomes(lines[1:]) if same else {}
+            self._count = len(self.known)
             self._file: IO[str] = self.path.open("a" if same else "w", encoding="utf-8")
             # a line that was cut ends here
             self._write("\n" if same else json.dumps({"study": identity}) + "\n")
@@ -50,11 +51,12 @@ class Journal:
             entry = {"case": name, "results": dict(outcome.results), "seconds": outcome.seconds}
             with contextlib.suppress(OSError, TypeError):  # a full disk does not end the study
                 self._write(json.dumps(entry) + "\n")
+                self._count += 1
 
     def close(self, *, finished: bool) -> None:
-        """Close the file; it is deleted where all is done."""
+        """Close the file; it is deleted where all is done, or nothing is in it."""
         self._file.close()
-        if finished:
+        if finished or not self._count:
             self.path.unlink(missing_ok=True)
 
     def _write(self, text: str) -> None:

@@ -283,7 +283,7 @@ def test_a_signal_ends_a_real_process_with_its_status(name: str, status: int, fo
         "from pneuopt.__main__ import main\n"
         "main()\n"
     )
-    arguments = [sys.executable, "-c", code, name, "tune", "drive.toml", "tuning.toml", "-o", "tuned.toml"]
+    arguments = [sys.executable, "-c", code, name, "tune", "-q", "drive.toml", "tuning.toml", "-o", "tuned.toml"]
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (status, "interrupted: no file was left half-written\n")
     assert not Path("tuned.toml").exists()

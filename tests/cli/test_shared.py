@@ -31,3 +31,10 @@ def test_estimates_that_may_be_biased_are_named_by_later_commands(
     path.write_text(f'[estimates]\n"friction.coulomb" = {{ mark = "{mark}" }}\n', encoding="utf-8")
     warn_of_status(path)
     assert ("may be biased by a model error: friction.coulomb" in capsys.readouterr().err) is warns
+
+
+@pytest.mark.parametrize(
+    ("code", "status"), [(Code.CONVERGED, 0), (Code.PARTIAL, 0), (Code.MISFIT, 1), (Code.NOT_CONVERGED, 1)]
+)
+def test_a_part_of_an_answer_ends_as_an_answer(code: Code, status: int) -> None:
+    assert finish(Outputs(None, None, None), {}, {}, Status(code, ("said",))) == status

@@ -1,0 +1,251 @@
+"""Reads mutated TOML files: ``python -m tests.files.fuzz CASES [SEED]`` prints what came of them.
+
+The files that `pneuopt init` writes for each kind of drive, and results made of them, are mutated in values, keys,
+nesting and bytes. A case passes if it is read, or refused by one of our own errors in one line.
+"""
+
+import io
+import random
+import re
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pneuopt.cli.init import run_init
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.files.drive import read_covariance, read_drive, read_estimates, read_marks, read_status
+from pneuopt.files.requirements import bound_units
+from pneuopt.files.rig import read_rig
+from pneuopt.files.study import read_axes, read_pareto, read_study
+from pneuopt.files.tuning import Tuning, read_tuning
+from pneuopt.models.declaration import Drive
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
+
+TIME_LIMIT = 2.0
+"""CPU time of a case [s]: a file of 128 KiB that takes longer is called a hang."""
+MAX_MESSAGE = 1000
+"""Length of a message [character]: a longer one shows the file instead of its fault."""
+KINDS = ("pneumatic", "force", "rotary", "linear")
+RESULT = """
+[estimates]
+"friction.coulomb" = { value = 40.0, stderr = 1.0, dof = 30.0, range_low = 30.0, range_high = 50.0, mark = "exact" }
+[covariance]
+"friction.coulomb" = [1.0]
+[status]
+code = "converged"
+message = "converged"
+[verdict]
+sentences = []
+[provenance]
+pneuopt = "0.2"
+"""
+VALUES = (
+    *('"1e999 N"', '"-1e-999 m"', '"inf m/s"', '"nan"', "nan", "inf", "-inf", "1e308", "0", "-1", "1", "true", "[1]"),
+    *("[]", "{}", '""', '"1 bar"', '"1 mm**9e9"', '"1 m^(99)^99"', "9" * 5000, '"' + "9" * 5000 + ' N"', "1979-05-27"),
+    *("[" * 60 + "]" * 60, "[" * 2000 + "]" * 2000, '{ value = "1 m" }', '{ value = "1 m", lower = "2 m" }', "1e8"),
+    *('{ from = "1 kg", to = "2 kg", steps = 1000000000 }', "{ value = [1] }", '["1 V", 2]', '[["0 s", "1 %"]]'),
+    *('"\\u0000"', "'" + "a" * 9999 + "'", "12:00:00", "0x7fffffffffffffff", "100000000", '"5 kg"', '"30 %"', '"40 N"'),
+)
+KEYS = ("Kp", "seed", "count", "kind", "model", "value", "pressure", "a.b", '""', "x" * 500, '"load.mass"', "steps")
+
+
+@dataclass
+class Report:
+    """What came of the cases: counts by file, the slowest [s], and each failure with its text."""
+
+    cases: Counter[str] = field(default_factory=Counter)
+    accepted: Counter[str] = field(default_factory=Counter)
+    slowest: float = 0.0
+    failures: list[tuple[str, str, bytes]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        lines = [f"{n:25s} {k:7d} cases, {self.accepted[n] / k:4.0%} accepted" for n, k in sorted(self.cases.items())]
+        total, peak = self.cases.total(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        share = self.accepted.total() / max(total, 1)
+        lines.append(
+            f"{total} cases, {share:.1%} accepted, {len(self.failures)} failures, slowest {self.slowest:.3f} s, "
+            f"peak {peak:.0f} MB"
+        )
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Base:
+    """The valid files of a kind of drive, and what they make."""
+
+    folder: Path
+    texts: Mapping[str, str]
+    drive: Drive
+    parameters: ParameterSet
+    tuning: Tuning
+
+
+def fuzz(cases: int, seed: int, kinds: tuple[str, ...] = KINDS) -> Report:
+    """Read mutated files of these kinds of drives."""
+    rng, report = random.Random(seed), Report()
+    with tempfile.TemporaryDirectory() as folder:
+        bases = {kind: _write_base(kind, Path(folder) / kind) for kind in kinds}
+        for _ in range(cases):
+            kind = rng.choice(kinds)
+            name = rng.choice(sorted(bases[kind].texts))
+            _try(report, f"{kind} {name}", bases[kind], name, _mutate(rng, bases[kind].texts[name]))
+    return report
+
+
+def _write_base(kind: str, folder: Path) -> Base:
+    folder.mkdir()
+    with redirect_stdout(io.StringIO()):
+        run_init(kind, folder, {"size": None, "cylinder": None, "valve": None}, None, force=True)
+    texts = {
+        name: (folder / name).read_text("utf-8") for name in ("drive.toml", "tuning.toml", "study.toml", "rig.toml")
+    }
+    texts["fit.toml"] = texts["drive.toml"] + RESULT
+    drive, parameters = read_drive(folder / "drive.toml")
+    return Base(folder, texts, drive, parameters, read_tuning(folder / "tuning.toml", drive.system(), parameters))
+
+
+def _read(base: Base, name: str, path: Path) -> None:
+    """Read a file as the commands do."""
+    loop: ClosedLoop = base.tuning.loop
+    if name in ("drive.toml", "fit.toml"):
+        read_drive(path)
+        for read in (read_status, read_marks, read_covariance, read_estimates):
+            read(path)
+    elif name == "tuning.toml":
+        task = read_tuning(path, base.drive.system(), base.parameters)
+        given = base.parameters.fixed(*base.parameters.free_names) | task.parameters
+        task.scenarios(given)
+        task.validation_scenarios(given)
+    elif name == "rig.toml":
+        read_rig(path, base.drive, loop)
+    else:
+        study = read_study(path)
+        if study.pareto is None:
+            read_axes(study, base.parameters | base.tuning.parameters)
+        else:
+            read_pareto(study, bound_units(loop))
+
+
+def _try(report: Report, label: str, base: Base, name: str, raw: bytes) -> None:
+    path = base.folder / f"mutated_{name}"
+    path.write_bytes(raw)
+    signal.signal(signal.SIGVTALRM, _stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, 5 * TIME_LIMIT)
+    start, fault = time.process_time(), ""
+    try:
+        _read(base, name, path)
+        report.accepted[label] += 1
+    except InputError as error:
+        text = str(error)
+        fault = "" if "\n" not in text and len(text) < MAX_MESSAGE else f"message: {text[:200]!r}"
+    except BaseException as error:
+        fault = f"{type(error).__name__}: {str(error)[:200]}"
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+    spent = time.process_time() - start
+    report.cases[label] += 1
+    report.slowest = max(spent, report.slowest)
+    fault = fault or (f"{spent:.1f} s" if spent > TIME_LIMIT else "")
+    if fault:
+        report.failures.append((label, fault, raw))
+
+
+def _stop(*_: object) -> None:
+    raise TimeoutError("hangs")
+
+
+def _mutate(rng: random.Random, text: str) -> bytes:
+    lines = [line for line in text.split("\n") if line.strip() and (line[0] != "#" or " = " in line)] or [""]
+    kinds: list[Callable[[random.Random, list[str]], None]] = [_value, _value, _word, _word, _key, _section, _commented]
+    for _ in range(rng.choice([1, 1, 1, 2, 4])):
+        rng.choice(kinds)(rng, lines)
+        lines = lines or [""]
+    raw = "\n".join(lines).encode()
+    return _bytes(rng, raw) if rng.random() < 0.15 else raw
+
+
+def _entry(rng: random.Random, lines: list[str]) -> int:
+    return rng.choice([i for i, line in enumerate(lines) if " = " in line] or [0])
+
+
+def _value(rng: random.Random, lines: list[str]) -> None:
+    """Another value, of any type."""
+    i = _entry(rng, lines)
+    lines[i] = f"{lines[i].partition(' = ')[0]} = {rng.choice(VALUES)}"
+
+
+def _word(rng: random.Random, lines: list[str]) -> None:
+    """A number within a value, of which units and types stay."""
+    i = _entry(rng, lines)
+    key, equals, value = lines[i].partition(" = ")
+    numbers = list(re.finditer(r"\d+\.?\d*(?:e-?\d+)?", value))
+    if numbers:
+        chosen = rng.choice(numbers)
+        other = rng.choice(["0", "1", "-1", "1e9", "1e-9", "1e308", "2", f"{float(chosen[0]) * rng.uniform(0.5, 2):g}"])
+        lines[i] = key + equals + value[: chosen.start()] + other + value[chosen.end() :]
+
+
+def _key(rng: random.Random, lines: list[str]) -> None:
+    """A key more, less, twice, or by another name."""
+    i, kind = _entry(rng, lines), rng.randrange(4)
+    if kind == 0:
+        lines.insert(i, f"{rng.choice(KEYS)} = {rng.choice(VALUES)}")
+    elif kind == 1 and len(lines) > 1:
+        del lines[i]
+    elif kind == 2:
+        lines.insert(i, lines[i])
+    else:
+        lines[i] = f"{rng.choice(KEYS)} = {lines[i].partition(' = ')[2]}"
+
+
+def _section(rng: random.Random, lines: list[str]) -> None:
+    """A section as a list, within another, twice, or as a value."""
+    heads = [i for i, line in enumerate(lines) if line.startswith("[")]
+    if not heads:
+        return
+    i = rng.choice(heads)
+    name = lines[i].strip("[]")
+    odd = (f"[[{name}]]", f"[{name}.{name}]", f"[{rng.choice(KEYS)}]", "[a.b.c.d]", f"[{name}]", "")
+    lines[i] = rng.choice(odd)
+
+
+def _commented(rng: random.Random, lines: list[str]) -> None:
+    """An entry that init has written as a comment."""
+    hidden = [i for i, line in enumerate(lines) if re.match(r"\s*#\s*[\w\".]+ = ", line)]
+    if hidden:
+        i = rng.choice(hidden)
+        lines[i] = lines[i].replace("#", "", 1).strip()
+
+
+def _bytes(rng: random.Random, raw: bytes) -> bytes:
+    """Bytes changed, cut out, put in, or the file cut."""
+    changed, i = bytearray(raw), rng.randrange(max(len(raw), 1))
+    kind = rng.randrange(4)
+    if kind == 0:
+        changed[i : i + 1] = bytes([rng.randrange(256)])
+    elif kind == 1:
+        del changed[i : i + rng.choice([1, 2, 50])]
+    elif kind == 2:
+        changed[i:i] = rng.randbytes(rng.choice([1, 4]))
+    else:
+        del changed[i:]
+    return bytes(changed)
+
+
+if __name__ == "__main__":
+    _, count, start, *chosen = (*sys.argv, *("0",)[len(sys.argv) - 2 :])
+    result = fuzz(int(count), int(start), tuple(chosen) or KINDS)
+    sys.stdout.write(f"{result}\n")
+    seen = Counter[str]()
+    for label, fault, raw in result.failures:
+        seen[fault[:60]] += 1
+        if seen[fault[:60]] <= 2:
+            sys.stdout.write(f"\n{label}: {fault}\n{raw[:3000].decode(errors='replace')}\n")
