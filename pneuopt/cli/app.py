@@ -95,13 +95,19 @@ def check_command(
     json: Json = None,
     plot: Plot = None,
     accept: Accept = None,
+    fix: Annotated[
+        Path | None,
+        typer.Option(
+            "--fix", metavar="FOLDER", help="Mend what rules can, and write the new logs and sidecars into this folder."
+        ),
+    ] = None,
 ) -> None:
     """Show what is read, assumed and wrong before a fit, and what the logs identify; status 1 if a fit refuses them."""
     with _report_errors():
         from pneuopt.cli.check import run_check
         from pneuopt.cli.shared import Outputs
 
-        raise typer.Exit(run_check(drive, _expand_patterns(logs), Outputs(None, json, plot), accept or ()))
+        raise typer.Exit(run_check(drive, _expand_patterns(logs), Outputs(None, json, plot), accept or (), fix))
 
 
 @app.command("identify")

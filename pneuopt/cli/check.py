@@ -1,6 +1,6 @@
 """The command `check`: what was read, assumed and found before a fit, and what the logs identify."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,41 +9,94 @@ from typing import TYPE_CHECKING
 import typer
 
 from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
+from pneuopt.cli.init import write_files
 from pneuopt.cli.shared import Outputs, finish
-from pneuopt.cli.terminal import make_console, show_sentence
+from pneuopt.cli.terminal import make_console, show_output_files, show_sentence
 from pneuopt.dynamics.system import System
 from pneuopt.files.assumptions import read_option_assumptions
 from pneuopt.files.drive import ambient_pressure, read_drive
 from pneuopt.identification.checks import check_logs
-from pneuopt.identification.checkup import LOG_CHECK, MODEL_CHECK, Checkup, check
+from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check
+from pneuopt.identification.checkup_text import finding_line, format_lines, headline
+from pneuopt.identification.mending import mend_findings
+from pneuopt.identification.problem import as_estimation_model
 from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.mending import MendedLog, mend_log, write_mended
 from pneuopt.logs.read_log import read_log
 from pneuopt.plotting import plot_finding, plot_logs
-from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def run_check(drive: Path, logs: Sequence[Path], outputs: Outputs, accept: Sequence[str] = ()) -> int:
-    """Check a drive's file and its logs; returns the exit status."""
-    outputs.check([drive, *logs, *(log.with_suffix(".toml") for log in logs)], *CHECKS, MODEL_CHECK, LOG_CHECK)
+def run_check(
+    drive: Path, logs: Sequence[Path], outputs: Outputs, accept: Sequence[str] = (), fix: Path | None = None
+) -> int:
+    """Check a drive's file and its logs, and mend the logs if there is a folder for it; returns the exit status."""
+    outputs.check([drive, *logs, *(log.with_suffix(".toml") for log in logs)], *CHECKS, *OTHER_CHECKS)
+    places = {} if fix is None else _new_places(fix, logs)
     model, parameters = read_drive(drive)
     system = model.system()
     experiments, errors = _read_all(logs, system, parameters, accept)
     for error in errors:
         show_sentence(make_console(error=True), f"error: {error}")
-    if not experiments:
+    status = EXIT_BAD_INPUT if errors else EXIT_SUCCESS
+    if experiments:
+        found = check(system, experiments, parameters)
+        found = replace(found, assumptions=(*found.assumptions, *read_option_assumptions(drive)))
+        typer.echo(found.format(make_console().width))
+        finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found))
+        status = status or (EXIT_FAILURE if found.is_refused else EXIT_SUCCESS)
+    return _fix(places, system, parameters, accept) if places else status
+
+
+def _new_places(folder: Path, logs: Sequence[Path]) -> dict[Path, Path]:
+    """Where each mended log goes; no file that is there already is written over.
+
+    Raises
+    ------
+    InputError
+        If two logs have one name, or there is such a file.
+    """
+    places: dict[Path, Path] = {}
+    for log in logs:
+        place = folder / f"{log.stem}.csv"
+        twice = f"{log}: another log has its name, too; mend one after the other, into two folders"
+        require(place not in places.values(), twice)
+        for path in (place, place.with_suffix(".toml")):
+            require(not path.exists(), f"{path}: is there already, and stays as it is; --fix names another folder")
+        places[log] = place
+    return places
+
+
+def _fix(places: Mapping[Path, Path], system: System, parameters: ParameterSet, accept: Sequence[str]) -> int:
+    """Write mended logs, say what was changed, and check them; returns the exit status of that check."""
+    zero, units = ambient_pressure(parameters), {n: p.unit for n, p in parameters.items()}
+    mended: dict[Path, MendedLog] = {}
+    errors: list[InputError] = []
+    for path in places:
+        try:
+            read = mend_log(path, plant=system, ambient_pressure=zero)
+            read = replace(read, log=read.log.accepting(*accept))
+            mended[path] = mend_findings(as_estimation_model(system), read, parameters, zero)
+        except InputError as error:
+            errors.append(error)
+    files = {p: text for path, log in mended.items() for p, text in write_mended(log, places[path], units).items()}
+    write_files(files, force=False)
+    for problem in errors:
+        show_sentence(make_console(error=True), f"error: not mended: {problem}")
+    said = ["", "mended", *(f"  {p.name}: {c}" for p, m in mended.items() for c in m.changes or ("nothing to mend",))]
+    typer.echo(format_lines(said, make_console().width))
+    show_output_files(make_console(), list(files))
+    if not mended:
         return EXIT_BAD_INPUT
-    found = check(system, experiments, parameters)
-    found = replace(found, assumptions=(*found.assumptions, *read_option_assumptions(drive)))
-    typer.echo(found.format(make_console().width))
-    finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found))
-    if errors:
-        return EXIT_BAD_INPUT
-    return EXIT_FAILURE if found.is_refused else EXIT_SUCCESS
+    left = check(system, _read_all([places[path] for path in mended], system, parameters, accept)[0], parameters)
+    said = [f"the mended logs: {headline(left)}", *map(finding_line, left.findings)]
+    typer.echo(format_lines(said, make_console().width))
+    return EXIT_BAD_INPUT if errors else EXIT_FAILURE if left.is_refused else EXIT_SUCCESS
 
 
 def _read_all(

@@ -22,7 +22,7 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.terminal import progress
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
-from pneuopt.identification.checkup import MODEL_CHECK, check
+from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.report import report_agreement
 from pneuopt.identification.result import IdentificationResult, Verdict
@@ -67,7 +67,7 @@ def run_identify(
 ) -> int:
     """Identify from logs; returns the exit status."""
     outputs.check(
-        _input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS, MODEL_CHECK
+        _input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS, *OTHER_CHECKS
     )
     model, parameters = _read_free_drive(drive)
     system = model.system()

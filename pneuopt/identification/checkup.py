@@ -14,6 +14,7 @@ from pneuopt.identification.assumptions import Assumption, list_assumptions
 from pneuopt.identification.checks import as_experiments, check_free, check_logs, find_log_warnings, log_remarks
 from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import QUIET_CHECKS, accept_remedy, is_accepted, is_refused
+from pneuopt.identification.exchange import find_exchange
 from pneuopt.identification.identifiability import verdict_from_sensitivities
 from pneuopt.identification.problem import EstimationProblem, as_estimation_model
 from pneuopt.identification.result import Verdict
@@ -26,9 +27,10 @@ from pneuopt.quantities.errors import ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.shooting.least_squares import LeastSquares
 
-MODEL_CHECK, LOG_CHECK, FREE_CHECK = "model", "log", "free"
-"""Names of findings that no check of the log doctor makes: by the model's equations, of what was mended in a log, and
-of parameters of which none is free."""
+MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
+"""Names of findings that no check of the log doctor makes: by the model's equations, of what was mended in a log, of
+parameters of which none is free, and of two columns that are exchanged."""
+OTHER_CHECKS = (MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +124,7 @@ def check(
     assumptions = list_assumptions(model, given, logs, parameters)
     parameters, found = _find_centre(model, logs, parameters)
     found += [f for log in logs for f in examine(log, stated_axis(model.plant, log, parameters))]
+    found += [f for log in logs for f in _exchange_findings(model, log, parameters, found)]
     found += [*_model_findings(model, logs, parameters), *_log_findings(model, given, logs), *_free(logs, parameters)]
     ranked = sorted(
         (_locate(_rank(f, found, logs), logs) for f in found), key=lambda f: list(Severity).index(f.severity)
@@ -163,6 +166,17 @@ def _model_finding(sentence: str, logs: Sequence[Experiment]) -> LogFinding:
     return LogFinding(channels[0] if channels else "", message, False, MODEL_CHECK, log.name, shown)
 
 
+def _exchange_findings(
+    model: Fittable, log: Experiment, parameters: ParameterSet, found: Sequence[LogFinding]
+) -> Iterator[LogFinding]:
+    """That two columns are exchanged, where a log has faults in two channels, and none once they are."""
+    several = len({f.channel for f in found if f.fault and f.log == log.name}) > 1
+    pair = find_exchange(model, log, parameters) if several else None
+    if pair is not None:
+        message = f"with the columns of {pair[0]} and {pair[1]} exchanged nothing is wrong: say so in [columns]"
+        yield LogFinding(pair[0], message, False, EXCHANGE_CHECK, log.name, evidence(log, *pair))
+
+
 def _log_findings(model: Fittable, given: Sequence[Experiment], logs: Sequence[Experiment]) -> Iterator[LogFinding]:
     """What was mended in each log, or doubted of its noise."""
     for log, checked in zip(given, logs, strict=True):
@@ -199,11 +213,13 @@ def _locate(finding: LogFinding, logs: Sequence[Experiment]) -> LogFinding:
         return finding
     if finding.check == LOG_CHECK and log.holes and "is cut" in finding.message:
         first, last = log.holes[0][0] - 1, log.holes[0][1]
-    elif finding.evidence is None or finding.evidence.contradiction.all() or not finding.evidence.contradiction.any():
+    elif finding.evidence is None or finding.evidence.contradiction.all():
         return finding
     else:
-        at = np.flatnonzero(finding.evidence.contradiction)
-        times = finding.evidence.t[[at[0], at[-1]]]
-        first, last = (int(k) for k in np.searchsorted(log.trajectory.t, times))
+        shown, (begin, end) = finding.evidence, finding.evidence.view
+        at = np.flatnonzero(shown.contradiction & (shown.t >= begin) & (shown.t <= end))
+        if not at.size:
+            return finding
+        first, last = (int(k) for k in np.searchsorted(log.trajectory.t, shown.t[at[[0, -1]]]))
     first, last = max(first, 0), min(last, len(log.trajectory) - 1)
     return replace(finding, rows=(log.source.first_row + first, log.source.first_row + last))

@@ -35,7 +35,12 @@ def format_checkup(found: "Checkup", width: int) -> str:
         ["identifiable, by sensitivities at the start values, if the model is right", *_verdict_lines(found)],
         ["what would help", *(f"  {run}: for {', '.join(names)}" for run, names in found.runs.items())],
     ]
-    return "\n\n".join("\n".join(_wrap(line, width) for line in lines) for lines in blocks if _says_something(lines))
+    return "\n\n".join(format_lines(lines, width) for lines in blocks if _says_something(lines))
+
+
+def format_lines(lines: Sequence[str], width: int) -> str:
+    """Each line in pieces of at most that width, the further ones indented by two more."""
+    return "\n".join(_wrap(line, width) for line in lines)
 
 
 def headline(found: "Checkup") -> str:

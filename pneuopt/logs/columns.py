@@ -190,20 +190,28 @@ def split_unit(name: str) -> tuple[str, str]:
     return (match[1] or match[3], match[2] or match[4] or "") if match else (name, "")
 
 
-def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> None:
+def nearest_channel(name: str, channels: Mapping[str, str]) -> str:
+    """The channel that a column's name nearly is; "" where it is none, or one without doubt."""
     bare, unit = split_unit(name)
-    if name in table.stamps:
-        return
+    if _split_channel(name, channels)[0]:
+        return ""
     parts = bare.casefold().replace(" ", "_").split("_")[:MAX_NAME_PARTS]
     for n in range(len(parts), 0 if not unit else len(parts) - 1, -1):
         head = "_".join(parts[:n])
         near = difflib.get_close_matches(head, channels, n=1, cutoff=0.85) or [_SYNONYMS.get(head, "")]
-        require(
-            not near[0],
-            f"{table.path}: column {name!r} looks like the channel {near[0]!r}; write it so, "
-            "or list the columns to use in a sidecar",
-            LogError,
-        )
+        if near[0]:
+            return near[0]
+    return ""
+
+
+def _check_misspelling(table: Table, name: str, channels: Mapping[str, str]) -> None:
+    near = "" if name in table.stamps else nearest_channel(name, channels)
+    require(
+        not near,
+        f"{table.path}: column {name!r} looks like the channel {near!r}; write it so, "
+        "or list the columns to use in a sidecar",
+        LogError,
+    )
 
 
 def _resolve_column(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pneuopt.logs.layout import MAX_HEAD_ROWS, TOA5, find_layout, has_table, toa5_layout
+from pneuopt.logs.layout import MAX_HEAD_ROWS, TOA5, Layout, find_layout, has_table, toa5_layout
 from pneuopt.logs.stamps import is_stamp
 from pneuopt.logs.table import Table
 from pneuopt.logs.text_cells import TextBlock, split_cells
@@ -57,6 +57,12 @@ def decode(path: Path, raw: bytes) -> str:
 
 def read_text(path: Path, text: str) -> Table:
     """Read the text of such a file."""
+    block, layout = find_block(path, text)
+    return block_table(block, layout)
+
+
+def find_block(path: Path, text: str) -> tuple[TextBlock, Layout]:
+    """The samples of such a text as cells, and how its rows are to be read."""
     lines = text.rstrip("\n ").split("\n")
     require(any(lines), f"{path}: row 1 is empty; it has to name the columns", LogError)
     delimiter = _find_delimiter(path, lines[:MAX_HEAD_ROWS])
@@ -65,8 +71,12 @@ def read_text(path: Path, text: str) -> Table:
     names, start = layout.names, layout.start
     first = rows[start] if start < len(rows) else []
     stamps = frozenset(name for name, cell in zip(names, first, strict=False) if name and is_stamp(cell))
-    block = TextBlock(path, names, lines[start:], delimiter, start + 1, stamps)
-    return Table(path, names, start + 1, block.columns, layout.units, stamps, layout.remarks)
+    return TextBlock(path, names, lines[start:], delimiter, start + 1, stamps), layout
+
+
+def block_table(block: TextBlock, layout: Layout) -> Table:
+    """The table of such samples."""
+    return Table(block.path, block.names, block.first_row, block.columns, layout.units, block.stamps, layout.remarks)
 
 
 def _find_delimiter(path: Path, lines: Sequence[str]) -> str:

@@ -5,13 +5,14 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pneuopt.logs.budget import read_bytes
 from pneuopt.logs.experiments import Experiment, experiment_from_table
 from pneuopt.logs.plant_channels import Plant
 from pneuopt.logs.readers import read_table
 from pneuopt.logs.sidecar_keys import ACCEPTED_CHECKS, INTERSAMPLE_KEY, SIDECAR_KEYS
+from pneuopt.logs.table import Table
 from pneuopt.quantities.errors import LogError, check_names, require
 from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.source import MAX_TOML_BYTES, check_nesting
@@ -62,11 +63,44 @@ def read_log(
     """
     path = Path(path)
     raw = read_bytes(path)
-    sha256 = hashlib.sha256(raw).hexdigest()
+    return assemble_log(path, raw, read_table(path, raw), read_sidecar(path, sidecar, columns), plant, ambient_pressure)
+
+
+class Sidecar(NamedTuple):
+    """What a sidecar, or a caller in its place, says about a log.
+
+    Attributes
+    ----------
+    path : Path
+        For messages; there may be no such file.
+    sections : mapping
+    columns : mapping
+        Channel to column.
+    columns_from : str
+        Where these come from.
+    """
+
+    path: Path
+    sections: Mapping[str, Any]
+    columns: Mapping[str, Any]
+    columns_from: str
+
+
+def read_sidecar(path: Path, sidecar: str | Path | None, columns: Mapping[str, Any] | None) -> Sidecar:
+    """What stands beside a log; its columns as a caller says, if it does."""
     side, sections = _read_sidecar(path, sidecar)
-    entries, where = (columns, "columns") if columns is not None else (sections.get("columns", {}), f"{side}: columns")
+    if columns is not None:
+        return Sidecar(side, sections, columns, "columns")
+    return Sidecar(side, sections, sections.get("columns", {}), f"{side}: columns")
+
+
+def assemble_log(
+    path: Path, raw: bytes, table: Table, beside: Sidecar, plant: Plant | None, ambient_pressure: float
+) -> Experiment:
+    """A log of a table and of what stands beside it; see `read_log`."""
+    side, sections, columns, where = beside
     with count_gauge_from(ambient_pressure):
-        run = experiment_from_table(read_table(path, raw), entries, where, plant, path.stem)
+        run = experiment_from_table(table, columns, where, plant, path.stem)
         conditions = {n: read_si(v, where=f"{side}: conditions.{n}") for n, v in sections.get("conditions", {}).items()}
     read = run.source and replace(run.source, sidecar=str(side) if sections else "", sections=tuple(sections))
     return replace(
@@ -74,7 +108,7 @@ def read_log(
         source=read,
         noise=_read_noise(sections.get("noise", {}), run, f"{side}: noise"),
         conditions=conditions,
-        sha256=sha256,
+        sha256=hashlib.sha256(raw).hexdigest(),
         intersample=_read_intersample(sections.get("intersample", {}), run.trajectory, f"{side}: intersample"),
         accept=tuple(sections.get(ACCEPTED_CHECKS, ())),
     )

@@ -68,6 +68,43 @@ class TextBlock:
         return seconds_from_first(cells, self.path, name, self.first_row)
 
 
+def mend_cells(block: TextBlock, used: Sequence[str]) -> tuple[TextBlock, dict[str, list[int]]]:
+    """Leave out rows of another length than the header, and empty the cells of columns that hold no number.
+
+    Parameters
+    ----------
+    block : TextBlock
+    used : sequence of str
+        The columns whose cells have to be numbers.
+
+    Returns
+    -------
+    block : TextBlock
+        With a row a line still: one that is left out has empty cells.
+    changes : dict of str to list of int
+        What was done, with the numbers of the rows.
+    """
+    width, changes = len(block.names), dict[str, list[int]]()
+    cells = [split_cells(line, block.delimiter) for line in block.lines]
+    cells = [row[:-1] if len(row) == width + 1 and not row[-1] else row for row in cells]
+    numbers = [i for i, name in enumerate(block.names) if name in used and name not in block.stamps]
+    commas = sum("," in row[i] for row in cells if len(row) == width for i in numbers)
+    points = sum("." in row[i] for row in cells if len(row) == width for i in numbers)
+    for k, row in enumerate(cells):
+        if len(row) != width:
+            changes.setdefault(f"left out, for the row has not {width} cells", []).append(k + block.first_row)
+            cells[k] = [""] * width
+            continue
+        for i in numbers:
+            text = row[i].replace(",", ".") if commas > points else row[i]
+            if row[i] not in MISSING and not NUMBER.fullmatch(text):
+                what = f"cell of {block.names[i]!r} emptied, for it holds no number"
+                changes.setdefault(what, []).append(k + block.first_row)
+                row[i] = ""
+    lines = [_UNIT_SEPARATOR.join(cell.replace(_UNIT_SEPARATOR, " ") for cell in row) for row in cells]
+    return replace(block, lines=lines, delimiter=_UNIT_SEPARATOR), changes
+
+
 def split_cells(line: str, delimiter: str, where: str = "") -> list[str]:
     """The cells of one line, without quotes and white space around them.
 

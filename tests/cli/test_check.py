@@ -73,3 +73,68 @@ def test_lines_are_no_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatch) -
     result = run("check drive.toml run.csv")
     assert max(map(len, result.stdout.splitlines())) <= 60
     assert "\x1b" not in result.stdout
+
+
+def mend(name: str) -> Result:
+    return run(f"check drive.toml {name} --fix mended")
+
+
+@pytest.mark.parametrize(
+    ("check", "said"),
+    [
+        ("work", "all 4000 rows: force multiplied by -1"),
+        ("scale", "all 4000 rows: position multiplied by 0.001"),
+        ("jumps", "rows 1503 to 1601 (99 in all): cells of position emptied"),
+        ("stops", "left out, at an end stop"),
+    ],
+)
+def test_a_fault_is_mended_by_its_rule_and_then_gone(check: str, said: str, folder: Path) -> None:
+    write(BAD_LOGS[check].select(["position", "force"]))
+    old = Path("run.csv").read_bytes()
+    (folder / "mended").mkdir()
+    result = mend("run.csv")
+    assert result.exit_code == 0
+    assert said in result.stdout
+    assert "the mended logs: nothing is wrong" in result.stdout
+    assert Path("run.csv").read_bytes() == old
+    assert said in Path("mended/run.toml").read_text("utf-8")
+    assert run("check drive.toml mended/run.csv").exit_code == 0
+
+
+def test_exchanged_columns_are_found_by_trying_and_mended(folder: Path) -> None:
+    log = swing().select(["position", "force"]).trajectory
+    write(Experiment(log.with_columns({"position": log["force"], "force": log["position"]})))
+    (folder / "mended").mkdir()
+    result = mend("run.csv")
+    words = " ".join(result.stdout.split())
+    assert "with the columns of position and force exchanged nothing is wrong" in words
+    assert "the mended logs: nothing is wrong" in words
+    assert result.exit_code == 0
+
+
+def test_an_input_is_never_written_over(folder: Path) -> None:
+    write(BAD_LOGS["work"].select(["position", "force"]))
+    old = Path("run.csv").read_bytes()
+    result = run("check drive.toml run.csv --fix .")
+    assert result.exit_code == 2
+    assert "is there already" in " ".join(result.stderr.split())
+    assert Path("run.csv").read_bytes() == old
+
+
+def test_what_no_rule_mends_is_said(folder: Path) -> None:
+    write(swing().select(["position"]))
+    (folder / "mended").mkdir()
+    result = mend("run.csv")
+    assert result.exit_code == 2
+    assert "not mended: run: the model needs the channel 'force'" in result.stderr
+    assert not list((folder / "mended").iterdir())
+
+
+def test_two_logs_of_one_name_are_not_written_over_each_other(folder: Path) -> None:
+    (folder / "other").mkdir()
+    write(swing().select(["position", "force"]))
+    write(swing().select(["position", "force"]), "other/run.csv")
+    result = run("check drive.toml run.csv other/run.csv --fix mended")
+    assert result.exit_code == 2
+    assert "another log has its name" in result.stderr
+    assert not (folder / "mended").exists()
