@@ -308,7 +308,7 @@ def test_only_files_are_read(tmp_path: Path) -> None:
         read_log("a\0b.csv")
     with pytest.raises(LogError, match=r"run_01\.toml: too many brackets in brackets"):
         read_log(written(tmp_path, HEADER + BODY, "[columns]\ntime = " + "[" * 3000 + "]" * 3000))
-    with pytest.raises(LogError, match=r"run_01\.toml: is larger than 1 MiB"):
+    with pytest.raises(LogError, match=r"run_01\.toml: is larger than 128 KiB"):
         read_log(written(tmp_path, HEADER + BODY, "#" * 2**21))
 
 
