@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import nan
+from math import isfinite, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -130,7 +130,8 @@ def with_relaxations(result: TuningResult, rows: dict[str, dict[str, float]], co
     unknown = [str(n) for n, row in result.requirements.iterrows() if np.isnan(row.certified) and np.isnan(row.allowed)]
     shortfall = ", ".join([*closest, *(f"no {n}" for n in unknown)])
     lead = f"no design found keeps all limits, nor does {confirmation} find one; the closest has {shortfall}"
-    sentences = (lead, describe_relaxations(rows), "or widen the gains' bounds")
+    would_do = any(isfinite(value) for row in rows.values() for value in (row["needed"], row["share"]))
+    sentences = (lead, describe_relaxations(rows), f"{'or ' if would_do else ''}widen the gains' bounds")
     relaxations = pd.DataFrame.from_dict(rows, orient="index")
     return replace(result, status=Status(Code.INFEASIBLE, sentences), relaxations=relaxations)
 

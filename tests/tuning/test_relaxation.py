@@ -25,6 +25,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.tuning.method import Method
 from pneuopt.tuning.racing import Racing
+from pneuopt.tuning.result import with_relaxations
 from pneuopt.tuning.simulator import Simulator
 from pneuopt.tuning.space import search_space
 from pneuopt.tuning.tune import TuningResult, tune
@@ -64,6 +65,12 @@ def test_the_status_says_what_would_do(sample_time: float | None) -> None:
     assert "(30 asked), or SteadyStateError relaxed to 0.06" in result.status.message
     assert "or all limits relaxed by 79.3 %; or widen the gains' bounds" in result.status.message
     assert result.parameters.value("pid.Kp") == 1.0
+
+
+def test_where_no_relaxation_would_do_wider_bounds_are_the_only_remedy() -> None:
+    rows = {"PeakControl": {"asked": PEAK, "needed": np.inf, "share": np.inf}}
+    said = with_relaxations(proportional(1e-3), rows, "a second search").status.message
+    assert said.endswith("no limit relaxed alone would do; widen the gains' bounds")
 
 
 def oscillator() -> tuple[ClosedLoop, ParameterSet]:
