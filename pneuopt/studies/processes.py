@@ -7,11 +7,13 @@ import os
 import pickle
 import re
 import signal
+import threading
 from collections import deque
 from collections.abc import Generator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait as wait_for_connections
 from typing import TYPE_CHECKING
 
 from pneuopt.quantities.errors import InputError, require
@@ -99,11 +101,24 @@ def run_in_executor(executor: Executor, fn: CaseFunction, runs: Mapping[str, Par
 
 
 def _spawn_process() -> "loky.ProcessPoolExecutor":
-    """An executor of one process that ignores Ctrl-C, which reaches all processes of a terminal: the first decides."""
+    """An executor of one process, which follows this one."""
     import loky
 
-    ignore_interrupt = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
-    return loky.ProcessPoolExecutor(1, context=get_context("spawn"), **ignore_interrupt)
+    return loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_follow_parent)
+
+
+def _follow_parent() -> None:
+    """In a spawned process: ignore Ctrl-C, which reaches all processes of a terminal, and end when the first has."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with(sentinel: int) -> None:
+    """Wait for the end of the first process, which may be killed without a word to the others."""
+    wait_for_connections([sentinel])
+    os._exit(1)
 
 
 def _load_function(packed: bytes) -> None:

@@ -16,12 +16,14 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.conftest import DRIVE, TUNING, generate_axis_logs
 
+LAST_MOMENT = 60.0
+"""Time for a command and its processes to end [s]: less takes a loaded machine for a hang; more waits longer."""
 EARLIER = "# an earlier result\n"
 STUDY = """[study]
 drive = "drive.toml"
@@ -60,18 +62,18 @@ class Tally:
         )
 
 
-def interrupt_commands(count: int, seed: int, commands: Sequence[str] = tuple(COMMANDS)) -> dict[str, Tally]:
-    """Run each command under each signal, so many times; by the command's name and the signal's."""
-    rng, found = random.Random(seed), dict[str, Tally]()
+def interrupt_commands(count: int, seed: int, commands: Sequence[str] = tuple(COMMANDS)) -> Iterator[tuple[str, Tally]]:
+    """Run each command under each signal, so many times; yields the command's name with the signal's, and the tally."""
+    rng = random.Random(seed)
     with tempfile.TemporaryDirectory() as base:
         for command in commands:
             whole = _time_whole_run(command, Path(base))
             for number in SIGNALS:
-                tally = found[f"{command} {number.name}"] = Tally()
+                tally = Tally()
                 for k in range(count):
                     folder = _write_inputs(Path(base) / f"{command}{number}_{k}")
                     _try(tally, command, number, rng.uniform(0, whole), folder)
-    return found
+                yield f"{command} {number.name}", tally
 
 
 def _write_inputs(folder: Path) -> Path:
@@ -108,7 +110,12 @@ def _try(tally: Tally, command: str, number: signal.Signals, moment: float, fold
     finished = process.poll() is not None
     sent = time.perf_counter()
     process.send_signal(number)
-    out, err = process.communicate()
+    try:
+        out, err = process.communicate(timeout=LAST_MOMENT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        out, err = "", f"nothing had ended after {LAST_MOMENT:g} s, or a process of it holds its streams"
+        tally.faults.append(f"{moment:.2f} s: {err}")
     tally.runs += 1
     tally.finished += finished
     if not finished:
@@ -145,7 +152,8 @@ def _is_whole(path: Path) -> bool:
 
 if __name__ == "__main__":
     _, times, start, *chosen = (*sys.argv, *("0",)[len(sys.argv) - 2 :])
-    for name, tally in interrupt_commands(int(times), int(start), chosen or tuple(COMMANDS)).items():
+    for name, tally in interrupt_commands(int(times), int(start), chosen or tuple(COMMANDS)):
         sys.stdout.write(f"{name:18s} {tally}\n")
+        sys.stdout.flush()
         for fault in tally.faults:
             sys.stdout.write(f"    {fault}\n")

@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -303,6 +304,31 @@ def test_ctrl_c_in_a_terminal_reaches_everybody_and_loses_nothing(functions: Mod
         os.killpg(run.pid, signal.SIGINT)
         out, err = run.communicate(timeout=30)
     assert (run.returncode, out, err) == (0, "['', 'interrupted', 'interrupted']\n", "")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no process ends without a word there")
+def test_the_processes_of_a_study_that_is_killed_end_with_it(functions: ModuleType, tmp_path: Path) -> None:
+    """They hold its pipes: a shell that reads them waited for ever."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pneuopt import Parameter, ParameterSet, sweep\n"
+        "from study_functions import hung\n"
+        "if __name__ == '__main__':\n"
+        "    rig = ParameterSet({'load.mass': Parameter(1.0, 'kg')})\n"
+        "    cases = {'quick': {}, 'hung': {'load.mass': 2.0}, 'never': {'load.mass': 3.0}}\n"
+        "    sweep(hung, rig, cases, progress=lambda line: print(line, flush=True))\n",
+        encoding="utf-8",
+    )
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True, start_new_session=True) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == "1 of 3 cases\n"
+        run.kill()
+        try:
+            run.communicate(timeout=30)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(run.pid, signal.SIGKILL)
 
 
 SYSTEMS = {
