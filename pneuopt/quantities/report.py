@@ -188,7 +188,7 @@ def _table_lines(table: Table, width: int | None) -> Iterator[tuple[str, Tone]]:
     if beside is not None and (below is None or _height(table, beside) <= _height(apart, below) + len(table.rows)):
         yield from _beside_lines(table, beside)
     elif below is not None:
-        yield from _below_lines(table, apart, below)
+        yield from _below_lines(table, apart, below, width)
     else:
         for number, panel in enumerate(_split_into_panels(table, width)):
             if number:
@@ -203,13 +203,14 @@ def _beside_lines(table: Table, widths: Sequence[int]) -> Iterator[tuple[str, To
         yield from ((text, Tone.PLAIN) for text in _row_lines(table, row, widths))
 
 
-def _below_lines(table: Table, apart: Table, widths: Sequence[int]) -> Iterator[tuple[str, Tone]]:
-    """Each row's name on its own line, the other cells below it."""
-    yield _plain(table.columns[0].heading.replace("\n", " ")), Tone.HEADING
+def _below_lines(table: Table, apart: Table, widths: Sequence[int], width: int) -> Iterator[tuple[str, Tone]]:
+    """Each row's name on a line of its own, the other cells below it."""
+    heading = table.columns[0].heading.replace("\n", " ")
+    yield from ((_plain(text), Tone.HEADING) for text in wrap_words(heading, width))
     yield from ((_INDENT + text, Tone.HEADING) for text in _heading_lines(apart, widths))
     yield "─" * (len(_INDENT) + _total(widths)), Tone.PLAIN
     for named, row in zip(table.rows, apart.rows, strict=True):
-        yield _plain(named[0]), Tone.PLAIN
+        yield from ((_plain(text), Tone.PLAIN) for text in wrap_words(named[0], width))
         yield from ((_INDENT + text, Tone.PLAIN) for text in _row_lines(apart, row, widths))
 
 

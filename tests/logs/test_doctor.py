@@ -36,9 +36,19 @@ def test_every_check_has_a_log_that_trips_it_alone_and_shows_why() -> None:
         assert all(curve.shape == shown.t.shape for panel in shown.panels for curve in panel.curves.values()), name
 
 
+RECORDER: dict[str, str | bool | dict[str, str | float]] = {
+    "time": "t [ms]",
+    "valve_voltage": "U_valve [V]",
+    "position": "x [mm]",
+    "pressure_a": {"column": "pA [bar]", "unit": "bar(g)"},
+    "pressure_b": {"column": "pB [bar]", "unit": "bar(g)"},
+}
+"""The columns of the stranger's logs, which have no sidecar: the README's reader makes one."""
+
+
 @pytest.mark.parametrize("path", sorted(DATA.glob("*/*.csv")), ids=lambda p: f"{p.parent.name}/{p.stem}")
 def test_the_example_logs_have_no_faults(path: Path) -> None:
-    assert faults(read_log(path)) == []
+    assert faults(read_log(path, columns=RECORDER if path.parent.name == "own_rig" else None)) == []
 
 
 @pytest.mark.parametrize("channel", ["position", "speed"])

@@ -104,7 +104,7 @@ def test_only_the_free_gains_change() -> None:
     for n in parameters:
         if n not in GAINS:
             assert tuned().parameters.value(n) == parameters.value(n)
-    assert repr(tuned()).startswith("TuningResult converged")
+    assert repr(tuned()).startswith("converged: certified objective")
 
 
 def test_a_first_order_plant_has_a_known_answer() -> None:
