@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+from pneuopt.files.budget import MAX_OPTION
 from pneuopt.files.toml import construct_at
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, argument_meanings, choice, table
@@ -94,4 +95,5 @@ def _read_option(given: Any, default: Any, where: str) -> Any:
     if isinstance(default, float):
         return read_value(given, "1", where=where)
     require(isinstance(given, int) and not isinstance(given, bool), f"{where} must be a whole number, got {given!r}")
-    return given
+    require(abs(given) <= MAX_OPTION, f"{where} may be {MAX_OPTION} at most, got {given!r}")
+    return int(given)

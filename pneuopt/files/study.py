@@ -1,5 +1,6 @@
 """study.toml: the drive, the tuning, and the axes of a grid or the two requirements of a front; what to show."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pneuopt.files.budget import MAX_CASES
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.requirements import read_bound
 from pneuopt.files.toml import read_toml
@@ -196,10 +198,13 @@ def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
     """
     check_names("parameter", study.axes, parameters, f"{study.path}: [axes]")
     with count_gauge_from(ambient_pressure(parameters)):
-        return tuple(
+        axes = tuple(
             _read_axis(name, entry, parameters[name].unit, f"{study.path}: [axes] {name}")
             for name, entry in study.axes.items()
         )
+    cells = math.prod(len(axis.points) for axis in axes)
+    require(cells <= MAX_CASES, f"{study.path}: [axes] make {cells} cells, {MAX_CASES} are allowed; take fewer values")
+    return axes
 
 
 def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
@@ -231,8 +236,8 @@ def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:
     first, second = (str(key) for key in pair or ())
     check_names("requirement", (first, second), units, f"{where} between")
     require(first != second, f"{where} between names {first} twice; a front needs two requirements, {_BETWEEN_EXAMPLE}")
-    counts = isinstance(points, int) and not isinstance(points, bool) and points >= 2
-    require(counts, f"{where} points is the number of designs, at least 2, got {points!r}")
+    counts = isinstance(points, int) and not isinstance(points, bool) and 2 <= points <= MAX_CASES
+    require(counts, f"{where} points is the number of designs, from 2 to {MAX_CASES}, got {points!r}")
     stated = [key for key in ("lower", "upper") if key in given]
     ends = {key: read_bound(second, given[key], units[second], f"{where} {key}") for key in stated}
     for key, value in ends.items():
@@ -268,8 +273,8 @@ def _read_range(entry: Mapping[str, Any], unit: str, where: str) -> list[float]:
     for key in _RANGE_KEYS:
         require(key in entry, f"{where} has no {key}; write {_AXIS_EXAMPLE}")
     steps = entry["steps"]
-    counts = isinstance(steps, int) and not isinstance(steps, bool) and steps >= 2
-    require(counts, f"{where} steps is the number of values, at least 2, got {steps!r}")
+    counts = isinstance(steps, int) and not isinstance(steps, bool) and 2 <= steps <= MAX_CASES
+    require(counts, f"{where} steps is the number of values, from 2 to {MAX_CASES}, got {steps!r}")
     first, last = (read_value(entry[key], unit, where=f"{where} {key}") for key in ("from", "to"))
     return [float(v) for v in np.linspace(first, last, steps)]
 

@@ -20,6 +20,7 @@ from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, Spread, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
+from pneuopt.files.budget import MAX_CASES
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.loop import (
     TUNABLE_SECTIONS,
@@ -362,6 +363,9 @@ def _read_kind(
     draw = {key: entries.pop(key, known.usual) for key, known in SCENARIO_KEYS[kind].keys.items()}
     count, seed = draw.get("count", 0), draw.get("seed", 0)
     require(isinstance(count, int) and isinstance(seed, int), f"{where} count and seed are whole numbers")
+    require(count <= MAX_CASES and seed >= 0, f"{where} count may be {MAX_CASES} at most, seed not below 0")
+    many = kind == "corners" and len(entries) >= MAX_CASES.bit_length()
+    require(not many, f"{where}: {len(entries)} parameters have too many corners; take [scenarios.samples]")
     try:
         spreads = _read_spreads(entries, where, parameters)
         if kind == "corners" and new_count is None:

@@ -24,7 +24,7 @@ class UnknownNameError(InputError):
     """A name that comes from data is not known; the message offers the nearest one."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str], where: str = "") -> None:
-        known = sorted(known)
+        known, name = sorted(known), str(name)  # what a file gives for a name may be a number
         near = difflib.get_close_matches(name[:MAX_SHOWN], known, n=1, cutoff=0.5)
         name = name if len(name) < MAX_SHOWN else name[:MAX_SHOWN] + "..."
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known) or 'none'}"
@@ -90,5 +90,5 @@ def check_names(kind: str, names: Iterable[str], known: Iterable[str], where: st
     """Raise `UnknownNameError` for the first of `names` that is not in `known`."""
     known = set(known)
     for name in names:
-        if name not in known:
+        if not isinstance(name, str) or name not in known:
             raise UnknownNameError(kind, name, known, where)

@@ -47,12 +47,29 @@ sentences = []
 [provenance]
 pneuopt = "0.2"
 """
+SCENARIOS = """
+[scenarios.corners]
+"load.mass" = "30 %"
+[scenarios.samples]
+count = 3
+seed = 1
+"load.mass" = "30 %"
+"""
 VALUES = (
     *('"1e999 N"', '"-1e-999 m"', '"inf m/s"', '"nan"', "nan", "inf", "-inf", "1e308", "0", "-1", "1", "true", "[1]"),
     *("[]", "{}", '""', '"1 bar"', '"1 mm**9e9"', '"1 m^(99)^99"', "9" * 5000, '"' + "9" * 5000 + ' N"', "1979-05-27"),
     *("[" * 60 + "]" * 60, "[" * 2000 + "]" * 2000, '{ value = "1 m" }', '{ value = "1 m", lower = "2 m" }', "1e8"),
     *('{ from = "1 kg", to = "2 kg", steps = 1000000000 }', "{ value = [1] }", '["1 V", 2]', '[["0 s", "1 %"]]'),
-    *('"\\u0000"', "'" + "a" * 9999 + "'", "12:00:00", "0x7fffffffffffffff", "100000000", '"5 kg"', '"30 %"', '"40 N"'),
+    *(
+        '"\\u0000"',
+        "'" + "a" * 9999 + "'",
+        "12:00:00",
+        "0x7fffffffffffffff",
+        "100000000",
+        '"5 kg"',
+        '"30 %"',
+        '"40 N"',
+    ),
 )
 KEYS = ("Kp", "seed", "count", "kind", "model", "value", "pressure", "a.b", '""', "x" * 500, '"load.mass"', "steps")
 
@@ -107,6 +124,8 @@ def _write_base(kind: str, folder: Path) -> Base:
     texts = {
         name: (folder / name).read_text("utf-8") for name in ("drive.toml", "tuning.toml", "study.toml", "rig.toml")
     }
+    if kind != "linear":
+        texts["tuning.toml"] += SCENARIOS.replace("mass", "inertia" if kind == "rotary" else "mass")
     texts["fit.toml"] = texts["drive.toml"] + RESULT
     drive, parameters = read_drive(folder / "drive.toml")
     return Base(folder, texts, drive, parameters, read_tuning(folder / "tuning.toml", drive.system(), parameters))

@@ -127,3 +127,19 @@ def test_a_tuning_with_scenarios_is_validated_on_new_plants(tmp_path: Path, monk
     assert 0.5 * worst_corner < settling["median"] <= settling["p95"] <= settling["worst"]
     assert settling["worst"] <= 1.05 * worst_corner, "friction and the gain vary beside the mass: by 10 % and by 1 %"
     assert settling["certified"] == pytest.approx(settling["worst"], rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[scenarios.samples]\ncount = 100000000\n'load.mass' = '30 %'", "count may be 20000 at most"),
+        ("[scenarios.samples]\ncount = 3\nseed = -1\n'load.mass' = '30 %'", "seed not below 0"),
+        (
+            "[scenarios.corners]\n" + "".join(f"'friction.{k}' = '30 %'\n" for k in range(20)),
+            "20 parameters have too many corners; take",
+        ),
+    ],
+)
+def test_more_plants_than_can_be_computed_are_refused_at_once(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=said):
+        read(tmp_path, text)

@@ -45,3 +45,10 @@ def test_require_raises_what_it_is_told() -> None:
     require(True, "never seen")
     with pytest.raises(LogError, match="too short"):
         require(False, "too short", LogError)
+
+
+@pytest.mark.parametrize("name", [1, 2.5, ["a"], {"a": 1}, None])
+def test_what_is_no_name_at_all_is_refused_as_one(name: object) -> None:
+    """As in a file: pressure_dependent = [1]."""
+    with pytest.raises(UnknownNameError, match="unknown law"):
+        check_names("law", [name], {"a"})  # type: ignore[list-item]
