@@ -13,10 +13,12 @@ import pytest
 
 posix = pytest.mark.skipif(os.name == "nt", reason="signals, /dev/full and closed descriptors are POSIX")
 START = """
-import signal, sys
+import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits it as ignored
 from pneuopt.cli.guard import run_guarded
 from pneuopt.cli.interruption import without_interruption
+def say_ready():
+    os.write(1, b"ready\\n")  # no buffer, which a signal that comes at once would leave full, to be written twice
 """
 
 
@@ -112,7 +114,7 @@ def interrupt_when_ready(process: subprocess.Popen[str], *pauses: float, number:
 @posix
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_ends_a_command_with_its_status_and_a_line(number: int, status: int) -> None:
-    process = guarded("import time\ndef command():\n    print('ready', flush=True)\n    time.sleep(60)")
+    process = guarded("import time\ndef command():\n    say_ready()\n    time.sleep(60)")
     interrupt_when_ready(process, 0.0, number=number)
     assert ended(process) == (status, "", "interrupted: no file was left half-written\n")
 
@@ -123,7 +125,7 @@ def test_a_file_is_written_whole_before_an_interruption_is_heard() -> None:
 import time
 def command():
     with without_interruption():
-        print("ready", flush=True)
+        say_ready()
         time.sleep(0.5)
         print("written", flush=True)
     print("never", flush=True)
@@ -139,7 +141,7 @@ def test_pressed_twice_loses_nothing_and_pressed_later_ends_at_once() -> None:
 import time
 def command():
     try:
-        print("ready", flush=True)
+        say_ready()
         time.sleep(60)
     except KeyboardInterrupt:
         time.sleep(1.0)
@@ -158,7 +160,7 @@ def test_foreign_code_that_hears_no_signal_is_ended() -> None:
     body = """
 import ctypes
 def command():
-    print("ready", flush=True)
+    say_ready()
     ctypes.CDLL(None).pause  # a loop of sleeps, for a signal ends a single one
     wait = ctypes.CDLL(None).pthread_join
     import threading, _thread
