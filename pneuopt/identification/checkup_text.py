@@ -143,7 +143,7 @@ def _range(log: Experiment, channel: str) -> str:
     column, unit = log.trajectory[channel], log.unit(channel)
     low, high = (write_value(float(f(column)), unit, 3) for f in (np.nanmin, np.nanmax))
     missing = int(np.isnan(column).sum())
-    return f"{low} to {high}" + (f", {missing} samples missing" if missing else "")
+    return f"{low} to {high}" + (f", {missing} sample{'s' * (missing > 1)} missing" if missing else "")
 
 
 def _origin(log: Experiment, channel: str) -> str:

@@ -2,18 +2,13 @@
 
 import pytest
 
-from tests.files.fuzz import Report, fuzz
-
-
-def check(report: Report) -> None:
-    assert [failure[:2] for failure in report.failures] == [], report.failures[0]
-    assert report.accepted.total() > 0.25 * report.cases.total()
+from tests.files.fuzz import fuzz
 
 
 def test_a_few_mutated_files() -> None:
-    check(fuzz(40, seed=1, kinds=("force",)))
+    fuzz(40, seed=1, kinds=("force",)).check()
 
 
 @pytest.mark.slow
 def test_many_mutated_files() -> None:
-    check(fuzz(20_000, seed=0))
+    fuzz(20_000, seed=0).check()

@@ -7,28 +7,20 @@ with a row a line and the values of the cells that were left alone, or refused b
 import io
 import random
 import re
-import resource
-import signal
 import sys
 import tempfile
-import time
 import zipfile
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pneuopt.logs.read_log import read_log
-from pneuopt.quantities.errors import InputError
+from tests.fuzzing import Report
 from tests.logs.binary_styles import BINARY_STYLES
 from tests.logs.styles import POSITION, ROWS, TEXT_STYLES, Style
 
-TIME_LIMIT = 2.0
-"""CPU time of a case [s]: a file of forty rows that takes longer would hang at forty thousand."""
-MAX_MESSAGE = 1000
-"""Length of a message [character]: a longer one shows the file instead of its fault."""
 CELLS = (
     *("", "NaN", "nan", "inf", "-inf", "1e300", "1e999", "-0", "+.5", "5.", "1e", "0x10", "1_000", "1.234,5", "1,5"),
     *("--", "9" * 5000, "a" * 140_000, "OL", "1.#QNAN", "12:00:00", "2026-03-12", "31.02.2026 10:00:00", '"', '"a'),
@@ -61,29 +53,6 @@ position = "20 um"
 [intersample]
 position = "held"
 """
-
-
-@dataclass
-class Report:
-    """What came of the cases: counts by style, the slowest [s], and each failure with its bytes."""
-
-    cases: Counter[str] = field(default_factory=Counter)
-    accepted: Counter[str] = field(default_factory=Counter)
-    slowest: dict[str, float] = field(default_factory=dict)
-    failures: list[tuple[str, str, bytes, str]] = field(default_factory=list)
-
-    def __str__(self) -> str:
-        lines = [
-            f"{name:70s} {n:7d} cases, {self.accepted[name] / n:4.0%} accepted, slowest {self.slowest[name]:.3f} s"
-            for name, n in sorted(self.cases.items())
-        ]
-        total, accepted = self.cases.total(), self.accepted.total()
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        lines.append(
-            f"{total} cases, {accepted / total:.1%} accepted, {len(self.failures)} failures, "
-            f"slowest {max(self.slowest.values()):.3f} s, peak {peak:.0f} MB"
-        )
-        return "\n".join(lines)
 
 
 @dataclass(frozen=True)
@@ -122,30 +91,12 @@ def _try(report: Report, name: str, style: Style, case: Case, folder: Path) -> N
     side.unlink(missing_ok=True)
     if case.side:
         side.write_text(case.side, encoding="utf-8", errors="surrogatepass")
-    signal.signal(signal.SIGVTALRM, _stop)
-    signal.setitimer(signal.ITIMER_VIRTUAL, 5 * TIME_LIMIT)
-    start, fault = time.process_time(), ""
-    try:
+
+    def read() -> str:
         run = read_log(path, columns=None if case.side else style.columns or None)
-        report.accepted[name] += 1
-        fault = _wrong(run.trajectory.values.get("position"), len(run.trajectory), case)
-    except InputError as error:
-        text = str(error)
-        fault = "" if "\n" not in text and len(text) < MAX_MESSAGE else f"message: {text[:200]!r}"
-    except BaseException as error:
-        fault = f"{type(error).__name__}: {str(error)[:200]}"
-    finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-    spent = time.process_time() - start
-    report.cases[name] += 1
-    report.slowest[name] = max(spent, report.slowest.get(name, 0.0))
-    fault = fault or (f"{spent:.1f} s" if spent > TIME_LIMIT else "")
-    if fault:
-        report.failures.append((name, fault, case.raw, case.side))
+        return _wrong(run.trajectory.values.get("position"), len(run.trajectory), case)
 
-
-def _stop(*_: object) -> None:
-    raise TimeoutError("hangs")
+    report.count(name, read, case.raw, case.side)
 
 
 def _wrong(position: "np.ndarray[tuple[int], np.dtype[np.float64]] | None", n: int, case: Case) -> str:
