@@ -6,18 +6,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.cli.init import write_files
 from pneuopt.cli.shared import Outputs, finish
-from pneuopt.cli.terminal import make_console, show_output_files, show_sentence
+from pneuopt.cli.terminal import make_console, show_output_files, show_report, show_sentence
 from pneuopt.dynamics.system import System
 from pneuopt.files.assumptions import read_option_assumptions
 from pneuopt.files.drive import ambient_pressure, read_drive
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.checkup import OTHER_CHECKS, Checkup, check
-from pneuopt.identification.checkup_text import finding_line, format_lines, headline
+from pneuopt.identification.checkup_report import finding_line, headline
 from pneuopt.identification.mending import mend_findings
 from pneuopt.identification.problem import as_estimation_model
 from pneuopt.logs.doctor import CHECKS
@@ -27,6 +25,7 @@ from pneuopt.logs.read_log import read_log
 from pneuopt.plotting import plot_finding, plot_logs
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report, Tone
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +46,7 @@ def run_check(
     if experiments:
         found = check(system, experiments, parameters)
         found = replace(found, assumptions=(*found.assumptions, *read_option_assumptions(drive)))
-        typer.echo(found.format(make_console().width))
+        show_report(make_console(), found.summary())
         finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found))
         status = status or (EXIT_FAILURE if found.is_refused else EXIT_SUCCESS)
     return _fix(places, system, parameters, accept) if places else status
@@ -88,14 +87,16 @@ def _fix(places: Mapping[Path, Path], system: System, parameters: ParameterSet, 
     write_files(files, force=False)
     for problem in errors:
         show_sentence(make_console(error=True), f"error: not mended: {problem}")
-    said = ["", "mended", *(f"  {p.name}: {c}" for p, m in mended.items() for c in m.changes or ("nothing to mend",))]
-    typer.echo(format_lines(said, make_console().width))
+    changes = ((p.name, change) for p, log in mended.items() for change in log.changes or ("nothing to mend",))
+    said = [Line(""), Line("mended", Tone.HEADING), *(Line(f"{name}: {change}", indent=2) for name, change in changes)]
+    show_report(make_console(), Report(tuple(said)))
     show_output_files(make_console(), list(files))
     if not mended:
         return EXIT_BAD_INPUT
     left = check(system, _read_all([places[path] for path in mended], system, parameters, accept)[0], parameters)
-    said = [f"the mended logs: {headline(left)}", *map(finding_line, left.findings)]
-    typer.echo(format_lines(said, make_console().width))
+    verdict = headline(left)
+    verdict = replace(verdict, text=f"the mended logs: {verdict.text}")
+    show_report(make_console(), Report((verdict, *map(finding_line, left.findings))))
     return EXIT_BAD_INPUT if errors else EXIT_FAILURE if left.is_refused else EXIT_SUCCESS
 
 

@@ -44,14 +44,14 @@ from pneuopt.evaluation.scenarios import NO_SCENARIOS, Scenarios
 from pneuopt.evaluation.travel import check_travel
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Certificate(Shown):
+class Certificate(Result):
     """What `certificate` found; prints its `summary()`.
 
     Attributes

@@ -19,14 +19,14 @@ from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CompensatorVerdict(Shown):
+class CompensatorVerdict(Result):
     """Verdict of `judge_compensators`: as text, the verdict in the first line and a reason in each further line.
 
     Attributes

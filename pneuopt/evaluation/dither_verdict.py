@@ -19,7 +19,7 @@ from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report, Tone
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,7 +76,7 @@ PRICE_METRICS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DitherVerdict(Shown):
+class DitherVerdict(Result):
     """Verdict of `judge_dither`: as text, the verdict in the first line and a reason in each further line.
 
     Attributes

@@ -11,7 +11,14 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.identification.assumptions import Assumption, list_assumptions
-from pneuopt.identification.checks import as_experiments, check_free, check_logs, find_log_warnings, log_remarks
+from pneuopt.identification.checks import (
+    as_experiments,
+    check_free,
+    check_logs,
+    find_log_warnings,
+    log_remarks,
+    outputs_in_log,
+)
 from pneuopt.identification.command_centre import find_centre
 from pneuopt.identification.examination import QUIET_CHECKS, accept_remedy, is_accepted, is_refused
 from pneuopt.identification.exchange import find_exchange
@@ -25,6 +32,8 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import ModelError, PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Report
+from pneuopt.quantities.shown import Shown
 from pneuopt.shooting.least_squares import LeastSquares
 
 MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK = "model", "log", "free", "exchange"
@@ -33,9 +42,9 @@ parameters of which none is free, and of two columns that are exchanged."""
 OTHER_CHECKS = (MODEL_CHECK, LOG_CHECK, FREE_CHECK, EXCHANGE_CHECK)
 
 
-@dataclass(frozen=True, eq=False)
-class Checkup:
-    """What `check` finds; printed, it is a text of 80 columns.
+@dataclass(frozen=True, eq=False, repr=False)
+class Checkup(Shown):
+    """What `check` finds.
 
     Attributes
     ----------
@@ -80,18 +89,15 @@ class Checkup:
 
     def to_dict(self) -> dict[str, Any]:
         """What was found, for a file."""
-        from pneuopt.identification.checkup_text import as_dict
+        from pneuopt.identification.checkup_report import as_dict
 
         return as_dict(self)
 
-    def format(self, width: int = 80) -> str:
-        """The text, in lines of `width` characters that end between words."""
-        from pneuopt.identification.checkup_text import format_checkup
+    def summary(self) -> Report:
+        """Whether a fit takes the logs; what was read, assumed and found; what is identifiable, and what would help."""
+        from pneuopt.identification.checkup_report import report_checkup
 
-        return format_checkup(self, width)
-
-    def __str__(self) -> str:
-        return self.format()
+        return report_checkup(self)
 
 
 def check(
@@ -178,10 +184,17 @@ def _exchange_findings(
 
 
 def _log_findings(model: Fittable, given: Sequence[Experiment], logs: Sequence[Experiment]) -> Iterator[LogFinding]:
-    """What was mended in each log, or doubted of its noise."""
+    """What was mended in each log, or doubted of its noise, and which measured samples are missing."""
     for log, checked in zip(given, logs, strict=True):
         for sentence in log_remarks(model, [log], [checked]):
             yield LogFinding("", sentence.removeprefix(f"{checked.name}: "), False, LOG_CHECK, checked.name)
+        for channel in outputs_in_log(model, log):
+            at = np.flatnonzero(np.isnan(log.trajectory[channel]))
+            if at.size:
+                count = f"{at.size} sample{'s' * (at.size > 1)} of {channel} {'are' if at.size > 1 else 'is'} missing"
+                rows = (log.source.first_row + int(at[0]), log.source.first_row + int(at[-1])) if log.source else None
+                message = f"{count}; a fit goes without"
+                yield LogFinding(channel, message, False, LOG_CHECK, checked.name, rows=rows)
 
 
 def _free(logs: Sequence[Experiment], parameters: ParameterSet) -> Iterator[LogFinding]:

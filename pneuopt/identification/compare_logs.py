@@ -19,7 +19,7 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import LogError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ MIN_RELATIVE_DIFFERENCE = 0.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LogComparison(Shown):
+class LogComparison(Result):
     """The estimates of several logs, each fitted alone, and whether they agree; prints its `summary()`.
 
     Attributes

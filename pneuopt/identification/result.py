@@ -12,7 +12,7 @@ from pneuopt.identification.marks import Mark as Mark  # noqa: PLC0414
 from pneuopt.identification.report import report_fit
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
@@ -146,7 +146,7 @@ class ChosenWindow:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class IdentificationResult(Shown):
+class IdentificationResult(Result):
     """The result of `identify`: estimates, intervals, fitted trajectories and status; printed, it is its `summary()`.
 
     Attributes

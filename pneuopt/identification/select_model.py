@@ -21,7 +21,7 @@ from pneuopt.quantities.errors import ConvergenceError, UnknownNameError, requir
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ MAX_HELD_OUT_RATIO = 1.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ModelSelection(Shown):
+class ModelSelection(Result):
     """The fits of several models to the same logs, ranked, and the recommended one; prints its `summary()`.
 
     Attributes

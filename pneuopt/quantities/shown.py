@@ -1,4 +1,4 @@
-"""`Shown`: what every result can do, print itself, stand in a notebook, and be saved."""
+"""`Shown`: what prints itself and stands in a notebook; `Result`: what can be saved besides."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -8,11 +8,21 @@ from pneuopt.quantities.result_file import write_result
 
 
 class Shown(ABC):
-    """A result that prints, and shows in a notebook, as its report, and that can be saved."""
+    """What prints, and shows in a notebook, as its report."""
 
     @abstractmethod
     def summary(self) -> Report:
         """What there is to know, verdict first: print it, or take its `to_text(width)` or `to_html()`."""
+
+    def __repr__(self) -> str:
+        return self.summary().to_text()
+
+    def _repr_html_(self) -> str:
+        return self.summary().to_html()
+
+
+class Result(Shown):
+    """What a search or a certificate hands out: it prints, and it can be saved."""
 
     def save(self, path: str | Path) -> None:
         """Write all of it to a file of JSON text, whole or not at all; `load_result` reads it.
@@ -23,9 +33,3 @@ class Shown(ABC):
             If the file cannot be written.
         """
         write_result(path, self)
-
-    def __repr__(self) -> str:
-        return self.summary().to_text()
-
-    def _repr_html_(self) -> str:
-        return self.summary().to_html()

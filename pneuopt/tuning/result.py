@@ -19,7 +19,7 @@ from pneuopt.evaluation.requirements import (
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.relaxation import describe_relaxations
 from pneuopt.tuning.report import report_tuning
@@ -35,7 +35,7 @@ RELAXATION_COLUMNS = ("asked", "needed", "share")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TuningResult(Shown):
+class TuningResult(Result):
     """The design that `tune` found, its claim, its certificate, what each requirement comes to; prints its `summary()`.
 
     Attributes

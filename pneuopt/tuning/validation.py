@@ -24,7 +24,7 @@ from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 from pneuopt.tuning.advice import LANE_DEFECTS, NO_REST, advise, find_breaks
 from pneuopt.tuning.report import report_validation, report_validation_verdict
 from pneuopt.tuning.simulator import Simulator
@@ -39,7 +39,7 @@ SUMMARY_PERCENTILE = 95.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DesignValidation(Shown):
+class DesignValidation(Result):
     """A design on new plants; prints its `summary()`.
 
     Attributes

@@ -69,10 +69,13 @@ def test_all_logs_that_cannot_be_read_are_named_and_the_others_checked() -> None
 
 def test_lines_are_no_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     write(BAD_LOGS["stops"].select(["position", "force"]))
+    plain = run("check drive.toml run.csv").stdout
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "60")
-    result = run("check drive.toml run.csv")
-    assert max(map(len, result.stdout.splitlines())) <= 60
-    assert "\x1b" not in result.stdout
+    wide = run("check drive.toml run.csv").stdout
+    assert max(map(len, wide.splitlines())) <= 60
+    assert wide.split() == plain.split()
 
 
 def mend(name: str) -> Result:
@@ -80,22 +83,22 @@ def mend(name: str) -> Result:
 
 
 @pytest.mark.parametrize(
-    ("check", "said"),
+    ("check", "said", "verdict"),
     [
-        ("work", "all 4000 rows: force multiplied by -1"),
-        ("scale", "all 4000 rows: position multiplied by 0.001"),
-        ("jumps", "rows 1503 to 1601 (99 in all): cells of position emptied"),
-        ("stops", "left out, at an end stop"),
+        ("work", "all 4000 rows: force multiplied by -1", "nothing is wrong"),
+        ("scale", "all 4000 rows: position multiplied by 0.001", "nothing is wrong"),
+        ("jumps", "rows 1503 to 1601 (99 in all): cells of position emptied", "a fit takes this, with 1 note"),
+        ("stops", "left out, at an end stop", "a fit takes this, with 1 note"),
     ],
 )
-def test_a_fault_is_mended_by_its_rule_and_then_gone(check: str, said: str, folder: Path) -> None:
+def test_a_fault_is_mended_by_its_rule_and_then_gone(check: str, said: str, verdict: str, folder: Path) -> None:
     write(BAD_LOGS[check].select(["position", "force"]))
     old = Path("run.csv").read_bytes()
     (folder / "mended").mkdir()
     result = mend("run.csv")
     assert result.exit_code == 0
     assert said in result.stdout
-    assert "the mended logs: nothing is wrong" in result.stdout
+    assert f"the mended logs: {verdict}: the logs identify all" in result.stdout
     assert Path("run.csv").read_bytes() == old
     assert said in Path("mended/run.toml").read_text("utf-8")
     assert run("check drive.toml mended/run.csv").exit_code == 0

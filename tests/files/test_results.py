@@ -25,7 +25,7 @@ from pneuopt.identification.result import ChosenWidth, ChosenWindow, Identificat
 from pneuopt.identification.select_model import ModelSelection
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.quantities.shown import Shown
+from pneuopt.quantities.shown import Result
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.tuning.result import TuningResult
@@ -146,8 +146,8 @@ def test_a_design_is_read_as_it_was_saved_and_prints_the_same(tmp_path: Path) ->
 
 
 def test_every_kind_of_result_can_be_read_again() -> None:
-    shown = {kind.__name__ for kind in Shown.__subclasses__() if kind.__module__.startswith("pneuopt.")}
-    assert shown == set(RESULT_KINDS)
+    results = {kind.__name__ for kind in Result.__subclasses__() if kind.__module__.startswith("pneuopt.")}
+    assert results == set(RESULT_KINDS)
 
 
 def message_or_result(path: Path) -> tuple[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pneuopt.files.drive import read_drive
-from pneuopt.identification.checkup import Checkup, check
+from pneuopt.identification.checkup import check
 from pneuopt.identification.identify import identify
 from pneuopt.logs.checks.findings import Severity
 from pneuopt.logs.experiments import Experiment
@@ -159,15 +159,15 @@ def test_what_logs_do_not_identify_is_said_with_the_run_that_would() -> None:
     assert "what would help" in str(found)
 
 
-@pytest.mark.parametrize("width", [60, 80])
-def test_lines_end_between_words(width: int) -> None:
-    log, drive, given = one_way()
-    found: Checkup = check(drive, log, given)
-    lines = found.format(width).splitlines()
-    assert max(map(len, lines)) <= width
-    assert " ".join(found.format(width).split()) == " ".join(found.format(10**6).split())
-    joined = found.format(10**6)
-    assert all(f" {word} " in f" {' '.join(joined.split())} " for word in " ".join(lines).split())
+def test_a_missing_sample_is_a_note_and_not_nothing() -> None:
+    column = LOG.trajectory["position"].copy()
+    column[700:703] = np.nan
+    channels = {"position": column, "force": LOG.trajectory["force"]}
+    found = check(DRIVE, replace(LOG, trajectory=Trajectory(T, channels)), GIVEN)
+    (note,) = found.findings
+    assert (note.severity, note.channel, note.log) == (Severity.NOTE, "position", "swing")
+    assert "3 samples of position are missing" in note.message
+    assert str(found).startswith("a fit takes this, with 1 note: the logs identify all of 2 free parameters")
 
 
 def test_the_dictionary_is_plain() -> None:

@@ -1,16 +1,19 @@
-"""The text of a `Checkup`, in lines that end between words, and what a file holds of it."""
+"""What a `Checkup` shows, whether a fit takes the logs, what was read, assumed and found, and what a file holds."""
 
+import itertools
 import math
 import re
-import textwrap
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pneuopt.identification.assumptions import Assumption
+from pneuopt.identification.marks import UNIDENTIFIABLE_NOTE
 from pneuopt.logs.checks.findings import LogFinding, Severity
 from pneuopt.logs.experiments import Experiment
+from pneuopt.quantities.report import TIED, Line, Report, Table, Tone, text_columns
 from pneuopt.quantities.units import write_value
 
 if TYPE_CHECKING:
@@ -22,47 +25,49 @@ what no rig keeps, a higher one hides what quiet sensors give."""
 MAX_PERCENT = 100.0
 """Standard deviation over the value [%] beyond which its digits say nothing."""
 _NUMBER_AND_UNIT = re.compile(r"(?<=\d) (?=(?:[a-zA-Z]?(?:m|s|N|V|g|Hz|Pa|bar|rad|J|K|W)|%)(?![a-z]))")
-_NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
+_TONES = {Severity.FAULT: Tone.BAD, Severity.DOUBT: Tone.DOUBTFUL, Severity.NOTE: Tone.PLAIN}
 
 
-def format_checkup(found: "Checkup", width: int) -> str:
+def report_checkup(found: "Checkup") -> Report:
     """The verdict, and below it what was read, assumed and found, and what the logs identify."""
-    blocks = [
-        [headline(found)],
-        ["read", *(line for log in found.logs for line in _log_lines(log))],
-        ["assumed, for it stands in no file; written so, it states the same", *_assumption_lines(found.assumptions)],
-        ["found", *map(finding_line, found.findings)],
-        ["identifiable, by sensitivities at the start values, if the model is right", *_verdict_lines(found)],
-        ["what would help", *(f"  {run}: for {', '.join(names)}" for run, names in found.runs.items())],
-    ]
-    return "\n\n".join(format_lines(lines, width) for lines in blocks if _says_something(lines))
+    blocks: dict[str, list[Line | Table]] = {
+        "read": [*itertools.chain.from_iterable(map(_log_lines, found.logs))],
+        "assumed, for it stands in no file; written so, it states the same": [*_assumption_lines(found.assumptions)],
+        "found": [*map(finding_line, found.findings)],
+        "identifiable, by sensitivities at the start values, if the model is right": [*_verdict_parts(found)],
+        "what would help": [_line(f"{run}: for {', '.join(names)}", 2) for run, names in found.runs.items()],
+    }
+    parts: list[Line | Table] = [headline(found)]
+    for title, block in blocks.items():
+        if block:
+            parts += [Line(""), Line(title, Tone.HEADING), *block]
+    return Report(tuple(parts))
 
 
-def format_lines(lines: Sequence[str], width: int) -> str:
-    """Each line in pieces of at most that width, the further ones indented by two more."""
-    return "\n".join(_wrap(line, width) for line in lines)
-
-
-def headline(found: "Checkup") -> str:
+def headline(found: "Checkup") -> Line:
     """Whether a fit would take the logs, in a sentence."""
     count = {s: sum(f.severity is s for f in found.findings) for s in Severity}
-    doubts = f"{count[Severity.DOUBT]} doubt{'s' if count[Severity.DOUBT] > 1 else ''}"
+    doubts = _count(count[Severity.DOUBT], "doubt")
     if count[Severity.FAULT]:
-        faults = f"{count[Severity.FAULT]} fault{'s' if count[Severity.FAULT] > 1 else ''}"
-        return f"a fit would refuse this: {faults}{f', {doubts}' if count[Severity.DOUBT] else ''}"
+        faults = _count(count[Severity.FAULT], "fault")
+        return Line(f"a fit would refuse this: {', '.join(filter(None, (faults, doubts)))}", Tone.BAD)
     unknown = found.verdict.unidentifiable if found.verdict else ()
     total = len(found.verdict.table) if found.verdict else 0
     known = f"the logs identify {total - len(unknown) if unknown else 'all'} of {total} free parameters"
-    return f"a fit takes this, with {doubts}: {known}" if count[Severity.DOUBT] else f"nothing is wrong: {known}"
+    remarks = ", ".join(filter(None, (doubts, _count(count[Severity.NOTE], "note"))))
+    if remarks:
+        return Line(f"a fit takes this, with {remarks}: {known}", Tone.DOUBTFUL if doubts else Tone.GOOD)
+    return Line(f"nothing is wrong: {known}", Tone.GOOD)
 
 
-def finding_line(finding: LogFinding) -> str:
+def finding_line(finding: LogFinding) -> Line:
     """Severity, log and rows, and what was found."""
     place = finding.log
     if finding.rows is not None:
         first, last = finding.rows
         place += f", row {first}" if first == last else f", rows {first} to {last}"
-    return f"  {finding.severity}{f' in {place}' if place else ''}: {finding.message}"
+    lead = f"{finding.severity}{f' in {place}' if place else ''}"
+    return replace(_line(f"{lead}: {finding.message}", 2), tone=_TONES[finding.severity])
 
 
 def as_dict(found: "Checkup") -> dict[str, Any]:
@@ -70,7 +75,7 @@ def as_dict(found: "Checkup") -> dict[str, Any]:
     verdict = found.verdict
     rows = verdict.table.reset_index(names="name").to_dict(orient="records") if verdict else []
     return {
-        "verdict": headline(found),
+        "verdict": headline(found).text,
         "read": [_log_record(log) for log in found.logs],
         "assumed": [{"name": a.name, "value": a.value, "unit": a.unit, "key": a.key} for a in found.assumptions],
         "found": [
@@ -83,16 +88,13 @@ def as_dict(found: "Checkup") -> dict[str, Any]:
     }
 
 
-def _says_something(lines: Sequence[str]) -> bool:
-    return len(lines) > 1 or not lines[0].startswith(("found", "assumed", "identifiable", "what would"))
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number > 1 else ''}" if number else ""
 
 
-def _wrap(line: str, width: int) -> str:
-    """The line in pieces that end between words, and not between a number and its unit."""
-    indent = " " * (len(line) - len(line.lstrip()) + 2)
-    joined = _NUMBER_AND_UNIT.sub(_NO_BREAK_SPACE, line)
-    pieces = textwrap.wrap(joined, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-    return "\n".join(pieces).replace(_NO_BREAK_SPACE, " ")
+def _line(text: str, indent: int) -> Line:
+    """A line that does not end between a number and its unit."""
+    return Line(_NUMBER_AND_UNIT.sub(TIED, text), indent=indent)
 
 
 def _log_record(log: Experiment) -> dict[str, Any]:
@@ -117,7 +119,7 @@ def _log_record(log: Experiment) -> dict[str, Any]:
     }
 
 
-def _log_lines(log: Experiment) -> Iterator[str]:
+def _log_lines(log: Experiment) -> Iterator[Line]:
     """File, rows and rate of a log, then its channels, and what is not read."""
     source, t = log.source, log.trajectory.t
     step, count = float(np.median(np.diff(t))), len(log.trajectory)
@@ -125,18 +127,18 @@ def _log_lines(log: Experiment) -> Iterator[str]:
         f"rows {source.first_row} to {source.first_row + count - 1} of {source.path}" if source else f"{count} samples"
     )
     rate = f"every {write_value(step, 's', 4)} ({write_value(1 / step, 'Hz', 5)})"
-    yield f"  {log.name or 'log'}: {rows}, {t[0]:.6g} s to {t[-1]:.6g} s, {rate}"
+    yield _line(f"{log.name or 'log'}: {rows}, {t[0]:.6g} s to {t[-1]:.6g} s, {rate}", 2)
     for channel in log.trajectory:
-        yield f"    {channel}: {_range(log, channel)}{_origin(log, channel)}"
+        yield _line(f"{channel}: {_range(log, channel)}{_origin(log, channel)}", 4)
     if source and "time" in source.columns:
-        yield f"    time: column {source.columns['time'].name!r}"
+        yield _line(f"time: column {source.columns['time'].name!r}", 4)
     if source and source.sidecar:
-        yield f"    {source.sidecar} says {', '.join(source.sections)}"
+        yield _line(f"{source.sidecar} says {', '.join(source.sections)}", 4)
     if source and source.unread:
-        yield f"    not read: {', '.join(source.unread)}"
+        yield _line(f"not read: {', '.join(source.unread)}", 4)
     for name, value in log.conditions.items():
-        yield f"    {name} = {value:g} in this log"
-    yield from (f"    {remark}" for remark in log.remarks)
+        yield _line(f"{name} = {value:g} in this log", 4)
+    yield from (_line(remark, 4) for remark in log.remarks)
 
 
 def _range(log: Experiment, channel: str) -> str:
@@ -157,28 +159,28 @@ def _origin(log: Experiment, channel: str) -> str:
     return f", column {column.name!r}{unit}{by}{said}"
 
 
-def _assumption_lines(assumptions: Sequence[Assumption]) -> Iterator[str]:
+def _assumption_lines(assumptions: Sequence[Assumption]) -> Iterator[Line]:
     """As a file would say it, with the reason."""
     file, sections = "", list(dict.fromkeys(a.key.partition("]")[0] for a in assumptions))
     for a in sorted(assumptions, key=lambda a: sections.index(a.key.partition("]")[0])):
         if a.file != file:
             file = a.file
-            yield f"  in {file}:"
-        yield f"    {a.key} = {a.text}: {a.reason}"
+            yield _line(f"in {file}:", 2)
+        yield _line(f"{a.key} = {a.text}: {a.reason}", 4)
 
 
-def _verdict_lines(found: "Checkup") -> Iterator[str]:
-    """A line a parameter, then why some are not identifiable."""
+def _verdict_parts(found: "Checkup") -> Iterator[Line | Table]:
+    """A row a parameter, then why some are not identifiable."""
     if found.verdict is None:
         return
-    table = found.verdict.table
-    names = max(len(str(n)) for n in table.index)
-    for name, row in table.iterrows():
+    rows = []
+    for name, row in found.verdict.table.iterrows():
         unit = found.parameters[str(name).partition("[")[0]].unit
-        value = write_value(float(row["value"]), unit, 4)
         known = _deviation(float(row["value"]), float(row["relative"]), float(row["stderr"]), unit)
-        yield f"  {name!s:<{names}}  {value:<15}  {known if row['identifiable'] else 'unidentifiable'}"
-    yield from (f"  {sentence}" for sentence in found.verdict.sentences)
+        value = write_value(float(row["value"]), unit, 4)
+        rows.append((str(name), value, known if row["identifiable"] else UNIDENTIFIABLE_NOTE))
+    yield Table(text_columns("parameter", "start", "deviation"), tuple(rows))
+    yield from (_line(sentence, 2) for sentence in found.verdict.sentences)
 
 
 def _deviation(value: float, relative: float, stderr: float, unit: str) -> str:
