@@ -30,6 +30,7 @@ from .dynamics.system import DiscreteSystem, Linearisation, System, define, disc
 from .evaluation.certificate import Certificate, certificate
 from .evaluation.compensator_verdict import CompensatorVerdict, judge_compensators
 from .evaluation.defects import Defect, Finding
+from .evaluation.distributions import LogNormal, LogUniform, Normal, Uniform
 from .evaluation.dither_effect import dither_effect
 from .evaluation.dither_verdict import DitherVerdict, Usefulness, judge_dither
 from .evaluation.energy import EnergyUse
@@ -38,6 +39,7 @@ from .evaluation.expected_plants import ExpectedPlants, expected_plants
 from .evaluation.limit_cycle import LimitCycle, find_limit_cycle
 from .evaluation.margins import Margins, frequency_response, margins
 from .evaluation.metrics import BandCentre, step_metrics
+from .evaluation.monte_carlo import monte_carlo
 from .evaluation.record import Recording, record
 from .evaluation.requirements import (
     IAE,
@@ -59,6 +61,7 @@ from .evaluation.requirements import (
     StepEnvelope,
 )
 from .evaluation.rig import Actuator, Rig, Sensor
+from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
 from .files.drive import read_drive, write_fit
 from .files.results import load_result
@@ -123,9 +126,10 @@ from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
+from .studies.cases import grid, read_cases
 from .studies.journal import Journal
 from .studies.neighbours import search_again, sweep_from_neighbours
-from .studies.sweep import grid, sweep
+from .studies.sweep import sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
 from .tuning.tune import TuningResult, tune
@@ -193,6 +197,8 @@ __all__ = [
     "LoadDependent",
     "LogComparison",
     "LogFinding",
+    "LogNormal",
+    "LogUniform",
     "LuGre",
     "Margins",
     "Mark",
@@ -201,6 +207,7 @@ __all__ = [
     "ModelSelection",
     "MotionDrive",
     "NoiseGain",
+    "Normal",
     "Overshoot",
     "ParallelForm",
     "Parameter",
@@ -225,6 +232,7 @@ __all__ = [
     "Ripple",
     "RiseTime",
     "RotaryDrive",
+    "Sampling",
     "SecondOrder",
     "Sensor",
     "SensorLag",
@@ -245,6 +253,7 @@ __all__ = [
     "Trajectory",
     "TuningResult",
     "TwoPhase",
+    "Uniform",
     "Usefulness",
     "Verdict",
     "Viscous",
@@ -279,6 +288,7 @@ __all__ = [
     "load_result",
     "margins",
     "mean_start",
+    "monte_carlo",
     "open_loop",
     "pareto_front",
     "plot_bode",
@@ -298,6 +308,7 @@ __all__ = [
     "propagate_error",
     "proportional_band",
     "proportional_gain",
+    "read_cases",
     "read_drive",
     "read_log",
     "read_tuning",

@@ -48,10 +48,11 @@ from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.source import read_once, read_toml_source
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
+from pneuopt.studies.cases import grid
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
-from pneuopt.studies.sweep import grid, sweep
+from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.certifier import certified_objective
 from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.tune import tune

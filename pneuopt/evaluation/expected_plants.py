@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import t
 
+from pneuopt.evaluation.monte_carlo import degrees_of_freedom, draw_in_ranges, select_estimates, select_ranges
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, AxisNames, Factor, Scenarios, draws, tolerances
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
@@ -148,15 +149,16 @@ def expected_plants(
     """
     require(count >= 1, f"count must be at least 1, got {count}")
     known = {n for values in scenarios.values() for n in values}
-    estimated, dof = _select_estimates(parameters, covariance, known), _degrees_of_freedom(estimates)
-    ranges = _select_ranges(parameters, estimates, known)
+    others = {*known, *parameters.free_names}
+    estimated, dof = select_estimates(parameters, covariance, others), degrees_of_freedom(estimates)
+    ranges = select_ranges(parameters, estimates, others)
     from_fit = (*(map(str, estimated.index) if estimated is not None else ()), *ranges)
     shares = _usual_tolerances(parameters, {*known, *from_fit})
     varied = tolerances(parameters, shares, count, seed=seed) if shares else {}
     drawn = {} if estimated is None else draws(parameters, estimated, count, seed=seed, dof=dof)
     own = list(scenarios.values()) or [{}]
     parts = zip(*((list(part.values()) or [{}] * count) for part in (varied, drawn)), strict=True)
-    wide = _draw_in_ranges(parameters, ranges, count, seed)
+    wide = draw_in_ranges(parameters, ranges, count, seed)
     plants = {f"plant {k + 1}": {**a, **b, **wide[k], **own[k % len(own)]} for k, (a, b) in enumerate(parts)}
     axes = [_tolerance_axis(names, share) for names, share in shares.items()]
     if estimated is not None:
@@ -164,52 +166,6 @@ def expected_plants(
         axes += [_estimate_axis(parameters, n, s, dof.get(n, math.inf)) for n, s in deviations.items()]
     axes += [_range_axis(parameters, n, *ends) for n, ends in ranges.items()]
     return ExpectedPlants(plants if axes or known else {}, tuple(axes), from_fit, tuple(sorted(known)))
-
-
-def _select_estimates(
-    parameters: ParameterSet, covariance: "pd.DataFrame | None", known: Collection[str]
-) -> "pd.DataFrame | None":
-    """The part of a covariance that the plants are drawn from: identified parameters of this loop; None without one."""
-    if covariance is None:
-        return None
-    spread = dict(zip(map(str, covariance.index), np.diag(covariance.to_numpy(dtype=float)).tolist(), strict=True))
-    names = [n for n, v in spread.items() if n in parameters and n not in known and v > 0 and not parameters[n].free]
-    return covariance.loc[names, names] if names else None
-
-
-def _degrees_of_freedom(estimates: "pd.DataFrame | None") -> dict[str, float]:
-    """The degrees of freedom of each estimate's variance, where a fit tells them."""
-    if estimates is None or "dof" not in estimates:
-        return {}
-    return {str(n): float(v) for n, v in estimates["dof"].items() if math.isfinite(v) and v > 0}
-
-
-def _select_ranges(
-    parameters: ParameterSet, estimates: "pd.DataFrame | None", known: Collection[str]
-) -> dict[str, tuple[float, float]]:
-    """The ranges within the bounds of parameters of this loop that a fit has given one in place of an interval."""
-    if estimates is None or "range_low" not in estimates:
-        return {}
-    rows = estimates[estimates["stderr"].isna() & estimates["range_low"].notna() & estimates["range_high"].notna()]
-    ends = {str(n): (float(row["range_low"]), float(row["range_high"])) for n, row in rows.iterrows()}
-    return {
-        n: (max(low, parameters[n].lower), min(high, parameters[n].upper))
-        for n, (low, high) in ends.items()
-        if n in parameters and n not in known and not parameters[n].free and low < high
-    }
-
-
-def _draw_in_ranges(
-    parameters: ParameterSet, ranges: Mapping[str, tuple[float, float]], count: int, seed: int
-) -> list[dict[str, float]]:
-    """Values anywhere in each range, by their logarithm where the parameter is searched by it."""
-    rng = np.random.default_rng((seed, 1))
-
-    def draw(name: str, low: float, high: float) -> float:
-        share = float(rng.random())
-        return low * (high / low) ** share if parameters[name].log else low + share * (high - low)
-
-    return [{n: draw(n, *ends) for n, ends in ranges.items()} for _ in range(count)]
 
 
 def _usual_tolerances(parameters: ParameterSet, others: Collection[str]) -> dict[AxisNames, float]:

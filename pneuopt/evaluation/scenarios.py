@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import norm, t
 
+from pneuopt.evaluation.distributions import Distribution, quantiles
+from pneuopt.evaluation.sampling import Sampling, Seed, unit_points
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 AxisNames = str | tuple[str, ...]
 Spread = float | tuple[float, float]
 Spreads = Mapping[str, Spread] | Mapping[AxisNames, Spread]
+SampleSpreads = Spreads | Mapping[str, Spread | Distribution] | Mapping[AxisNames, Spread | Distribution]
 ScenarioValues = dict[str, dict[str, float]]
 MAX_CORNERS = 4096  # plants, 12 axes: each one is simulated for every candidate, and another axis doubles their number
 # Draws until a sample lies within the bounds: fewer refuse a covariance that reaches beyond them, more only delay the
@@ -144,32 +147,56 @@ def apply_scenario(parameters: ParameterSet, values: Mapping[str, float | Factor
     return parameters.with_bounds(room).with_values(spread | plain)
 
 
-def samples(parameters: ParameterSet, spreads: Spreads, count: int, *, seed: int = 0) -> ScenarioValues:
-    """Plants drawn uniformly from the box whose corners `corners` gives, with the same errors.
+def samples(
+    parameters: ParameterSet,
+    spreads: SampleSpreads,
+    count: int,
+    *,
+    seed: Seed = 0,
+    sampling: Sampling = Sampling.RANDOM,
+) -> ScenarioValues:
+    """Plants drawn from the box whose corners `corners` gives, or from stated distributions.
 
     Parameters
     ----------
     parameters : ParameterSet
     spreads : mapping
-        As for `corners`; parameters on one axis vary together.
+        As for `corners`, drawn uniformly; or a `Distribution`, cut off at the bounds. Parameters on one axis vary
+        together.
     count : int
-    seed : int
+    seed : int or tuple of int
+    sampling : Sampling
+        How the draws fill the box.
 
     Returns
     -------
     dict of str to dict of str to float
         "sample 1" and so on.
+
+    Raises
+    ------
+    InputError
+        As for `corners`, or if next to nothing of a distribution lies within the bounds.
+
+    Examples
+    --------
+    >>> from pneuopt.quantities.parameters import Parameter
+    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "load.force": Parameter(0.0, "N")})
+    >>> from pneuopt.evaluation.distributions import Normal
+    >>> spreads = {"load.mass": Normal(0.05), "load.force": (-20.0, 20.0)}
+    >>> len(samples(rig, spreads, 100, sampling=Sampling.LATIN_HYPERCUBE))
+    100
     """
     require(count >= 1, f"count must be at least 1, got {count}")
-    ends, rng = _axis_ends(parameters, spreads), np.random.default_rng(seed)
-    out = {}
-    for number in range(1, count + 1):
-        shares = rng.random(len(ends)).tolist()
-        out[f"sample {number}"] = _merge_values(
-            {n: low[n] + share * (high[n] - low[n]) for n in low}
-            for share, (low, high) in zip(shares, ends.values(), strict=True)
-        )
-    return out
+    axes = _axis_names(parameters, spreads)
+    shares = unit_points(sampling, count, len(axes), seed)
+    columns = {
+        n: _sample_values(parameters, n, spread, shares[:, k]).tolist()
+        for k, (names, spread) in enumerate(axes.values())
+        for n in names
+    }
+    rows = zip(*columns.values(), strict=True)
+    return {f"sample {k}": dict(zip(columns, row, strict=True)) for k, row in enumerate(rows, 1)}
 
 
 def draws(
@@ -177,7 +204,7 @@ def draws(
     covariance: "pd.DataFrame",
     count: int,
     *,
-    seed: int = 0,
+    seed: Seed = 0,
     dof: Mapping[str, float] = MappingProxyType({}),
 ) -> ScenarioValues:
     """Plants drawn from a fit's covariance: the uncertainty that the logs leave, correlations included.
@@ -190,7 +217,7 @@ def draws(
         `IdentificationResult.covariance`: rows and columns by parameter. A parameter that is searched by its logarithm
         is drawn by it.
     count : int
-    seed : int
+    seed : int or tuple of int
     dof : mapping of str to float, optional
         Degrees of freedom of a parameter's variance, ``fit.estimates["dof"]``: each parameter is then drawn by
         Student's t, as its confidence interval is, with normal scores that are correlated as the estimates are.
@@ -234,10 +261,12 @@ def _by_student_t(normal: Array, deviations: Array, dof: Array) -> Array:
     return out
 
 
-def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
-    """Parameter values of each axis at its low and its high end."""
+def _axis_names(
+    parameters: ParameterSet, spreads: SampleSpreads
+) -> dict[str, tuple[tuple[str, ...], Spread | Distribution]]:
+    """The parameters of each axis, and how they spread."""
     require(len(spreads) > 0, "no spread: give at least one parameter and how far it spreads")
-    out: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
+    out: dict[str, tuple[tuple[str, ...], Spread | Distribution]] = {}
     taken: dict[str, str] = {}
     for key, spread in spreads.items():
         patterns = (key,) if isinstance(key, str) else key
@@ -246,6 +275,14 @@ def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[di
         for name in names:
             require(name not in taken, f"{name} is on two axes, {taken.get(name)!r} and {axis!r}; leave it on one")
             taken[name] = axis
+        out[axis] = names, spread
+    return out
+
+
+def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
+    """Parameter values of each axis at its low and its high end."""
+    out: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
+    for axis, (names, spread) in _axis_names(parameters, spreads).items():
         ends = [_spread_ends(parameters, name, spread) for name in names]
         out[axis] = (
             {n: e[0] for n, e in zip(names, ends, strict=True)},
@@ -254,8 +291,18 @@ def _axis_ends(parameters: ParameterSet, spreads: Spreads) -> dict[str, tuple[di
     return out
 
 
-def _spread_ends(parameters: ParameterSet, name: str, spread: Spread) -> tuple[float, float]:
+def _sample_values(parameters: ParameterSet, name: str, spread: Spread | Distribution, shares: Array) -> Array:
+    """The values of a parameter at these shares of its axis."""
+    if isinstance(spread, float | int | tuple):
+        low, high = _spread_ends(parameters, name, spread)
+        return np.asarray(low + shares * (high - low))
+    return quantiles(spread, name, parameters[name], shares)
+
+
+def _spread_ends(parameters: ParameterSet, name: str, spread: Spread | Distribution) -> tuple[float, float]:
     p = parameters[name]
+    if not isinstance(spread, float | int | tuple):
+        raise InputError(f"{name}: {spread} has no corners; draw samples")
     if isinstance(spread, tuple):
         low, high = spread
     else:

@@ -5,17 +5,16 @@ spawned, not forked, on every system: the function is pickled once for each of t
 `System`, a `ClosedLoop`); machine code comes from the cache.
 """
 
-import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from contextlib import closing, suppress
 from math import nan
 from typing import TYPE_CHECKING, Any
 
-from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.quantities.units import write_value
+from pneuopt.studies.cases import CaseValues, case_parameters
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, Outcome
 from pneuopt.studies.processes import run_in_executor, run_in_processes
@@ -23,44 +22,7 @@ from pneuopt.studies.processes import run_in_executor, run_in_processes
 if TYPE_CHECKING:
     import pandas as pd
 
-CaseValues = ParameterSet | Mapping[str, float]
 _STUDY_COLUMNS = ("case", "seconds", "error")
-
-
-def grid(parameters: ParameterSet, axes: Mapping[str, Iterable[float]]) -> dict[str, dict[str, float]]:
-    """Every combination of values, as named cases for `sweep`; the last axis runs fastest.
-
-    Parameters
-    ----------
-    parameters : ParameterSet
-        Gives units and bounds.
-    axes : mapping of str to iterable of float
-        Parameter to its values [its SI unit].
-
-    Returns
-    -------
-    dict of str to dict of str to float
-        "load.mass = 2 kg, load.force = 0 N" to the values by name.
-
-    Raises
-    ------
-    InputError
-        If a parameter is unknown, a value is outside its bounds or there twice, or there is none.
-
-    Examples
-    --------
-    >>> from pneuopt.quantities.parameters import Parameter
-    >>> rig = ParameterSet({"load.mass": Parameter(5.0, "kg"), "stroke": Parameter(0.2, "m")})
-    >>> grid(rig, {"load.mass": [2.0, 8.0], "stroke": [0.1]})["load.mass = 8 kg, stroke = 100 mm"]
-    {'load.mass': 8.0, 'stroke': 0.1}
-    """
-    require(len(axes) > 0, "a grid needs an axis: a parameter and its values")
-    check_names("parameter", axes, parameters, "axis")
-    columns = [_label_axis(parameters, name, list(map(float, values))) for name, values in axes.items()]
-    return {
-        ", ".join(label for label, _ in point): dict(zip(axes, (value for _, value in point), strict=True))
-        for point in itertools.product(*columns)
-    }
 
 
 def sweep(
@@ -107,6 +69,7 @@ def sweep(
     --------
     >>> from concurrent.futures import ThreadPoolExecutor
     >>> from pneuopt.quantities.parameters import Parameter
+    >>> from pneuopt.studies.cases import grid
     >>> rig = ParameterSet({"mass": Parameter(5.0, "kg"), "force": Parameter(10.0, "N")})
     >>> table = sweep(lambda p: p.value("force") / p.value("mass"), rig, grid(rig, {"mass": [2.0, 0.0]}),
     ...               executor=ThreadPoolExecutor())
@@ -114,7 +77,7 @@ def sweep(
     ([5.0, nan], 'ZeroDivisionError')
     """
     require(len(cases) > 0, "a study needs a case")
-    runs = {str(name): _case_parameters(parameters, case, str(name)) for name, case in cases.items()}
+    runs = {str(name): case_parameters(parameters, case, str(name)) for name, case in cases.items()}
     found = {} if journal is None else {name: journal.known[name] for name in runs if name in journal.known}
     missing = {name: values for name, values in runs.items() if name not in found}
     outcomes = run_in_processes(fn, missing) if executor is None else run_in_executor(executor, fn, missing)
@@ -128,27 +91,6 @@ def sweep(
                 journal.add(name, outcome)
             report(_progress_text(found, len(runs)), len(found), len(runs))
     return _study_table(parameters, runs, found)
-
-
-def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
-    """The values with their labels, of six digits, or of 17 where two labels would be equal."""
-    require(len(values) > 0, f"axis {name}: no values")
-    require(len(set(values)) == len(values), f"axis {name}: a value is there twice; leave one out")
-    for value in values:
-        _case_parameters(parameters, {name: value}, "axis")
-    short, full = ([write_value(v, parameters[name].unit, digits) for v in values] for digits in (6, 17))
-    labels = short if len(set(short)) == len(values) else full
-    return [(f"{name} = {label}", value) for label, value in zip(labels, values, strict=True)]
-
-
-def _case_parameters(parameters: ParameterSet, case: CaseValues, name: str) -> ParameterSet:
-    if isinstance(case, ParameterSet):
-        return case
-    check_names("parameter", case, parameters, name)
-    try:
-        return parameters.with_values(case)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
 
 
 def _progress_text(found: Mapping[str, Outcome], total: int) -> str:

@@ -9,10 +9,11 @@ import pytest
 
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.studies.cases import grid
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
-from pneuopt.studies.sweep import grid, sweep
+from pneuopt.studies.sweep import sweep
 
 RIG = ParameterSet({"mass": Parameter(1.0, "kg"), "gain": Parameter(1.0, "1")})
 CASES = grid(RIG, {"mass": [1.0, 2.0, 3.0, 4.0]})

@@ -29,8 +29,9 @@ from pneuopt.models.linear import FirstOrder, Integrator, SecondOrder
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.progress import Progress
+from pneuopt.studies.cases import grid
 from pneuopt.studies.outcome import INTERRUPTED_CASE
-from pneuopt.studies.sweep import grid, sweep
+from pneuopt.studies.sweep import sweep
 
 RIG = ParameterSet(
     {
