@@ -17,6 +17,8 @@ from pneuopt.evaluation.monte_carlo import degrees_of_freedom, draw_in_ranges, s
 from pneuopt.evaluation.scenarios import NO_SCENARIOS, AxisNames, Factor, Scenarios, draws, tolerances
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.shown import Shown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,8 +75,8 @@ class PlantAxis:
         return f"{' and '.join(self.names)} +-{100 * self.share:.2g} %"
 
 
-@dataclass(frozen=True, eq=False)
-class ExpectedPlants:
+@dataclass(frozen=True, eq=False, repr=False)
+class ExpectedPlants(Shown):
     """Plants that a model may stand for, and what they differ by.
 
     Attributes
@@ -107,6 +109,12 @@ class ExpectedPlants:
             ("as the scenarios have them", list(self.known)),
         )
         return tuple(f"{lead}: {', '.join(labels)}" for lead, labels in parts if labels)
+
+    def summary(self) -> Report:
+        """How many plants, and what they differ by."""
+        count = len(self.scenarios)
+        lead = Line(f"{count} plant{'s' if count != 1 else ''} that the model may stand for", Tone.HEADING)
+        return Report((lead, *(Line(sentence, indent=2) for sentence in self.sentences)))
 
 
 def expected_plants(

@@ -15,6 +15,8 @@ from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report
+from pneuopt.quantities.shown import Shown
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.solution import Fit
@@ -31,8 +33,8 @@ MAX_LOG_PROBE = 0.3  # e-folds over which the curvature at the estimate is measu
 REFIT_ITERATIONS = 40  # iterations of a refit, at most: fewer leave its cost too high, and the interval too narrow
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
+@dataclass(frozen=True, eq=False, repr=False)
+class Profile(Shown):
     """The profile likelihood of one parameter, with all others fitted again at each of its values.
 
     Attributes
@@ -63,8 +65,10 @@ class Profile:
         """Whether an end of the interval is infinite."""
         return math.isinf(self.low) or math.isinf(self.high)
 
-    def __repr__(self) -> str:
-        return f"Profile of {self.name}: {self.sentence}"
+    def summary(self) -> Report:
+        """The estimate and its interval."""
+        lead = f"{self.name} = {self.estimate:.5g} {self.unit}, {100 * self.level:.4g} % interval"
+        return Report((Line(f"{lead}: {self.sentence}"),))
 
     @property
     def threshold(self) -> float:

@@ -11,8 +11,8 @@ from pneuopt.identification.marks import UNIDENTIFIABLE_NOTE as UNIDENTIFIABLE_N
 from pneuopt.identification.marks import Mark as Mark  # noqa: PLC0414
 from pneuopt.identification.report import report_fit
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Report
-from pneuopt.quantities.shown import Result
+from pneuopt.quantities.report import Line, Report
+from pneuopt.quantities.shown import Result, Shown
 from pneuopt.quantities.status import Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.quantities.units import write_value
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 INFINITE_INFLATION = 1e5
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
+@dataclass(frozen=True, eq=False, repr=False)
+class Verdict(Shown):
     """The identifiability of the free parameters from a set of logs, and the runs that would identify the others.
 
     Attributes
@@ -84,8 +84,9 @@ class Verdict:
             "reasons": {str(n): reason for n, reason in self.reasons.items()},
         }
 
-    def __str__(self) -> str:
-        return "\n".join(self.sentences) or "the logs identify every free parameter"
+    def summary(self) -> Report:
+        """What the logs do not identify, and why."""
+        return Report(tuple(map(Line, self.sentences or ("the logs identify every free parameter",))))
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,10 @@ def test_without_a_fit_the_stated_tolerances_hold() -> None:
     assert (table["friction.coulomb"] - table["friction.static"]).abs().max() < 1e-12, "they vary together"
     assert (table[["friction.smoothing", "friction.stribeck_velocity", "load.force"]].fillna(0) == 0).all(axis=None)
     assert plants.sentences[0].startswith("assumed tolerances: load.mass +-5 %")
+    lines = repr(plants).splitlines()
+    assert lines[:1] == [f"{PLANT_COUNT} plants that the model may stand for"]
+    assert lines[1].startswith("  assumed tolerances: load.mass +-5 %")
+    assert "load.mass +-5 %" in plants._repr_html_()
 
 
 def test_a_fit_replaces_the_tolerances_of_what_it_identified() -> None:

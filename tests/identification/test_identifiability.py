@@ -63,8 +63,8 @@ def test_offset_and_coulomb_asymmetry_only_count_together() -> None:
     sharp = truth.with_values({"friction.smoothing": 1e-4, "friction.asymmetry_width": 1e-4})
     verdict = identifiability(system, [log], sharp.freed(*free))
     assert verdict.indistinguishable == (("load.force", "friction.coulomb_asymmetry"),)
-    assert "load.force and friction.coulomb_asymmetry act only together" in str(verdict)
-    assert "turn the axis round" in str(verdict)
+    assert "load.force and friction.coulomb_asymmetry act only together" in " ".join(verdict.sentences)
+    assert "turn the axis round" in " ".join(verdict.sentences)
 
 
 def test_speeds_that_hardly_differ_refuse_slope_and_curve() -> None:
@@ -73,8 +73,8 @@ def test_speeds_that_hardly_differ_refuse_slope_and_curve() -> None:
     free = rig.parameters.freed("friction.coulomb", "friction.static", "friction.stribeck_velocity", "friction.viscous")
     poor = identifiability(rig.system(), [rubbed([0.005, -0.005, 0.01, -0.01])], free)
     assert {"friction.static", "friction.stribeck_velocity", "friction.viscous"} <= set(poor.unidentifiable)
-    assert "nearly all speeds lie between 0.005 and 0.01 m/s" in str(poor)
-    assert "log speeds from 0.005 to beyond 0.05 m/s" in str(poor)
+    assert "nearly all speeds lie between 0.005 and 0.01 m/s" in " ".join(poor.sentences)
+    assert "log speeds from 0.005 to beyond 0.05 m/s" in " ".join(poor.sentences)
     rich = identifiability(rig.system(), [rubbed([0.001, -0.002, 0.01, -0.02, 0.1, -0.2])], free)
     assert "friction.viscous" not in rich.unidentifiable
     alone = rig.parameters.freed("friction.viscous")
@@ -89,7 +89,9 @@ def test_without_reversals_bristles_are_refused_and_never_a_number() -> None:
     verdict = identifiability(system, [late], free)
     bristles = {"friction.bristle_stiffness", "friction.bristle_damping"}
     assert bristles <= set(verdict.unidentifiable)
-    assert "the motion never reverses, so that the bristles are hardly seen; log presliding" in str(verdict)
+    assert "the motion never reverses, so that the bristles are hardly seen; log presliding" in " ".join(
+        verdict.sentences
+    )
     result = identify(system, [late], free)
     rows = result.estimates.loc[sorted(bristles)]
     assert np.isnan(rows[["value", "stderr", "ci_low", "ci_high"]]).all(axis=None)
@@ -108,7 +110,7 @@ def test_a_mass_that_hardly_accelerates_is_refused() -> None:
     free = ForceDrive(Coulomb()).parameters.with_values({"load.mass": 1.0}).freed("load.mass", "friction.coulomb")
     verdict = identifiability(ForceDrive(Coulomb()).system(), [log], free)
     assert "load.mass" in verdict.unidentifiable
-    assert "weigh the load and fix its mass" in str(verdict)
+    assert "weigh the load and fix its mass" in " ".join(verdict.sentences)
 
 
 def test_a_parameter_without_effect_is_named() -> None:

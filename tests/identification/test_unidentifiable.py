@@ -75,7 +75,7 @@ def test_bristles_without_presliding_are_no_numbers_and_keep_their_given_values(
     assert [result.parameters[n].upper for n in BRISTLES] == [DRIVE.parameters[n].upper for n in BRISTLES]
     assert result.verdict is not None
     assert result.verdict.unchanged == BRISTLES
-    assert "(2e+04) and friction.bristle_damping (100) keep their given values" in str(result.verdict)
+    assert "(2e+04) and friction.bristle_damping (100) keep their given values" in " ".join(result.verdict.sentences)
     assert "the motion never reverses" in result.verdict.reasons[BRISTLES[0]]
 
 
