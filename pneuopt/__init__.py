@@ -27,5 +27,5 @@ Wherever a drive stands, its system may; where logs or steps stand, one may. Nam
 
 import lazy_loader
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -246,6 +246,13 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     assert found.stdout.strip() == "[]"
 
 
+def test_the_version_is_that_of_the_newest_changes() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    newest = re.search(r"^## Changelog\n+\*\*([\d.]+)( \(unreleased\))?\*\*", text, re.MULTILINE)
+    assert newest is not None
+    assert pneuopt.__version__ == newest[1] + (".dev0" if newest[2] else "")
+
+
 def test_the_data_are_those_that_the_readme_lists() -> None:
     text = (ROOT / "data" / "README.md").read_text(encoding="utf-8")
     listed = {path: digest for digest, path in re.findall(r"^([0-9a-f]{64})  (\S+)$", text, re.MULTILINE)}
