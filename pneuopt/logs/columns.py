@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pneuopt.logs.table import Table
+from pneuopt.logs.table import EMPTY_CELL, Table
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError, check_names, require
 from pneuopt.quantities.keys import Key, Takes
@@ -286,8 +286,7 @@ def _check_finite(table: Table, numbers: Mapping[str, Array]) -> None:
             row = int(np.argmax(wrong))
             what = "is not a number" if np.isinf(column[row]) else "is no measured value"
             raise LogError(
-                f"{table.path}: row {row + table.first_row}, column {name!r}: {column[row]:.6g} {what}; "
-                "leave the cell empty if the sample is missing"
+                f"{table.path}: row {row + table.first_row}, column {name!r}: {column[row]:.6g} {what}; {EMPTY_CELL}"
             )
 
 

@@ -9,6 +9,9 @@ from pneuopt.logs.budget import MAX_COLUMNS, MAX_NAME
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 
+EMPTY_CELL = "leave the cell empty if the sample is missing, as `pneuopt check --fix FOLDER` does in a copy of the log"
+"""What to do about a cell that holds no sample."""
+
 
 @dataclass(frozen=True)
 class Table:

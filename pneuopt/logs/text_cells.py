@@ -12,6 +12,7 @@ import numpy as np
 from pneuopt.logs.budget import check_cells
 from pneuopt.logs.layout import NUMBER
 from pneuopt.logs.stamps import seconds_from_first
+from pneuopt.logs.table import EMPTY_CELL
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
 
@@ -209,6 +210,6 @@ def _number_error(block: TextBlock, used: Sequence[int]) -> LogError:
             if cell not in MISSING and not (is_number and (decimal == "." or "." not in cell)):
                 return LogError(
                     f"{block.path}: row {k + block.first_row}, column {block.names[i]!r}: {cell[:40]!r} is not a "
-                    f"number (decimal mark {decimal!r}); leave the cell empty if the sample is missing"
+                    f"number (decimal mark {decimal!r}); {EMPTY_CELL}"
                 )
     return LogError(f"{block.path}: cannot be read as numbers; export it as CSV")

@@ -14,7 +14,7 @@ from pneuopt.logs.columns import MAX_MAGNITUDE
 from pneuopt.logs.layout import MAX_HEAD_ROWS, find_layout, has_table
 from pneuopt.logs.libraries import foreign_code, import_extra
 from pneuopt.logs.stamps import is_stamp, seconds_from_first
-from pneuopt.logs.table import Table
+from pneuopt.logs.table import EMPTY_CELL, Table
 from pneuopt.logs.text_cells import MISSING
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import LogError, require
@@ -148,7 +148,7 @@ def _number(sheet: _Sheet, name: str, index: int, cell: Any) -> float:
         return np.nan
     is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
     place = f"{sheet.path}: row {index + sheet.first_row}, column {name!r}"
-    require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; leave the cell empty if it is missing", LogError)
+    require(is_number, f"{place}: {str(cell)[:40]!r} is not a number; {EMPTY_CELL}", LogError)
     return float(cell) if not abs(cell) > MAX_MAGNITUDE else np.inf  # which is refused
 
 
