@@ -105,7 +105,7 @@ class _CWriter:
         self.storage: dict[str, str] = {}  # what a rarer rate hands on, and its place
         self.values: dict[int, CValue] = {}
         self.reciprocals: dict[int, CValue] = {}
-        instructions = list(_instructions(c_function.function))
+        instructions = list(read_instructions(c_function.function))
         self.divisors = Counter(i.sources[-1] for i in instructions if i.operation in DIVISIONS)
         for instruction in instructions:
             self._add(instruction)
@@ -157,7 +157,7 @@ class _CWriter:
         return self.storage[value.text]
 
 
-def _instructions(function: ca.Function) -> Iterator[Instruction]:
+def read_instructions(function: ca.Function) -> Iterator[Instruction]:
     """The Function's operations, each result in a place of its own."""
     symbols = function.sx_in()
     f = ca.Function(function.name(), symbols, function.call(symbols), {"live_variables": False, "cse": True})

@@ -1,20 +1,30 @@
-"""`run_in_vm`: a rollout in CasADi's virtual machine, for where there is no compiler; the same answers, more slowly.
+"""`run_in_vm`: a rollout without machine code, for where there is no compiler; the same answers, more slowly.
 
-A Function is called on memory that stays in its place (`bind_function`): a call by CasADi's matrices takes fifty times
-as long as the arithmetic of a small model.
+Many segments run as operations on arrays (`ArrayProgram`), few in CasADi's virtual machine. There a Function is called
+on memory that stays in its place (`bind_function`): a call by CasADi's matrices takes fifty times as long as the
+arithmetic of a small model.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from pneuopt.dynamics.compiled.array_program import ArrayProgram
 from pneuopt.quantities.arrays import Array
 
 # Operations, segments times those of the model, that a thread is started for, half a millisecond. Fewer, and starting
 # it (50 us) takes the time that it saves; more leave cores idle.
 OPERATIONS_A_THREAD = 100_000
+# Segments for each thread of CasADi's machine from which arrays are faster. Fewer, and NumPy's calls take longer than
+# the arithmetic in them; more leave half of the speed.
+ARRAY_SEGMENTS = 120
+# Steps of a sample that are written as one Function. More take longer to write; a call of each takes 4 us.
+FOLDED_STEPS = 100
+# Segments of a block of arrays. Fewer waste time in NumPy's calls; more do not fit the processor's cache.
+BLOCK_SEGMENTS = 1000
 
 
 class VmRun(NamedTuple):
@@ -84,20 +94,55 @@ def run_in_vm(
     threads : int
         Segments are shared out to so many at most.
     """
+    (m, n), nx = given[3].shape, given[0].shape[1]
+    if nx == 0 and n > 1:
+        return _run_samples(functions, given, states, threads)
+    parts = _count_parts(functions["step"].n_instructions(), m, threads)
+    if m < ARRAY_SEGMENTS * parts or not all(map(_find_program, functions.values())):
+        return _run(functions, given, start_columns, substeps, states, _Machine(m, threads))
+    blocks = ([a if a.ndim == 1 else a[i : i + BLOCK_SEGMENTS] for a in given] for i in range(0, m, BLOCK_SEGMENTS))
+    with np.errstate(all="ignore"):  # as in machine code
+        runs = [_run(functions, b, start_columns, substeps, states, _Arrays(len(b[0]))) for b in blocks]
+    y, dy, x_end, dx_end = (np.concatenate([getattr(run, n) for run in runs]) for n in ("y", "dy", "x_end", "dx_end"))
+    kept = [run.x for run in runs if run.x is not None]
+    return VmRun(y, dy, np.concatenate(kept) if kept else None, x_end, dx_end)
+
+
+def _run_samples(functions: Mapping[str, ca.Function], given: Sequence[Array], states: int, threads: int) -> VmRun:
+    """A run of a model without a state: each of its samples is a segment."""
+    x0, u, p, t, h = given
+    (m, n), rows = t.shape, p if p.ndim == 1 else np.repeat(p, t.shape[1], axis=0)
+    flat = np.empty((m * n, 0)), u.reshape(m * n, 1, -1), rows, t.reshape(-1, 1), h.reshape(-1, 1)
+    run = run_in_vm(functions, flat, 0, 1, 0, threads)
+    kept = np.empty((m, -(-n // states), 0)) if states else None
+    return VmRun(run.y.reshape(m, n, -1), run.dy.reshape(m, n, *run.dy.shape[2:]), kept, x0, run.dx_end[:m])
+
+
+def _run(
+    functions: Mapping[str, ca.Function],
+    given: Sequence[Array],
+    start_columns: int,
+    substeps: int,
+    states: int,
+    engine: "_Machine | _Arrays",
+) -> VmRun:
     x0, u, p, t, h = given
     (m, n), (nx, ns), ny = t.shape, functions["step"].size_in(5), functions["output"].size1_out(0)
-    x, S, at, size, held = x0.copy(), np.zeros((m, ns, nx)), np.empty(m), np.empty(m), np.empty((m, u.shape[2]))
+    x, x_next, S, S_next = (engine.allocate(*shape) for shape in ((nx,), (nx,), (ns, nx), (ns, nx)))
+    at, size, held, parameters = (engine.allocate(k) for k in (1, 1, u.shape[2], p.shape[-1]))
+    y, dy = engine.allocate(ny), engine.allocate(ns, ny)
+    x[:], S[:], parameters[:] = x0, 0.0, p
     S[:, :start_columns] = np.eye(start_columns, nx)
-    x_next, S_next, y, dy = np.empty_like(x), np.empty_like(S), np.empty((m, ny)), np.empty((m, ns, ny))
-    arguments = (x, held, np.ascontiguousarray(np.broadcast_to(p, (m, p.shape[-1]))), S)
-    mapped = {name: _map(function, m, threads) for name, function in functions.items()}
-    read_output = bind_function(mapped["output"], (at, *arguments), (y, dy))
-    step = bind_function(mapped["step"], (at, size, *arguments), (x_next, S_next))
-    update = bind_function(mapped["update"], (at, *arguments), (x_next, S_next)) if "update" in mapped else None
+    arguments = (x, held, parameters, S)
+    read_output = engine.bind(functions["output"], (at, *arguments), (y, dy))
+    step, times = engine.fold(functions["step"], substeps)
+    operations = functions["step"].n_instructions() * substeps // times
+    advance = engine.bind(step, (at, size, *arguments), (x_next, S_next), operations)
+    update = engine.bind(functions["update"], (at, *arguments), (x_next, S_next)) if "update" in functions else None
     kept = np.empty((m, -(-n // states), nx)) if states else None
-    run = VmRun(np.empty((m, n, ny)), np.empty((m, n, ns, ny)), kept, x, S)
+    run = VmRun(np.empty((m, n, ny)), np.empty((m, n, ns, ny)), kept, np.empty((m, nx)), np.empty((m, ns, nx)))
     for j in range(n):
-        at[:], size[:], held[:] = t[:, j], h[:, j] / substeps, u[:, j]
+        at[:, 0], size[:, 0], held[:] = t[:, j], h[:, j] / substeps, u[:, j]
         if kept is not None and j % states == 0:
             kept[:, j // states] = x
         if update is not None:
@@ -105,14 +150,73 @@ def run_in_vm(
             x[:], S[:] = x_next, S_next
         read_output()
         run.y[:, j], run.dy[:, j] = y, dy
-        for k in range(substeps):
-            at[:] = t[:, j] + k * size
-            step()
+        for k in range(times):
+            at[:, 0] = t[:, j] + k * size[:, 0]
+            advance()
             x[:], S[:] = x_next, S_next
+    run.x_end[:], run.dx_end[:] = x, S
     return run
 
 
-def _map(function: ca.Function, m: int, threads: int) -> ca.Function:
-    """A Function of m segments at once, in as many threads as pay."""
-    parts = min(threads, m * function.n_instructions() // OPERATIONS_A_THREAD)
-    return function.map(m, "thread", parts) if parts > 1 else function.map(m)
+class _Machine:
+    """Functions of m segments at once in CasADi's machine, one segment after the other in memory."""
+
+    def __init__(self, m: int, threads: int) -> None:
+        self._m, self._threads = m, threads
+
+    def allocate(self, *shape: int) -> Array:
+        return np.empty((self._m, *shape))
+
+    def fold(self, step: ca.Function, substeps: int) -> tuple[ca.Function, int]:
+        """A Function of so many steps, or of one, and how often a sample calls it."""
+        if not 1 < substeps <= FOLDED_STEPS:
+            return step, substeps
+        t, h, x, u, p, S = (ca.MX.sym(f"i{i}", *step.size_in(i)) for i in range(step.n_in()))
+        x_next, S_next = x, S
+        for k in range(substeps):
+            x_next, S_next = step(t + k * h, h, x_next, u, p, S_next)
+        return ca.Function("system_steps", [t, h, x, u, p, S], [x_next, S_next]), 1
+
+    def bind(
+        self, function: ca.Function, inputs: Sequence[Array], results: Sequence[Array], operations: int = 0
+    ) -> Callable[[], object]:
+        """A call that evaluates the Function; it has so many operations, or those that it counts itself."""
+        parts = _count_parts(operations or function.n_instructions(), self._m, self._threads)
+        mapped = function.map(self._m, "thread", parts) if parts > 1 else function.map(self._m)
+        return bind_function(mapped, inputs, results)
+
+
+class _Arrays:
+    """Functions of m segments at once as operations on arrays; in memory, a number of all segments stands together."""
+
+    def __init__(self, m: int) -> None:
+        self._m = m
+
+    def allocate(self, *shape: int) -> Array:
+        return np.moveaxis(np.empty((*shape, self._m)), -1, 0)
+
+    def fold(self, step: ca.Function, substeps: int) -> tuple[ca.Function, int]:
+        return step, substeps
+
+    def bind(
+        self, function: ca.Function, inputs: Sequence[Array], results: Sequence[Array], _operations: int = 0
+    ) -> Callable[[], None]:
+        program = _find_program(function)
+        assert program is not None, "asked before"
+        return program.bind(
+            *([np.moveaxis(a, 0, -1).reshape(-1, self._m) for a in group] for group in (inputs, results))
+        )
+
+
+@functools.lru_cache(maxsize=64)
+def _find_program(function: ca.Function) -> ArrayProgram | None:
+    """The Function as operations on arrays; None where it has one that NumPy has not."""
+    try:
+        return ArrayProgram(function)
+    except NotImplementedError:
+        return None
+
+
+def _count_parts(operations: int, m: int, threads: int) -> int:
+    """Threads that pay for so many operations of m segments in CasADi's machine."""
+    return max(1, min(threads, m * operations // OPERATIONS_A_THREAD))

@@ -221,13 +221,48 @@ def test_the_vm_runs_without_casadi_s_matrices(monkeypatch: pytest.MonkeyPatch) 
     rollout = Rollout(case.system.pieces, (0,), start=True, lanes=0)
     usual = case.run(rollout)
 
-    def refuse(*_: object) -> None:
-        pytest.fail("a Function was called by matrices")
+    original = ca.Function.call
 
-    monkeypatch.setattr(ca.Function, "call", refuse)
-    monkeypatch.setattr(ca.Function, "__call__", refuse)
+    def refuse(function: ca.Function, arguments: Any, *options: Any) -> Any:
+        assert all(isinstance(a, ca.MX) for a in arguments), "a Function was called by matrices"
+        return original(function, arguments, *options)
+
+    monkeypatch.setattr(ca.Function, "call", refuse)  # what a call of a Function calls
     again = case.run(rollout)
     assert_array_equal(again.x_end, usual.x_end)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_arrays_give_what_casadi_s_machine_gives(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there are many segments, in blocks of which the last is smaller."""
+    case = Case(name, m=7)
+    rollout = Rollout(case.system.pieces, (0, 1), start=True, lanes=0)
+    usual = case.run(rollout)
+    monkeypatch.setattr(vm, "ARRAY_SEGMENTS", 1)
+    monkeypatch.setattr(vm, "BLOCK_SEGMENTS", 3)
+    monkeypatch.setattr(vm, "bind_function", lambda *_: pytest.fail("CasADi's machine was called"))
+    assert_alike(case.run(rollout), usual)
+
+
+def test_arrays_and_folded_steps_are_for_what_they_suit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few segments run in CasADi's machine, with all steps of a sample in a call; many as arrays."""
+    calls, bind = [0], vm.bind_function
+
+    def count(*given: Any) -> Any:
+        call = bind(*given)
+
+        def counted() -> object:
+            calls[0] += 1
+            return call()
+
+        return counted
+
+    monkeypatch.setattr(vm, "bind_function", count)
+    few, many = Case("stribeck", m=5, n=6), Case("stribeck", m=vm.ARRAY_SEGMENTS, n=6)
+    few.run(Rollout(few.system.pieces, lanes=0))
+    assert calls == [2 * 6]  # the output and the step
+    many.run(Rollout(many.system.pieces, threads=1, lanes=0))
+    assert calls == [2 * 6]
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -244,8 +279,9 @@ def test_threads_of_the_vm_change_nothing(name: str, monkeypatch: pytest.MonkeyP
     for threads in (1, 3):
         rollout = Rollout(case.system.pieces, (0,), start=True, threads=threads, lanes=0)
         found.append(case.run(rollout))
-    assert (7,) in maps
-    assert (7, "thread", 3) in maps
+    m = case.t.size if name == "pressure" else 7  # without a state each sample is a segment
+    assert (m,) in maps
+    assert (m, "thread", 3) in maps
     for field in ("y", "x_end", "x", "dy", "dx_end"):
         assert_array_equal(getattr(found[0], field), getattr(found[1], field))
 
