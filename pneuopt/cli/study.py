@@ -37,7 +37,8 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.files.drive import read_drive
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
-from pneuopt.files.study import Pareto, Study, SweptAxis, read_axes, read_pareto, read_study
+from pneuopt.files.study import Pareto, Study, SweptAxis, read_axes, read_pareto, read_study, swept_axes
+from pneuopt.files.study_cases import read_study_cases
 from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.plotting import plot_front, plot_map
@@ -73,19 +74,15 @@ def run_study(file: Path, outputs: Outputs, quiet: bool) -> int:
 
 
 def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
-    """Certify a loop over a grid of parameters; returns the exit status."""
+    """Certify a loop over a grid or other cases; returns the exit status."""
     file, count = study.path, len(study.axes)
-    require(
-        outputs.plot is None or count <= 2, f"{file}: --plot draws one or two axes, there are {count}; leave it out"
-    )
+    require(outputs.plot is None or not study.cases, f"{file}: --plot draws a grid of one or two [axes]; leave it out")
+    many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
+    require(outputs.plot is None or count <= 2, many)
     task, parameters = read_fit_and_tuning(study.drive, study.tuning)
     warn_of_status(study.tuning, "tuning")
-    axes, units = read_axes(study, parameters), metric_units(task.loop)
+    (cases, axes), units = _read_cases(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{file}: [metrics] show")
-    try:
-        cases = grid(parameters, {axis.name: axis.points for axis in axes})
-    except InputError as error:
-        raise InputError(f"{file}: [axes] {error}") from None
     with _keep_cases(study, outputs, len(cases)) as journal:
         if study.tune:
             table = _tune_cells(study, task, parameters, axes, quiet, journal)
@@ -110,6 +107,18 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
     if journal is not None and stopped is None:
         journal.path.unlink(missing_ok=True)
     return status
+
+
+def _read_cases(study: Study, parameters: ParameterSet) -> tuple[dict[str, dict[str, float]], tuple[SweptAxis, ...]]:
+    """The cases of a study, and the parameters in which they differ."""
+    if study.cases:
+        cases = read_study_cases(study, parameters)
+        return cases, swept_axes(parameters, cases)
+    axes = read_axes(study, parameters)
+    try:
+        return grid(parameters, {axis.name: axis.points for axis in axes}), axes
+    except InputError as error:
+        raise InputError(f"{study.path}: [axes] {error}") from None
 
 
 @contextmanager

@@ -1,10 +1,10 @@
 """Distributions of a parameter from plant to plant, by which `samples` draws; the parameter's bounds cut them off.
 
 A newcomer adds a class like these, and a row of `DISTRIBUTIONS`, whose word study.toml and tuning.toml take:
-``"load.mass" = { normal = "5 %" }``.
+``"load.mass" = { distribution = "normal", spread = "5 %" }``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf, isfinite, log1p
 from typing import Any, Protocol
@@ -24,6 +24,8 @@ _EDGE = 2.0**-53  # share nearest to 0 and 1 [1]: at these themselves a quantile
 
 class Distribution(Protocol):
     """How a parameter varies from plant to plant."""
+
+    def __init__(self, spread: float | tuple[float, float]) -> None: ...
 
     @property
     def spread(self) -> float | tuple[float, float]:
@@ -130,7 +132,7 @@ class LogNormal:
         return stats.lognorm(log1p(fraction), scale=median)
 
 
-DISTRIBUTIONS: Mapping[str, Callable[[float | tuple[float, float]], Distribution]] = {
+DISTRIBUTIONS: Mapping[str, type[Distribution]] = {
     "uniform": Uniform,
     "log_uniform": LogUniform,
     "normal": Normal,

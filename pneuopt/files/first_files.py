@@ -31,6 +31,7 @@ from pneuopt.quantities.units import write_value
 BAND, OVERSHOOT, SENSITIVITY = "2 %", "5 %", 1.6  # what a first tuning asks for: usual, and within reach of most drives
 SWEEP = (0.8, 1.0, 1.2)  # of a first study's parameter, times its value: near enough that one design may hold
 _DIGITS = 6
+_EXAMPLE_SPREAD = 'distribution = "normal", spread = "5 %"'
 _OTHER_FILES = ("drive", "tuning", "study", "rig")
 
 
@@ -182,7 +183,7 @@ def _tuning_names(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -> 
         "reference.start": f'{output.name} = "0 {output.unit}"',
         "reference.disturbance": f'"{first.swept}" = {tenth}',
         "scenarios.corners": f'"{first.swept}" = "30 %"',
-        "scenarios.samples": f'"{first.swept}" = "30 %"',
+        "scenarios.samples": f'"{first.swept}" = {{ {_EXAMPLE_SPREAD} }}',
         "scenarios.tolerances": '"pid.Kp" = "1 %"',
     }
 
@@ -196,10 +197,12 @@ def _study_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -
     title = (
         "How the loop does on other plants; name fit.toml and tuned.toml, once there are such:",
         "    pneuopt study study.toml -o cases.csv --plot map.png",
+        "[samples], [corners] or [table] ask for other cases in place of [axes];",
         "[pareto] asks for a front instead; leave out [axes] and [metrics] then.",
     )
     names = {"axes": '"supply.pressure" = { from = "5 bar(g)", to = "7 bar(g)", steps = 3 }'}
     names = names if "supply.pressure" in values else {"axes": '"pid.Kp" = { from = 0.5, to = 1.5, steps = 3 }'}
+    names |= {"samples": f'"{first.swept}" = {{ {_EXAMPLE_SPREAD} }}', "corners": f'"{first.swept}" = "30 %"'}
     return Template(title, STUDY_KEYS, stated, examples=ends, names=names, schema=_schema_path("study"))
 
 

@@ -17,7 +17,7 @@ from pneuopt.quantities.units import write_value
 FILE_MEANINGS: Mapping[str, str] = {
     "drive.toml": "the hardware: what is known of it, and what is free",
     "tuning.toml": "the controller, what it is asked to follow, and what counts",
-    "study.toml": "a grid of plants, or a front between two requirements",
+    "study.toml": "a grid of plants, samples, corners or a table of them, or a front between two requirements",
     "rig.toml": "what the hardware has and its model has not, for `tune --rig`",
     "log.toml": "the sidecar of log.csv: it has the log's name",
 }

@@ -57,6 +57,11 @@ def _value_or_table(key: Key) -> dict[str, Any]:
     return {"anyOf": [_VALUE, _describe_table(table("", key.keys or PARAMETER_KEYS))]}
 
 
+def _spread_or_table(key: Key) -> dict[str, Any]:
+    spread: dict[str, Any] = {"type": ["number", "string", "array"]}
+    return {"anyOf": [spread, _describe_table(table("", key.keys))]} if key.keys else spread
+
+
 _FORMS: Mapping[Takes, Callable[[Key], dict[str, Any]]] = {
     Takes.FLAG: lambda _: {"type": "boolean"},
     Takes.TEXT: _describe_text,
@@ -66,7 +71,7 @@ _FORMS: Mapping[Takes, Callable[[Key], dict[str, Any]]] = {
     Takes.PARAMETER: _value_or_table,
     Takes.LIST: _describe_list,
     Takes.FLAG_OR_LIST: lambda _: {"type": ["boolean", "array"]},
-    Takes.SPREAD: lambda _: {"type": ["number", "string", "array"]},
+    Takes.SPREAD: _spread_or_table,
     Takes.AXIS: lambda _: {"type": ["array", "object"]},
     Takes.COLUMN: lambda key: {"anyOf": [{"type": ["string", "boolean"]}, _describe_table(table("", key.keys))]},
     Takes.TABLE: _describe_table,

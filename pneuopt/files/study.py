@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from pneuopt.files.budget import MAX_CASES
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.requirements import read_bound
+from pneuopt.files.study_cases import CASE_KEYS
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, flag, table
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.units import count_gauge_from, read_unit, read_value, si_conversion
+from pneuopt.quantities.units import count_gauge_from, read_unit, read_value, si_conversion, write_value
 
 _AXIS_EXAMPLE = '["4 kg", "8 kg"] or { from = "2 kg", to = "8 kg", steps = 4 }'
 _BETWEEN_EXAMPLE = 'between = ["settling_time", "peak_control"]'
@@ -38,8 +39,9 @@ STUDY_KEYS: Mapping[str, Key] = {
         required=True,
     ),
     "axes": table("the axes of a grid", {}, others=_SWEPT_AXIS, named="parameter"),
+    **CASE_KEYS,
     "metrics": table(
-        "of a grid: what is shown",
+        "what is shown of the cases",
         {
             "band": Key("half width of the settling band; by default the tuning's", example='"2 %"'),
             "show": Key(
@@ -79,6 +81,9 @@ class Study:
         Half width of the settling band, a fraction of the step; None: as the tuning says.
     show : tuple of str
         The metrics on screen and in the figure.
+    cases : mapping of str to mapping
+        In place of axes, the section that says which cases there are, by its name: as written; `read_study_cases`
+        reads it.
     pareto : mapping of str to object, optional
         A front is asked for in place of a grid: as written; `read_pareto` reads it.
     tune : bool
@@ -93,6 +98,7 @@ class Study:
     show: tuple[str, ...]
     pareto: Mapping[str, Any] | None = None
     tune: bool = False
+    cases: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -167,7 +173,10 @@ def read_study(path: str | Path) -> Study:
     for name in ("axes", "metrics"):
         alone = name not in sections or "pareto" not in sections
         require(alone, f"{path}: [{name}] belongs to a grid, [pareto] to a front; leave one of them out")
-    require(bool(axes) or "pareto" in sections, f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
+    cases = {name: sections[name] for name in CASE_KEYS if name in sections}
+    chosen = [*(["axes"] if axes else []), *cases, *(["pareto"] if "pareto" in sections else [])]
+    require(bool(chosen), f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
+    require(len(chosen) == 1, f"{path}: [{'], ['.join(chosen)}]: a study has cases of one kind; leave one of them out")
     band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
     require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
     given, known = sections.get("study", {}), STUDY_KEYS["study"].keys
@@ -175,8 +184,9 @@ def read_study(path: str | Path) -> Study:
     tune = given.get("tune", known["tune"].usual)
     require(isinstance(tune, bool), f"{path}: [study] tune must be true or false, got {tune!r}")
     require(not (tune and "pareto" in sections), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
+    require(not (tune and cases), f"{path}: [study] tune needs a grid, whose cells have neighbours: write [axes]")
     require(not (tune and band), f"{path}: [metrics] band would not be the one tuned for; state it in {tuning.name}")
-    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), sections.get("pareto"), tune)
+    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), sections.get("pareto"), tune, cases)
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
@@ -205,6 +215,17 @@ def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
     cells = math.prod(len(axis.points) for axis in axes)
     require(cells <= MAX_CASES, f"{study.path}: [axes] make {cells} cells, {MAX_CASES} are allowed; take fewer values")
     return axes
+
+
+def swept_axes(parameters: ParameterSet, cases: Mapping[str, Mapping[str, float]]) -> tuple[SweptAxis, ...]:
+    """The parameters in which cases differ, each with the values that it takes, in a unit that reads well."""
+    names = dict.fromkeys(n for values in cases.values() for n in values)
+    axes = []
+    for name in names:
+        points, unit = tuple(values[name] for values in cases.values() if name in values), parameters[name].unit
+        written = read_unit(write_value(points[0], unit), unit)
+        axes.append(SweptAxis(name, points, written, *si_conversion(written, unit)))
+    return tuple(axes)
 
 
 def read_pareto(study: Study, units: Mapping[str, str]) -> Pareto:

@@ -18,10 +18,9 @@ from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
 from pneuopt.evaluation.requirements import EnvelopeBounds
-from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, Spread, corners, samples, tolerances
+from pneuopt.evaluation.scenarios import NO_SCENARIOS, Factor, Scenarios, corners, samples, tolerances
 from pneuopt.evaluation.specification import Specification, specify_limits
 from pneuopt.files.budget import MAX_CASES
-from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.loop import (
     TUNABLE_SECTIONS,
     TuningSections,
@@ -29,6 +28,7 @@ from pneuopt.files.loop import (
 )
 from pneuopt.files.method import read_method
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
+from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
 from pneuopt.files.toml import (
     construct_at,
     inline_table,
@@ -53,7 +53,7 @@ from pneuopt.quantities.keys import Takes
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
-from pneuopt.quantities.units import count_gauge_from, read_value, write_value
+from pneuopt.quantities.units import read_value, write_value
 from pneuopt.tuning.method import Method
 
 if TYPE_CHECKING:
@@ -360,35 +360,22 @@ def _read_kind(
     kind: str, given: Mapping[str, Any], where: str, parameters: ParameterSet, new_count: int | None
 ) -> Scenarios:
     entries = dict(given)
-    draw = {key: entries.pop(key, known.usual) for key, known in SCENARIO_KEYS[kind].keys.items()}
-    count, seed = draw.get("count", 0), draw.get("seed", 0)
-    require(isinstance(count, int) and isinstance(seed, int), f"{where} count and seed are whole numbers")
-    require(count <= MAX_CASES and seed >= 0, f"{where} count may be {MAX_CASES} at most, seed not below 0")
+    draw = read_draw({key: entries.pop(key) for key in SCENARIO_KEYS[kind].keys if key in entries}, where)
     many = kind == "corners" and len(entries) >= MAX_CASES.bit_length()
     require(not many, f"{where}: {len(entries)} parameters have too many corners; take [scenarios.samples]")
     try:
-        spreads = _read_spreads(entries, where, parameters)
-        if kind == "corners" and new_count is None:
-            return corners(parameters, spreads)
-        if kind != "tolerances":
-            return samples(parameters, spreads, new_count or count, seed=seed if new_count is None else seed + 1)
+        if kind == "samples":
+            own = read_sample_spreads(entries, where, parameters)
+            count, seed = (draw.count, draw.seed) if new_count is None else (new_count, draw.seed + 1)
+            return samples(parameters, own, count, seed=seed, sampling=draw.sampling)
+        spreads = read_spreads(entries, where, parameters)
+        if kind == "corners":
+            return (
+                corners(parameters, spreads) if new_count is None else samples(parameters, spreads, new_count, seed=1)
+            )
         pairs = [n for n, spread in spreads.items() if isinstance(spread, tuple)]
         require(not pairs, f'{", ".join(pairs)}: a tolerance is a fraction, "1 %"')
         shares = {n: spread for n, spread in spreads.items() if not isinstance(spread, tuple)}
         return tolerances(parameters, shares, new_count)
     except InputError as error:
         raise error if where in str(error) else InputError(f"{where} {error}") from None
-
-
-def _read_spreads(entries: Mapping[str, Any], where: str, parameters: ParameterSet) -> dict[str, Spread]:
-    found: dict[str, Spread] = {}
-    for pattern, given in entries.items():
-        if isinstance(given, list):
-            unit = parameters[parameters.match_names(pattern)[0]].unit
-            require(len(given) == 2, f'{where} {pattern}: write a fraction, "30 %", or two values, the least first')
-            with count_gauge_from(ambient_pressure(parameters)):
-                low, high = (read_value(end, unit, where=f"{where} {pattern}") for end in given)
-            found[pattern] = (low, high)
-        else:
-            found[pattern] = read_value(given, "1", where=f"{where} {pattern}")
-    return found

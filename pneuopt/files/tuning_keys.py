@@ -18,6 +18,7 @@ from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.requirements import SettlingTime, StepEnvelope
 from pneuopt.files.method import METHOD_SECTION
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY
+from pneuopt.files.spreads import CORNERS_KEY, SAMPLES_KEY
 from pneuopt.quantities.keys import Key, Takes, choice, first_sentence, flag, table
 from pneuopt.quantities.unit_algebra import difference_unit
 
@@ -91,19 +92,10 @@ EXTRA_KEYS: Mapping[str, Mapping[str, Key]] = {
 }
 """The keys of some requirements beside their limit and weight."""
 
-_SPREAD = Key("a fraction, or least and largest value", Takes.SPREAD, unit="{own}", example='"30 %"')
 _TOLERANCE = Key("a fraction of the gain", example='"1 %"')
 SCENARIO_KEYS: Mapping[str, Key] = {
-    "corners": table("plants at the corners of a box", {}, others=_SPREAD, named="parameter"),
-    "samples": table(
-        "plants drawn from a box",
-        {
-            "count": Key("how many", Takes.COUNT, usual=20),
-            "seed": Key("of the random numbers", Takes.COUNT, usual=0),
-        },
-        others=_SPREAD,
-        named="parameter",
-    ),
+    "corners": CORNERS_KEY,
+    "samples": SAMPLES_KEY,
     "tolerances": table("gains off by so much, either way", {}, others=_TOLERANCE, named="gain"),
 }
 

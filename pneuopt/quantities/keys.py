@@ -25,7 +25,7 @@ class Takes(Enum):
     TABLE = "a table"
     TABLES = "sections [[...]]"
     SAMPLES = "a number of samples"
-    SPREAD = "a fraction, or two values"
+    SPREAD = "a fraction, two values, or a distribution"
     AXIS = "a list of values, or a range"
     COLUMN = "a column's name, a table, or false"
 
@@ -46,7 +46,7 @@ _TYPES: Mapping[Takes, tuple[type, ...]] = {
     Takes.TABLE: (dict,),
     Takes.TABLES: (list,),
     Takes.SAMPLES: (int, str),
-    Takes.SPREAD: (str, int, float, list),
+    Takes.SPREAD: (str, int, float, list, dict),
     Takes.AXIS: (list, dict),
     Takes.COLUMN: (str, dict, bool),
 }

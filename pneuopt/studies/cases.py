@@ -7,16 +7,20 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.source import MAX_REASON, read_source
 from pneuopt.quantities.units import si_conversion, write_value
 
 if TYPE_CHECKING:
     import pandas as pd
 
+MAX_TABLE_BYTES = 2**28
+"""Size of a table of cases [byte], 256 MiB: more fills the memory; less refuses a million cases of ten parameters."""
 CaseValues = ParameterSet | Mapping[str, float]
 _NAMES = "case"  # the column of a table that names its cases, as in the table that `sweep` returns
 
@@ -112,12 +116,11 @@ def read_cases(parameters: ParameterSet, table: "pd.DataFrame | str | Path") -> 
 def _read_csv(path: Path) -> "pd.DataFrame":
     import pandas as pd
 
+    raw = read_source(path, MAX_TABLE_BYTES, "take fewer cases")
     try:
-        return pd.read_csv(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, pd.errors.ParserError) as error:
-        raise InputError(f"{path}: is no table of cases in CSV ({' '.join(str(error).split())})") from None
+        return pd.read_csv(BytesIO(raw))
+    except ValueError as error:  # pandas' own errors among them
+        raise InputError(f"{path}: is no table of cases in CSV ({' '.join(str(error).split())[:MAX_REASON]})") from None
 
 
 def _read_column(column: "pd.Series[Any]", written: str, unit: str, where: str) -> list[float]:

@@ -28,7 +28,14 @@ from pneuopt.quantities.units import read_value
 
 KINDS = [name for name, kind in DRIVE_KINDS.items() if kind.first is not None]
 FILES = ["drive.toml", "tuning.toml", "study.toml", "rig.toml", "log.toml"]
-EXCLUSIVE = {"sensor", "pareto", "method"}  # sections whose keys exclude each other, or another section
+EXCLUSIVE = {
+    "sensor",
+    "pareto",
+    "method",
+    "samples",
+    "corners",
+    "table",
+}  # sections whose keys exclude each other, or another section
 ENTRY = re.compile(r'(# )?("?[\w.]+"?) = (["\d{[-]|true|false).*')
 
 
