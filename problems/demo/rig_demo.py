@@ -31,6 +31,7 @@ import pneuopt as po
 from pneuopt.plotting import BLUE, GREY, ORANGE, axes_grid, legend_above
 from problems.shared.arrays import Array
 from problems.shared.claims import Claim, arguments, design, finish, frame
+from problems.shared.progress import ProgressLines
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,13 +104,13 @@ def run() -> Demo:
     drive, given = po.read_drive(DATA / "drive.toml")
     log, held_out = (po.read_log(DATA / f"{name}.csv") for name in ("run_01", "run_02"))
     began = process_time()
-    fit = po.identify(drive.system(), [log], given)
+    fit = po.identify(drive.system(), [log], given, progress=ProgressLines("identify"))
     seconds = {"identify": process_time() - began}
     loop, free = tuning_start(drive.system(), fit.parameters)
     designs = {"hand": on_rig(free, po.evaluate(loop, STEPS, free, band=BAND))}
     for name, start in {"pid_only": free.fixed("dither.*"), "tuned": free}.items():
         began = process_time()
-        best = tune(loop, start)
+        best = tune(loop, start, progress=ProgressLines(f"tune {name}"))
         seconds[name] = process_time() - began
         designs[name] = on_rig(best.parameters, best.certified)
     return Demo(log, fit, predicted(drive.system(), held_out, fit.parameters), designs, seconds)
@@ -122,10 +123,13 @@ def tuning_start(system: po.System, fitted: po.ParameterSet) -> tuple[po.ClosedL
     return loop, (fitted.fixed("*") | own).with_values(HAND).with_bounds(RANGES).freed(*RANGES)
 
 
-def tune(loop: po.ClosedLoop, start: po.ParameterSet, *, throw: bool = True) -> po.TuningResult:
+def tune(
+    loop: po.ClosedLoop, start: po.ParameterSet, *, throw: bool = True, progress: ProgressLines | None = None
+) -> po.TuningResult:
     """The design that settles first in the share of the band that is asked for; it is tried on no other plants."""
     asked = po.SettlingTime(ASKED * BAND)
-    return po.tune(loop, STEPS, start, minimise=asked, subject_to=LIMITS, method=SEARCH, plants={}, throw=throw)
+    search: dict[str, Any] = {"method": SEARCH, "plants": {}, "throw": throw, "progress": progress}
+    return po.tune(loop, STEPS, start, minimise=asked, subject_to=LIMITS, **search)
 
 
 def predicted(system: po.System, log: po.Experiment, parameters: po.ParameterSet) -> dict[str, float]:
