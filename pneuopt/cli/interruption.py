@@ -18,12 +18,16 @@ from types import FrameType
 PATIENCE = 1.7
 """Time that a command may take to end [s]: more looks like a hang; less throws away what it was about to write."""
 
+RETURN = 0.02
+"""Time until a lost interruption comes again [s]: less may meet the same destructor; more delays the end."""
+
 
 class _State:
     """What a process knows of its interruption: the signal, when it came, and whether it has to wait for a file."""
 
     number: int | None = None
     since: float = 0.0
+    is_lost = False
     is_shielded = False
     is_pending = False
     is_over = False
@@ -39,6 +43,7 @@ def listen_to_signals() -> None:
     wake.setblocking(False)
     signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(heard, wake), name="pneuopt-signals", daemon=True).start()
+    sys.unraisablehook = _notice_lost
 
 
 def interruption_status() -> int | None:
@@ -73,15 +78,36 @@ def end_at_once(status: int) -> None:
 def _interrupt(number: int, _frame: FrameType | None) -> None:
     if _State.is_over:
         os._exit(128 + number)
-    if _State.number is not None:
+    if _State.number is not None and not _State.is_lost:
         if time.monotonic() - _State.since > PATIENCE:
             end_at_once(128 + number)
         return
-    _State.number, _State.since = number, time.monotonic()
+    if not _State.is_lost:
+        _State.number, _State.since = number, time.monotonic()
+    _State.is_lost = False
     if _State.is_shielded:
         _State.is_pending = True
         return
     raise KeyboardInterrupt
+
+
+def _notice_lost(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Where Python can raise nothing, in a destructor or at an import's end, an interruption comes again soon after."""
+    if _State.number is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+        return
+    _State.is_lost = True
+    threading.Thread(target=_send_again, args=(_State.number,), daemon=True).start()
+
+
+def _send_again(number: int) -> None:
+    """Send the signal to the main thread, which is out of the destructor by then, or hears it again."""
+    time.sleep(RETURN)
+    main = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main is not None:
+        signal.pthread_kill(main, number)
+    else:
+        signal.raise_signal(number)
 
 
 def _watch(heard: socket.socket, _wake: socket.socket) -> None:

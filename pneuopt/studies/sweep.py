@@ -76,6 +76,8 @@ def sweep(
     >>> table["value"].tolist(), table["error"].tolist()[1][:17]
     ([5.0, nan], 'ZeroDivisionError')
     """
+    from pneuopt.quantities.frames import WideFrame  # now: what is interrupted has no seconds left to import pandas
+
     require(len(cases) > 0, "a study needs a case")
     runs = {str(name): case_parameters(parameters, case, str(name)) for name, case in cases.items()}
     found = {} if journal is None else {name: journal.known[name] for name in runs if name in journal.known}
@@ -90,7 +92,7 @@ def sweep(
             if journal is not None:
                 journal.add(name, outcome)
             report(_progress_text(found, len(runs)), len(found), len(runs))
-    return _study_table(parameters, runs, found)
+    return WideFrame(_study_columns(parameters, runs, found))
 
 
 def _progress_text(found: Mapping[str, Outcome], total: int) -> str:
@@ -98,11 +100,9 @@ def _progress_text(found: Mapping[str, Outcome], total: int) -> str:
     return f"{len(found)} of {total} cases" + (f", {failed} failed" if failed else "")
 
 
-def _study_table(
+def _study_columns(
     parameters: ParameterSet, runs: Mapping[str, ParameterSet], found: Mapping[str, Outcome]
-) -> "pd.DataFrame":
-    from pneuopt.quantities.frames import WideFrame
-
+) -> dict[str, list[Any]]:
     swept = list(dict.fromkeys(n for values in runs.values() for n in values if _differs(n, values, parameters)))
     outcomes = {
         name: _check_column_names(found.get(name, Outcome(error=INTERRUPTED_CASE)), {*_STUDY_COLUMNS, *swept})
@@ -113,7 +113,7 @@ def _study_table(
     columns |= {n: [v.value(n) if n in v else nan for v in runs.values()] for n in swept}
     columns |= {n: [outcome.results.get(n, nan) for outcome in outcomes.values()] for n in results}
     columns |= {n: [getattr(outcome, n) for outcome in outcomes.values()] for n in ("seconds", "error")}
-    return WideFrame(columns)
+    return columns
 
 
 def _differs(name: str, values: ParameterSet, parameters: ParameterSet) -> bool:

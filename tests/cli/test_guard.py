@@ -155,6 +155,41 @@ def command():
 
 
 @posix
+def test_a_signal_is_heard_where_python_can_raise_nothing() -> None:
+    """In a destructor, say, an exception is printed and forgotten."""
+    body = """
+import time
+class Odd:
+    def __del__(self):
+        say_ready()
+        time.sleep(60)
+def command():
+    Odd()
+    time.sleep(60)
+"""
+    process = guarded(body)
+    interrupt_when_ready(process, 0.0)
+    assert ended(process) == (130, "", "interrupted: no file was left half-written\n")
+
+
+@posix
+def test_ctrl_c_before_anything_is_imported_says_nothing() -> None:
+    program = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "pneuopt.cli.guard":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+from pneuopt.__main__ import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+@posix
 def test_foreign_code_that_hears_no_signal_is_ended() -> None:
     """A call of C that returns only when it is done, as a long parse or decomposition does."""
     body = """

@@ -363,3 +363,19 @@ def test_a_closed_loop_is_certified_elsewhere_with_the_same_figures(functions: M
     there = table[list(here.index)].to_numpy(dtype=float)[1]
     assert there == pytest.approx(here["0 to 0.2"].to_numpy(), rel=1e-9, nan_ok=True)
     assert 0 < table["SettlingTime"].iloc[0] != table["SettlingTime"].iloc[1] > 0
+
+
+def test_what_a_table_takes_is_imported_before_the_cases_are_computed() -> None:
+    """After Ctrl-C two seconds are left, in which pandas is not imported on a loaded machine."""
+    program = """
+import sys
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.studies import sweep
+def stop(*_):
+    print("pandas" in sys.modules)
+    sys.exit()
+sweep.run_in_processes = stop
+sweep.sweep(str, ParameterSet({"mass": Parameter(5.0, "kg")}), {"one": {}})
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "True\n"
