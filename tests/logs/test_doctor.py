@@ -1,13 +1,16 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from pneuopt.logs.checks import balance, end_stops
 from pneuopt.logs.checks.findings import PISTON
 from pneuopt.logs.doctor import CHECKS, examine
 from pneuopt.logs.experiments import Experiment
+from pneuopt.logs.noise import noise_level
 from pneuopt.logs.read_log import read_log
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.trajectories import Trajectory
@@ -22,6 +25,21 @@ def faults(experiment: Experiment) -> list[str]:
 
 def test_a_sound_log_has_no_findings() -> None:
     assert examine(swing()) == ()
+
+
+def test_two_checks_share_one_balance_and_a_stated_noise_is_not_estimated_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    levels, weighed = Mock(wraps=noise_level), Mock(wraps=balance._weigh)
+    monkeypatch.setattr(balance, "_weigh", weighed)
+    for module in (balance, end_stops):
+        monkeypatch.setattr(module, "noise_level", levels)
+    log = swing().with_noise({"position": 1e-5, "speed": 1e-3})
+    axis = PISTON._replace(forces={"force": 1.0}, constant=0.0, inertia=1.0)
+    examine(log, axis)
+    assert (levels.call_count, weighed.call_count) == (0, 1)
+    examine(log, axis._replace(inertia=3.0))
+    assert weighed.call_count == 2
 
 
 def test_every_check_has_a_log_that_trips_it_alone_and_shows_why() -> None:

@@ -12,6 +12,7 @@ each alternative has the lag that suits it best.
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -86,6 +87,9 @@ class Balance(NamedTuple):
         return residual > max(MIN_RESIDUAL_FACTOR * self.residual, MIN_CONTRADICTION * self.spread)
 
 
+_LAST_BALANCES: WeakKeyDictionary[Experiment, tuple[StatedAxis, Balance | None]] = WeakKeyDictionary()
+
+
 def check_mass(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFinding]:
     """Find a stated mass that force and acceleration contradict by a factor."""
     found = None if math.isnan(axis.inertia) else force_balance(experiment, axis)
@@ -135,7 +139,18 @@ def _offset_cause(axis: StatedAxis, offset: float) -> str:
 
 
 def force_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
-    """The balance of forces over the windows of a log that move one way; None where motion or forces are not known."""
+    """The balance of forces over the windows of a log that move one way; None where motion or forces are not known.
+
+    Two checks ask for that of one log, one after the other.
+    """
+    axis_then, found = _LAST_BALANCES.get(experiment, (None, None))
+    if axis_then is not axis:
+        found = _fit_balance(experiment, axis)
+        _LAST_BALANCES[experiment] = axis, found
+    return found
+
+
+def _fit_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
     rows = _weigh(experiment, axis)
     if rows is None:
         return None
@@ -173,7 +188,7 @@ def _weigh(experiment: Experiment, axis: StatedAxis) -> _Rows | None:
     step = float(np.median(np.diff(log.t)))
     t = log.t[0] + step * np.arange(math.floor(float(log.t[-1] - log.t[0]) / step) + 1)
     x, force = _on_grid(log.t, log[moved], t), axis.net_force({n: _on_grid(log.t, log[n], t) for n in axis.forces})
-    noise = experiment.noise.get(moved, noise_level(log[moved], log.t))
+    noise = experiment.noise[moved] if moved in experiment.noise else noise_level(log[moved], log.t)
     if moved == axis.speed:
         x, noise = np.append(0.0, np.cumsum((x[1:] + x[:-1]) * step / 2)), noise * step
     half = 1

@@ -33,7 +33,8 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
         return
     x, push, unit = log[axis.position], axis.net_force({n: log[n] for n in axis.forces}), experiment.unit(axis.position)
     way = float(np.nanmax(x) - np.nanmin(x))
-    width = max(STOP_WIDTH * experiment.noise.get(axis.position, noise_level(x, log.t)), STOP_SHARE * way)
+    noise = experiment.noise[axis.position] if axis.position in experiment.noise else noise_level(x, log.t)
+    width = max(STOP_WIDTH * noise, STOP_SHARE * way)
     inside = (x > np.nanmin(x) + width) & (x < np.nanmax(x) - width)
     middle, level = _usual_push(inside, motion, push)
     for side, end in ((1, float(np.nanmax(x))), (-1, float(np.nanmin(x)))):
