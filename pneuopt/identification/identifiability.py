@@ -25,8 +25,8 @@ from pneuopt.identification.widths import excerpts
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.search import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.segments import Segments, segment, stable_substeps, start_nodes
 from pneuopt.shooting.solution import Fit
 

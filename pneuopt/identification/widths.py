@@ -24,8 +24,8 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.budget import BudgetSpentError
+from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.search import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
 from pneuopt.shooting.transcription import Transcription
 

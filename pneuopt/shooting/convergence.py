@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.arrow import ReducedEquations, positive_definite_inverse
+from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations, positive_definite_inverse
 from pneuopt.shooting.equations import NormalEquations, describe_misfit
 from pneuopt.shooting.scaling import UNIDENTIFIABLE_PRIOR_RATIO, ParameterScaling
 
@@ -84,6 +84,16 @@ def assess_convergence(
     return ConvergenceTest(
         _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(bounded, space, reduced, noise)
     )
+
+
+def largest_parameter_step(
+    equations: NormalEquations, keep: Mask, reduced: ReducedEquations, step: GaussNewtonStep
+) -> float:
+    """The largest step of a kept parameter in its standard deviations; infinite where the data do not determine all."""
+    if equations.unidentifiable_parameters(reduced, keep).size:
+        return math.inf
+    spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
+    return float(np.max(np.abs(step.parameters[keep]) / spread, initial=0.0))
 
 
 def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: bool) -> Status:

@@ -108,6 +108,15 @@ class NormalEquations:
         """Root mean square of each output's residuals, in noise standard deviations; 0 where nothing was measured."""
         return np.asarray(np.sqrt(self.linearisation.squares.sum(axis=0) / np.maximum(self.segments.counts, 1)))
 
+    def promised_squares(self, keep: Mask) -> float:
+        """The squares at the end of an undamped step in the kept parameters, by these equations; NaN if there is none.
+
+        Rounding, and a step that would go far, may make them negative.
+        """
+        reduced = self.arrow.eliminate(0.0)
+        step = reduced and reduced.step(keep)
+        return 2 * self.cost - self.arrow.descent_rate(step) if step else math.nan
+
     def unidentifiable_parameters(self, reduced: ReducedEquations, keep: Mask) -> Indices:
         """Positions, among the kept parameters, of those that the data do not separate; empty if they do."""
         square = np.ix_(keep, keep)

@@ -1,7 +1,9 @@
 """`Search`: the stages of a lifted least squares, from loose gaps to tight ones, and from coarse steps to fine ones.
 
 A first stage that explains the logs to their noise is followed by the last one at once; the stages between are for
-starts from which that does not soon converge.
+starts from which that does not soon converge. Where the linearised equations say that tight gaps would leave many times
+the noise, it is followed by the search for noise of the states: the model is wrong, and the stages between would only
+show that.
 """
 
 import math
@@ -12,15 +14,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pneuopt.dynamics.compiled.rollout import RolloutResult
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations, positive_definite_inverse
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE, ConvergenceTest, assess_convergence
+from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
+from pneuopt.shooting.convergence import (
+    MAX_CHI_SQUARE_RATIO,
+    MAX_GAP_SHARE,
+    ConvergenceTest,
+    assess_convergence,
+    largest_parameter_step,
+)
 from pneuopt.shooting.equations import correct_residuals, weigh_gaps
+from pneuopt.shooting.integration_steps import IntegrationSteps
 from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, stable_substeps, start_nodes
+from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, start_nodes
 from pneuopt.shooting.solution import Fit, Optimum
 
 if TYPE_CHECKING:
@@ -30,35 +38,29 @@ if TYPE_CHECKING:
 STAGE_COST_TOLERANCE = 1e-3
 # promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
 FINAL_COST_TOLERANCE = 5e-7
-# step of a parameter over the tolerance of convergence [1] at which a stage with noise of the states ends: lower
-# settles states that no parameter depends on, higher leaves the parameters short of their optimum
-STATE_NOISE_TOLERANCE = 0.01
+# promised decrease in noise variances at which the last stage ends where no parameter moves: lower iterates for states
+# that no parameter depends on, higher leaves costs that are compared short of their least
+SETTLED_COST_DECREASE = 0.01
+# step of a parameter over the tolerance of convergence [1] at which the last stage ends: lower settles states that no
+# parameter depends on, higher leaves the parameters short of their optimum; and where finer steps follow, which move it
+FINE_TOLERANCE, COARSE_TOLERANCE = 0.01, 0.5
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
 GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
 ABANDONED_START = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
-# relative change of a parameter [1] after which the stiffness is computed anew: higher risks unstable steps
-STIFFNESS_UPDATE_CHANGE = 0.03
 # error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
 # estimates, lower costs a run with sensitivities
 MAX_GRADIENT_ERROR = 0.01
-MAX_SEARCH_SUBSTEPS = 200  # integration steps a sample: a search with more would take hours, fewer refuse stiff models
 # iterations of the last stage right after the first: more are lost where stages between are needed, fewer may not
 # converge
 JUMP_ITERATIONS = 10
 # promised decrease over the cost [1] at which such a first stage ends: lower iterates for what the last one finds
 # anyway, higher jumps from a start that is not near
 JUMP_COST_TOLERANCE = 1e-2
-MAX_STAGE_REFINEMENT = 8  # factor on the start's integration steps in a stage: higher takes long, lower may be unstable
-
-
-class _StageEnd(NamedTuple):
-    """Where a stage ended."""
-
-    nodes: Array
-    z: Array
-    cost: float
+# squares that the last stage promises by the linearised equations, in noise variances [1], above which it is not tried
+# right after the first: lower passes over it for a start that is only not yet near, higher iterates for wrong models
+MAX_JUMP_MISFIT = 10.0
 
 
 class _Snapshot(NamedTuple):
@@ -86,14 +88,11 @@ class Search:
         self.gap_scales = gap_scales(segments, method.kinematic)
         self.iterations, self.stage = 0, method.stages[0]
         self.correction: IntegrationCorrection | None
-        self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[_StageEnd]()
+        self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[tuple[Array, Array, float]]()
         nodes = start_nodes(segments)
-        self.stiffness_parameters = self.scaling.values(self.scaling.start)
-        self.required_substeps = method.substeps or stable_substeps(
-            segments, nodes, self.stiffness_parameters, RK4_MAX_H_LAMBDA
-        )
-        self.substeps = self.start_substeps = method.substeps or min(self.required_substeps, MAX_SEARCH_SUBSTEPS)
-        self.output_substeps, self.correction, self.integration_change = self.substeps, None, math.nan
+        self.steps = IntegrationSteps(segments, nodes, self.scaling.values(self.scaling.start), method.substeps)
+        self.substeps = self.output_substeps = self.steps.start
+        self.correction, self.integration_change, self.is_coarse = None, math.nan, False
         self.current = self._evaluate(nodes, self.scaling.start)
 
     def solve(self) -> Fit:
@@ -106,8 +105,8 @@ class Search:
         return self._fit(status, time.perf_counter() - began)
 
     def _run_stages(self) -> Status:
-        if self._is_too_stiff:
-            verdict = f"the model is so stiff that a sample takes {self.required_substeps} integration steps"
+        if self.steps.are_too_many:
+            verdict = f"the model is so stiff that a sample takes {self.steps.required} integration steps"
             remedy = "widen the smoothing of its sharpest term, or give LeastSquares(substeps=)"
             return Status(Code.NOT_CONVERGED, (verdict, remedy))
         last, allowed = self.method.stages[-1], None
@@ -120,21 +119,36 @@ class Search:
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
             self.has_stalled = self._finish_stage(stage.iterations)
-            self.stage_ends.append(_StageEnd(self.current.nodes, self.current.z, self.current.cost))
+            self.stage_ends.append((self.current.nodes, self.current.z, self.current.cost))
             if stage is self.method.stages[0]:
                 if 2 * self.current.cost > self.method.max_first_misfit * self.current.equations.count:
                     return ABANDONED_START
-                if found := self._jump_to_last_stage():
+                if found := self._jump():
                     return self._refine_steps(found)
         status = self._convergence_status(self.current)
         # gaps that absorb the misfit of the model: the answer depends on their weight
         gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
         return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
 
-    def _jump_to_last_stage(self) -> Status | None:
-        """The status of an optimum that the last stage soon reaches after a first that explains the log; or None."""
+    def _jump(self) -> Status | None:
+        """The status of an optimum that is soon reached after a first stage that explains the log; or None."""
         if len(self.method.stages) < 3 or not self._is_noise(self.current.cost):
             return None
+        count, (first, *between, last) = self.current.equations.count, self.method.stages
+        if not self._promised_squares(last) > MAX_JUMP_MISFIT * count:
+            return self._jump_to_last_stage()
+        near_noise = [s for s in between if self._promised_squares(s) <= MAX_CHI_SQUARE_RATIO * count]
+        found = self._loosen(near_noise[-1] if near_noise else first, self.current.nodes, self.current.z)
+        return found if found.converged else None
+
+    def _promised_squares(self, stage: "Stage") -> float:
+        """The squares, in noise variances, to which the gaps of a stage would lead by the linearised equations."""
+        slopes = self.current.equations.linearisation
+        equations = weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales)
+        return equations.promised_squares(self.scaling.has_effect(equations) & ~self.scaling.held)
+
+    def _jump_to_last_stage(self) -> Status | None:
+        """The status of an optimum that the last stage soon reaches; or None."""
         before = self._snapshot()
         self._enter_stage(self.method.stages[-1], self.current.nodes, self.current.z)
         if math.isfinite(self.current.cost):
@@ -146,11 +160,6 @@ class Search:
         self._restore(before)
         return None
 
-    @property
-    def _is_too_stiff(self) -> bool:
-        """Whether a sample of the start takes more integration steps than a search can afford."""
-        return self.required_substeps > self.start_substeps
-
     def _gaps_absorb_misfit(self) -> bool:
         """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""
         absorbing = self.current.equations.gap_share > MAX_GAP_SHARE
@@ -158,20 +167,23 @@ class Search:
 
     def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
         """Let the gaps stand for noise of the states of a wrong model: the tightest with which all residuals agree."""
-        last = self.method.stages[-1]
-        for stage, end in reversed(list(zip(self.method.stages[:-1], self.stage_ends, strict=False))):
-            if self._is_noise(end.cost):
-                before = self._snapshot()
-                self.noisy_gaps = True
-                self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), end.nodes, end.z)
-                self._finish_stage(last.iterations)
-                found = self._convergence_status(self.current)
-                if found.converged:
-                    return found
-                self._restore(before)
-                self.noisy_gaps = False
-                break
+        for stage, (nodes, z, cost) in reversed(list(zip(self.method.stages[:-1], self.stage_ends, strict=False))):
+            if self._is_noise(cost):
+                found = self._loosen(stage, nodes, z)
+                return found if found.converged else status
         return status
+
+    def _loosen(self, stage: "Stage", nodes: Array, z: Array) -> Status:
+        """The status of the optimum with a stage's gaps as noise of the states; where there is none, nothing moves."""
+        before, last = self._snapshot(), self.method.stages[-1]
+        self.noisy_gaps = True
+        self._enter_stage(replace(stage, iterations=last.iterations, refine=last.refine), nodes, z)
+        self._finish_stage(last.iterations)
+        found = self._convergence_status(self.current)
+        if not found.converged:
+            self._restore(before)
+            self.noisy_gaps = False
+        return found
 
     def _snapshot(self) -> _Snapshot:
         return _Snapshot(self.stage, self.current, self.correction, self.substeps, self.output_substeps)
@@ -181,12 +193,10 @@ class Search:
 
     def _enter_stage(self, stage: "Stage", nodes: Array, z: Array) -> None:
         """Weigh the gaps as in a stage, with integration steps from the stiffness at these nodes."""
-        steps, q = self.substeps, self.scaling.values(z)
-        if not self.method.substeps and not np.allclose(q, self.stiffness_parameters, rtol=STIFFNESS_UPDATE_CHANGE):
-            needed, self.stiffness_parameters = stable_substeps(self.segments, nodes, q, RK4_MAX_H_LAMBDA), q
-            steps = min(needed, MAX_STAGE_REFINEMENT * self.start_substeps)  # fewer, too: a bad start may be stiff
+        steps = self.steps.renew(nodes, self.scaling.values(z), self.substeps)
         is_known = steps == self.substeps and self.correction is None and nodes is self.current.nodes
         self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
+        self.is_coarse = stage.refine > 1
         if is_known:
             slopes = self.current.equations.linearisation
             self.current = Iterate(nodes, z, weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales))
@@ -196,6 +206,7 @@ class Search:
     def _apply_finer_steps(self, steps: int) -> float:
         """Integrate the current iterate by finer steps; return the largest change of y [standard deviations]."""
         nodes, z, before = self.current.nodes, self.current.z, self._outputs()
+        self.is_coarse = False
         if self._corrects_residuals:
             self._correct_residuals(steps)
         else:
@@ -210,7 +221,7 @@ class Search:
 
     def _correct_residuals(self, steps: int) -> None:
         """Add what finer steps change to the current residuals; derivatives are computed anew where that is much."""
-        current, before, fine = self.current, self._outputs(), self._run(steps)
+        current, before, fine, self.is_coarse = self.current, self._outputs(), self._run(steps), False
         slopes = current.equations.linearisation
         self.correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
         self.output_substeps, sigma = steps, self.stage.gap * self.gap_scales
@@ -282,29 +293,23 @@ class Search:
         return before - self.current.cost < STALL_COST_DECREASE * before
 
     def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
-        """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction.
+        """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
 
-        Where the gaps stand for noise of the states, a hundredth of the tolerance in the parameters' directions: the
-        states of such a fit estimate that noise, and settle long after the parameters.
+        The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts.
         """
         promised = 0.5 * current.equations.arrow.descent_rate(step)
-        if self.noisy_gaps and promised < STAGE_COST_TOLERANCE * current.cost:
-            return self._largest_parameter_step(current, reduced, step) < STATE_NOISE_TOLERANCE * self.method.tolerance
-        if self.stage is self.method.stages[-1]:
-            return promised < FINAL_COST_TOLERANCE * max(1.0, 2 * current.cost / max(1, current.equations.count))
-        is_first = self.stage is self.method.stages[0] and self._is_noise(current.cost)
-        return (
-            not self.noisy_gaps
-            and promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
-        )
-
-    def _largest_parameter_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> float:
-        """The largest step of a parameter in its standard deviations; infinite where the data do not determine all."""
+        is_last, misfit = self.stage is self.method.stages[-1], max(1.0, 2 * current.cost / current.equations.count)
+        if not (self.noisy_gaps or is_last):
+            is_first = self.stage is self.method.stages[0] and self._is_noise(current.cost)
+            return promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
+        if is_last and promised < FINAL_COST_TOLERANCE * misfit:
+            return True
+        is_settled = promised < SETTLED_COST_DECREASE * misfit or self.noisy_gaps or self.is_coarse
+        if not (is_settled and promised < STAGE_COST_TOLERANCE * current.cost):
+            return False
         keep = self.scaling.movable(current.z, current.equations, reduced)
-        if current.equations.unidentifiable_parameters(reduced, keep).size:
-            return math.inf
-        spread = np.sqrt(np.diag(positive_definite_inverse(reduced.schur[np.ix_(keep, keep)])))
-        return float(np.max(np.abs(step.parameters[keep]) / spread, initial=0.0))
+        largest = largest_parameter_step(current.equations, keep, reduced, step)
+        return largest < (COARSE_TOLERANCE if self.is_coarse else FINE_TOLERANCE) * self.method.tolerance
 
     def _objective(self) -> Objective:
         sigma = self.stage.gap * self.gap_scales
@@ -324,8 +329,7 @@ class Search:
 
     def _fit(self, status: Status, seconds: float) -> Fit:
         transcription, current, equations = self.segments.transcription, self.current, self.current.equations
-        q = self.scaling.values(current.z)
-        free = transcription.parameters.free_names
+        q, free = self.scaling.values(current.z), transcription.parameters.free_names
         values = dict(zip(free, q[transcription.free].tolist(), strict=True))
         is_run = self.correction is not None and math.isfinite(self.integration_change)  # at these very nodes
         run = self.correction.fine_run if is_run and self.correction else self._run(self.output_substeps)
@@ -366,7 +370,7 @@ class Search:
 
     def _doubtful_parameters(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
-        if self._is_too_stiff:
+        if self.steps.are_too_many:
             return (), ()
         free, found = self.segments.transcription.parameters.free_names, self._assess(self.current)
         return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)

@@ -1,5 +1,6 @@
 """The shortcuts of a search: the last stage right after the first, and finer integration steps without derivatives."""
 
+import math
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -7,13 +8,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pneuopt.quantities.arrays import Array
 from pneuopt.shooting.equations import correct_residuals, normal_equations
-from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search import Search
+from pneuopt.shooting.search import FINE_TOLERANCE, Search
 from pneuopt.shooting.segments import IntegrationCorrection, segment, start_nodes
 from pneuopt.shooting.solution import Fit
-from tests.shooting.test_least_squares import two_logs
+from tests.shooting.test_least_squares import found, shaken, two_logs
 
 FIRST, *OTHERS = LeastSquares().stages
 
@@ -96,3 +98,44 @@ def test_a_last_stage_that_stays_above_the_noise_is_not_integrated_by_finer_step
     monkeypatch.setattr(Search, "_jump_to_last_stage", jumped)
     assert solve_least_squares(two_logs(), LeastSquares()).status.converged
     assert jumps == [True]
+
+
+def test_a_wrong_model_is_not_searched_with_tight_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first stage's linearised equations foresee what tight gaps leave; the optimum is that of all stages."""
+    problem, entered, enter = shaken(2e-3), list[float](), Search._enter_stage
+
+    def record(search: Search, stage: Stage, nodes: Array, z: Array) -> None:
+        entered.append(stage.gap)
+        enter(search, stage, nodes, z)
+
+    monkeypatch.setattr(Search, "_enter_stage", record)
+    fit = solve_least_squares(problem, LeastSquares())
+    assert min(entered) == fit.stats["gap_deviation"] > LeastSquares().stages[-1].gap
+    monkeypatch.setattr("pneuopt.shooting.search.MAX_JUMP_MISFIT", math.inf)
+    whole = solve_least_squares(problem, LeastSquares())
+    assert min(entered) == LeastSquares().stages[-1].gap
+    assert fit.covariance is not None
+    spread = np.sqrt(np.diag(fit.covariance))
+    assert np.abs((found(fit) - found(whole)) / spread).max() < 1e-2
+    assert fit.stats["iterations"] < 0.7 * whole.stats["iterations"]
+
+
+def test_foreseen_squares_are_those_that_tight_gaps_leave() -> None:
+    search = Search(segment(shaken(2e-3)), LeastSquares(stages=(Stage(1e-2, 12), Stage(3e-4, 30))))
+    first, last = search.method.stages
+    search._finish_stage(first.iterations)
+    foreseen = search._promised_squares(last)
+    search._enter_stage(last, search.current.nodes, search.current.z)
+    search._finish_stage(last.iterations)
+    assert foreseen == pytest.approx(2 * search.current.cost, rel=0.05)
+
+
+def test_nothing_is_iterated_to_the_end_before_finer_steps_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the model misses the log, the coarse steps of the last stage end as soon as the parameters do not move."""
+    problem = shaken(2e-3)
+    fit = solve_least_squares(problem)
+    monkeypatch.setattr("pneuopt.shooting.search.COARSE_TOLERANCE", FINE_TOLERANCE)
+    fine = solve_least_squares(problem)
+    assert fit.covariance is not None
+    assert np.abs((found(fit) - found(fine)) / np.sqrt(np.diag(fit.covariance))).max() < 1e-2
+    assert fit.stats["iterations"] < fine.stats["iterations"]
