@@ -7,12 +7,13 @@ curve. A width that is a property of the friction is freed, in a candidate of it
 
 Windows and widths are those of the leader, the simplest of the candidates that follow the logs best in short searches
 with loose gaps; a model that is too simple would cut the logs into windows so short that nothing tells the others
-apart. Candidates that such searches show to be hopeless beside the leader's fit are not searched any longer.
+apart. Candidates that such searches show to be hopeless beside the leader's are not searched any longer. In windows the
+others begin where the leader has ended, if they have its states.
 """
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,8 +29,8 @@ from pneuopt.quantities.status import Code, Status
 from pneuopt.shooting.least_squares import LeastSquares
 
 # samples of a window where candidates jump from segment to segment and none has chosen one: fewer hardly tell models
-# apart, with more a wrong one may run away
-JUMPING_WINDOW_SAMPLES = 100
+# apart, with more all gather so much misfit that no search settles
+JUMPING_WINDOW_SAMPLES = 20
 # squares of a trial over the least of all [1], up to which the simplest candidate leads: lower lets idle terms lead,
 # higher a model that does not follow the logs
 LEADER_RATIO = 1.1
@@ -56,23 +57,25 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Refutation:
-    """Why a candidate was not fitted: its squares by a short search, and a few words.
+    """Why a candidate was not fitted: its squares over the leader's in short searches, and a few words.
 
     Parameters
     ----------
-    chi_square : float
-        Of its fit, at least, in variances of the declared noise.
+    leader : str
+    ratio : float
     free : tuple of str
         The parameters that it would estimate.
     reason : str
     """
 
-    chi_square: float
+    leader: str
+    ratio: float
     free: tuple[str, ...]
     reason: str
 
 
 Fits = dict[str, IdentificationResult | Refutation]
+Trials = dict[str, Trial]
 
 
 def fit_candidates(
@@ -98,10 +101,7 @@ def fit_candidates(
         within it.
     """
     alike = _Alike(experiments, method or LeastSquares(), window)
-    trials, out = dict[str, Trial](), Fits()
-    for name, candidate in candidates.items():
-        alike.announce("trying", name, len(trials), len(candidates))
-        trials[name] = alike.try_shortly(candidate)
+    trials, out = _try_all(candidates, alike), Fits()
     for name in _by_rank(candidates, trials):
         alike.announce("fitting", name, len(out), len(candidates))
         out[name] = fit = alike.fit(candidates[name])
@@ -109,6 +109,25 @@ def fit_candidates(
             out = _fit_beside(name, fit, candidates, trials, alike)
             break
     return {n: out[n] for n in candidates}
+
+
+def _try_all(candidates: Mapping[str, Candidate], alike: "_Alike") -> Trials:
+    """A trial of each candidate's first start, the richest first, which leaves the others the fewest squares."""
+    trials, allowed = Trials(), tuple[float, ...]()
+    for name in _richest_first(candidates):
+        alike.announce("trying", name, len(trials), len(candidates))
+        trials[name] = alike.try_shortly(candidates[name], allowed=allowed)
+        allowed = _hopeless_squares(min(trials.values(), key=lambda trial: trial.squares))
+    return trials
+
+
+def _richest_first(candidates: Mapping[str, Candidate]) -> list[str]:
+    return sorted(candidates, key=lambda n: -len(candidates[n].parameters.free_names))
+
+
+def _hopeless_squares(best: Trial) -> tuple[float, ...]:
+    """The squares after each stage beyond which another candidate is hopeless."""
+    return tuple(HOPELESS_RATIO * squares for squares in best.by_stage)
 
 
 def _by_rank(candidates: Mapping[str, Candidate], trials: Mapping[str, Trial]) -> list[str]:
@@ -123,19 +142,17 @@ def _fit_beside(
     leader: str,
     fit: IdentificationResult,
     candidates: Mapping[str, Candidate],
-    trials: Mapping[str, Trial],
+    trials: Trials,
     alike: "_Alike",
 ) -> Fits:
     """The fit of the leader and those of the others, as alike to it as can be, the simplest first."""
     widths, out = {width.name: width.value for width in fit.widths}, Fits({leader: fit})
-    for name in candidates.keys() - {leader}:
-        if (refutation := _refute(name, leader, fit, candidates, trials, alike)) is not None:
-            out[name] = refutation
-    others = sorted(candidates.keys() - out.keys(), key=lambda n: len(candidates[n].parameters.free_names))
+    out |= _refute_hopeless(leader, fit, candidates, trials, alike)
+    others = sorted(candidates.keys() - out.keys(), key=lambda n: (len(candidates[n].parameters.free_names), n))
     if others and alike.window is None:
         alike = alike.with_window_of(fit)
         if fit.window is None and alike.window != math.inf:
-            out[leader] = alike.fit(candidates[leader])
+            out[leader] = alike.fit(candidates[leader], fit)
     for name in others:
         alike.announce("fitting", name, len(out), len(candidates))
         out[name] = found = _fit_one(_with_widths(candidates[name], widths), leader, candidates, alike, out)
@@ -143,30 +160,27 @@ def _fit_beside(
     return out
 
 
-def _refute(
-    name: str,
-    leader: str,
-    fit: IdentificationResult,
-    candidates: Mapping[str, Candidate],
-    trials: Mapping[str, Trial],
-    alike: "_Alike",
-) -> Refutation | None:
-    """The refutation of a candidate beside the leader's fit; None where it may explain the logs as well.
+def _refute_hopeless(
+    leader: str, fit: IdentificationResult, candidates: Mapping[str, Candidate], trials: Trials, alike: "_Alike"
+) -> dict[str, Refutation]:
+    """The refutations of candidates beside the leader's fit; a case of a refuted one needs no more than its own trial.
 
     A static map is always fitted, for that is as short.
     """
-    candidate = _with_widths(candidates[name], {width.name: width.value for width in fit.widths})
-    known = trials[name] if candidate == candidates[name] else None
-    squares = max(trials[leader].squares, alike.squares(fit), float(fit.fit["samples"].sum()))
-    enough = HOPELESS_RATIO * squares
-    if not candidate.system.states or (known is not None and known.least <= enough):
-        return None
-    near = fit if candidate.has_states_of(candidates[leader]) else None
-    trial = alike.try_shortly(candidate, near, known, enough)
-    if not enough < trial.least < math.inf:
-        return None
-    words = f"short searches with loose gaps leave {trial.least / squares:.3g} times the squares of {leader}"
-    return Refutation(trial.least, candidate.parameters.free_names, words)
+    out, widths = dict[str, Refutation](), {width.name: width.value for width in fit.widths}
+    for name in _richest_first({n: c for n, c in candidates.items() if n != leader and c.system.states}):
+        candidate, trial = _with_widths(candidates[name], widths), trials[name]
+        is_tried = candidate == candidates[name] and bool(trial.by_stage)
+        if is_tried and not trial.is_hopeless:
+            continue
+        if not (is_tried and any(candidates[n].extends(candidate) for n in out)):
+            near = fit if candidate.has_states_of(candidates[leader]) else None
+            trial = alike.try_shortly(candidate, near, trial if is_tried else None, _hopeless_squares(trials[leader]))
+        if trial.ratio:
+            ratio = HOPELESS_RATIO * trial.ratio
+            words = f"short searches with loose gaps leave {ratio:.3g} times the squares of {leader}"
+            out[name] = Refutation(leader, ratio, candidate.parameters.free_names, words)
+    return out
 
 
 def _fit_one(
@@ -180,9 +194,11 @@ def _fit_one(
     }
     own = fits[leader]
     assert isinstance(own, IdentificationResult)
-    is_nested = leader in within or candidates[leader].extends(candidate)
-    fit = alike.fit(candidate, own) if is_nested else alike.fit(candidate)
-    if is_nested and not fit.status.converged:
+    is_near = candidate.has_states_of(candidates[leader]) and (
+        leader in within or candidates[leader].extends(candidate) or math.isfinite(alike.length)
+    )
+    fit = alike.fit(candidate, own) if is_near else alike.fit(candidate)
+    if is_near and not fit.status.converged:
         fit = alike.fit(candidate)
     if within and not fit.status.converged:
         richest = max(within, key=lambda n: len(candidates[n].parameters.free_names))
@@ -225,11 +241,11 @@ class _Alike:
         candidate: Candidate,
         near: IdentificationResult | None = None,
         known: Trial | None = None,
-        enough: float = math.inf,
+        allowed: Sequence[float] = (),
     ) -> Trial:
         """The short search of a candidate."""
         given = candidate.system, self.experiments, candidate.parameters, self._own_method
-        return try_candidate(*given, window=self.length, near=near, known=known, enough=enough)
+        return try_candidate(*given, window=self.length, near=near, known=known, allowed=allowed)
 
     def announce(self, action: str, name: str, done: int, count: int) -> None:
         """Say whose search begins."""
@@ -242,12 +258,6 @@ class _Alike:
             step = max(float(np.median(np.diff(e.trajectory.t))) for e in self.experiments)
             return replace(self, window=JUMPING_WINDOW_SAMPLES * step)
         return replace(self, window=fit.window.duration if fit.window else math.inf)
-
-    def squares(self, fit: IdentificationResult) -> float:
-        """The squared residuals of a fit of whole logs in variances of the noise; zero of one that jumps."""
-        table = fit.fit
-        jumps = fit.window is not None or _has_jumps(fit, self.method)
-        return 0.0 if jumps else float(((table["rmse"] / table["noise"]) ** 2 * table["samples"]).sum())
 
 
 def _has_jumps(fit: IdentificationResult, method: LeastSquares) -> bool:

@@ -58,7 +58,8 @@ def report_selection(chosen: "ModelSelection") -> Report:
     for row in chosen.table.reset_index(names="model").to_dict(orient="records"):
         unidentifiable = row["unidentifiable"]
         missing = f"{UNIDENTIFIABLE_NOTE}: {unidentifiable}" if unidentifiable else ""
-        note = "" if row["converged"] else "not converged"
+        why = str(row["message"]).partition(";")[0]
+        note = "" if row["converged"] else f"refuted: {why}" if row["refuted"] else f"not converged: {why}"
         bound = f"{AT_BOUND_NOTE}: {row['at_bound']}" if row["at_bound"] else ""
         figures = str(row["free"]), format_number(row["bic_above"], 4), str(row["contains"])
         remark = note or row["unphysical"] or bound or missing

@@ -4,6 +4,7 @@ import fnmatch
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from pneuopt.dynamics.runnable import HasSystem, as_system
@@ -45,8 +46,8 @@ class ModelSelection(Result):
     Attributes
     ----------
     table : DataFrame
-        A row a candidate, the best first: converged, free (number of estimates), deviance, bic, bic_above (the best's;
-        all three at least so large where a short search has refuted the candidate, and p_value at most so large),
+        A row a candidate, the best first: converged, refuted (by short searches, without a fit), free (number of
+        estimates), deviance, bic, bic_above (the best's; all three estimated for a refuted one, as is p_value),
         contains (the richest candidate nested in it), p_value (its extra terms are chance), held_out_nrmse,
         unidentifiable and at_bound (names of parameters), unphysical (which order of
         `Excitation.at_least` it breaks), message.
@@ -147,6 +148,7 @@ class _CandidateRow:
     """A row of the table: one candidate."""
 
     converged: bool
+    refuted: bool
     free: int
     deviance: float
     bic: float
@@ -166,6 +168,8 @@ class _CandidateRow:
     @property
     def defect(self) -> str:
         """Why it is not recommended, in a few words."""
+        if self.refuted:
+            return "by short searches"
         if not self.converged:
             return self.message.partition(";")[0]
         return f"{self.at_bound} at a bound" if self.at_bound else self.unphysical
@@ -215,14 +219,22 @@ def _candidate_rows(
     comparable = {n: fit for n, fit in found.items() if n in predicted or n not in fits}
     rows = {}
     for name, fit in found.items():
-        k, deviance, inside, p, bic = len(_free_names(fit)), _chi_square(fit) / scale, "", math.nan, math.nan
+        k, deviance, inside, p, bic = len(_free_names(fit)), _chi_square(fit, fits) / scale, "", math.nan, math.nan
         if name in comparable:
             inside, bic = _largest_submodel(name, candidates, comparable), bayes_information(deviance, k, count)
         if inside and name in predicted:
             less = k - len(_free_names(found[inside]))
-            p = likelihood_ratio_p(_chi_square(found[inside]) / scale - deviance, less)
+            p = likelihood_ratio_p(_chi_square(found[inside], fits) / scale - deviance, less)
         rows[name] = _CandidateRow(
-            name in predicted, k, deviance, bic, inside, p, predicted.get(name, math.nan), *_said(candidates[name], fit)
+            name in predicted,
+            name not in fits,
+            k,
+            deviance,
+            bic,
+            inside,
+            p,
+            predicted.get(name, math.nan),
+            *_said(candidates[name], fit),
         )
     return dict(sorted(rows.items(), key=lambda row: (not row[1].converged, row[1].bic)))
 
@@ -260,10 +272,12 @@ def _largest_submodel(
     return max(simpler, key=lambda n: len(_free_names(fits[n])), default="")
 
 
-def _chi_square(fit: IdentificationResult | Refutation) -> float:
-    """The sum of squared residuals, in variances of the declared noise; at least that of one that is refuted."""
+def _chi_square(
+    fit: IdentificationResult | Refutation, fits: Mapping[str, IdentificationResult] = MappingProxyType({})
+) -> float:
+    """The sum of squared residuals, in variances of the declared noise; an estimate for a candidate that is refuted."""
     if isinstance(fit, Refutation):
-        return fit.chi_square
+        return fit.ratio * _chi_square(fits[fit.leader])
     return float(((fit.fit["rmse"] / fit.fit["noise"]) ** 2 * fit.fit["samples"]).sum())
 
 

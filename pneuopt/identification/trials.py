@@ -21,7 +21,6 @@ from pneuopt.quantities.errors import PhysicsWarning
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.solution import Fit
 
 # gaps and iterations of a trial: with tighter gaps, or more iterations, it takes as long as a search; with looser ones
 # a wrong model looks as good as a right one
@@ -36,13 +35,29 @@ class Trial:
     Parameters
     ----------
     squares : float
-        Squared residuals and gaps, in noise variances; infinite where no start is finite.
+        Squared residuals and gaps, in noise variances; infinite where no start is finite, or none was searched to the
+        end.
     least : float
         What these would still fall to, by the linearised equations; zero where these say nothing.
+    by_stage : tuple of float
+        The squares after each stage, at least the noise's.
+    ratio : float
+        The least squares over those that were allowed after the same stage, where no start kept within these; else 0.
     """
 
     squares: float = math.inf
     least: float = math.inf
+    by_stage: tuple[float, ...] = ()
+    ratio: float = 0.0
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether each start was left for its squares, or is not finite."""
+        return math.isinf(self.squares)
+
+    def better(self, other: "Trial") -> "Trial":
+        """The one of fewer squares; of two that were left, the one that was nearer."""
+        return min(self, other, key=lambda trial: (trial.squares, trial.ratio or math.inf))
 
 
 def try_candidate(
@@ -54,7 +69,7 @@ def try_candidate(
     window: float = math.inf,
     near: IdentificationResult | None = None,
     known: Trial | None = None,
-    enough: float = math.inf,
+    allowed: Sequence[float] = (),
 ) -> Trial:
     """Search shortly from a model's first starts.
 
@@ -69,9 +84,9 @@ def try_candidate(
     near : IdentificationResult, optional
         A fit with another model of the same states, from which a search begins, too, where the model's starts guess.
     known : Trial, optional
-        Of the first start, which is not tried again.
-    enough : float
-        Squares to which a search must fall to be the last.
+        Of the first start, which is not tried again; the other starts are tried where it is hopeless.
+    allowed : sequence of float
+        Squares after each stage beyond which a start is left, by default none; one that keeps within them is the last.
 
     Returns
     -------
@@ -90,31 +105,29 @@ def try_candidate(
     candidates, best = problem.candidates(), known or Trial()
     others = [problem.start_from(near)] if near and candidates[0].trial_parameters else []
     for start in itertools.chain(others, itertools.islice(candidates, 1 if known else 0, MAX_TRIALS)):
-        found = _try_start(problem, start)
-        best = Trial(min(best.squares, found.squares), min(best.least, found.least))
-        if best.least <= enough:
+        best = best.better(_try_start(problem, start, allowed))
+        if not (allowed and best.is_hopeless):
             break
     return best
 
 
-def _try_start(problem: EstimationProblem, start: Start) -> Trial:
-    """The trial from one start."""
+def _try_start(problem: EstimationProblem, start: Start, allowed: Sequence[float]) -> Trial:
+    """The trial from one start, until its squares exceed what is allowed."""
     stages = TRIAL_STAGES if problem.has_gaps else TRIAL_STAGES[-1:]
-    # an empty last stage: the last one of a method would iterate to its end
-    method = replace(problem.method, stages=(*stages, replace(stages[-1], iterations=0)))
-    fit = solve_least_squares(problem.transcription(start), method)
-    if fit.status.code is Code.INTERRUPTED:
-        raise KeyboardInterrupt
-    squares = 2 * fit.stats["cost"]
-    return Trial(squares, _least_squares(fit)) if squares < math.inf else Trial()
-
-
-def _least_squares(fit: Fit) -> float:
-    """The squares at the end of an undamped step, by the linearised equations; zero where there is no such step."""
-    if fit.optimum is None:
-        return 0.0
-    arrow = fit.optimum.equations.arrow
-    reduced = arrow.eliminate(0.0)
-    step = reduced and reduced.step(fit.optimum.keep)
-    least = 2 * fit.stats["cost"] - arrow.descent_rate(step) if step else 0.0
-    return least if least > 0.0 else 0.0
+    trial = Trial(0.0, 0.0)
+    for stage, enough in itertools.zip_longest(stages, allowed[: len(stages)], fillvalue=math.inf):
+        assert isinstance(stage, Stage)
+        # an empty last stage: the last one of a method would iterate to its end
+        method = replace(problem.method, stages=(stage, replace(stage, iterations=0)))
+        fit = solve_least_squares(problem.transcription(start), method)
+        if fit.status.code is Code.INTERRUPTED:
+            raise KeyboardInterrupt
+        squares, optimum = 2 * fit.stats["cost"], fit.optimum
+        if not squares < math.inf:
+            return Trial()
+        least = max(0.0, optimum.equations.promised_squares(optimum.keep)) if optimum else 0.0
+        trial = Trial(squares, least, (*trial.by_stage, max(squares, fit.count)))
+        if least > enough:
+            return replace(trial, squares=math.inf, ratio=least / enough)
+        start = problem.start_from(fit)
+    return trial

@@ -162,7 +162,7 @@ def test_a_tie_is_decided_by_held_out_runs_and_the_reason_says_what_would_separa
 
 
 def row(*, free: int, deviance: float, bic: float, held_out: float) -> _CandidateRow:
-    return _CandidateRow(True, free, deviance, bic, "", math.nan, held_out, "", "", "", "")
+    return _CandidateRow(True, False, free, deviance, bic, "", math.nan, held_out, "", "", "", "")
 
 
 FORCED = {"load.mass": 5.0, "load.force": 0.0}
@@ -202,6 +202,10 @@ def test_hopeless_models_are_refuted_by_short_searches_and_do_not_cut_the_logs()
         assert not columns["converged"][name]
         assert columns["deviance"][name] > 4 * columns["deviance"]["stribeck"]
         assert "short searches with loose gaps leave" in columns["message"][name]
+        assert columns["refuted"][name]
+    shown = " ".join(str(found.summary()).split())
+    assert "refuted: short searches" in shown
+    assert "not converged" not in shown
     assert columns["contains"]["stribeck"] == "coulomb"
     assert columns["p_value"]["stribeck"] < 1e-6
     assert "refuted: " in found.reason
