@@ -1,0 +1,17 @@
+"""Full disks, damaged and foreign caches, moved inputs, processes and threads lose nothing and show no traceback."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.cli.circumstances import CIRCUMSTANCES, try_circumstances
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="redirections, mounts and users of Linux")
+def test_unlucky_circumstances_lose_nothing(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    outcomes = list(try_circumstances(tmp_path))
+    assert [str(outcome) for outcome in outcomes if outcome.fault] == []
+    assert len(outcomes) == len(CIRCUMSTANCES) or os.geteuid() != 0
