@@ -53,7 +53,7 @@ def repair_log(system: Fittable, experiment: Experiment) -> tuple[Experiment, tu
     holes = _find_holes(log, known, system) if system.states else []
     lost = ~known if not system.states else _inside(holes, len(log))
     everything = (
-        f"{experiment.name}: no {MIN_RUN} samples in a row hold {', '.join(inputs)} and an output; log them together"
+        f"{experiment.name}: no part holds {', '.join(inputs)} and {MIN_RUN} samples of an output; log them together"
     )
     require(not lost.all(), everything, LogError)
     where = ", ".join(f"from {log.t[max(a - 1, 0)]:g} s to {log.t[min(b, len(log) - 1)]:g} s" for a, b in holes[:3])
@@ -100,7 +100,7 @@ def _find_holes(log: Trajectory, known: Mask, system: Fittable) -> list[tuple[in
     at = np.flatnonzero(known)
     far = np.flatnonzero(np.diff(log.t[at]) > (MAX_BRIDGE + 1.5) * float(np.median(np.diff(log.t))))
     begins, ends = [*at[:1], *at[far + 1]], [*(at[far] + 1), *(at[-1:] + 1)]
-    measured = np.isfinite(log.matrix(n for n in names(system.outputs) if n in log)).any(axis=1) & known
+    measured = np.isfinite(log.matrix(n for n in names(system.outputs) if n in log)).any(axis=1)
     runs = [(int(a), int(b)) for a, b in zip(begins, ends, strict=True) if measured[a:b].sum() >= MIN_RUN]
     edges = [0, *(edge for run in runs for edge in run), len(log)]
     inner = range(2, len(edges) - 2, 2)

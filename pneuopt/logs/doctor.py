@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from pneuopt.logs.checks.balance import check_mass, check_offset
 from pneuopt.logs.checks.end_stops import check_end_stops
 from pneuopt.logs.checks.findings import PISTON, LogFinding, StatedAxis
@@ -12,6 +14,12 @@ from pneuopt.logs.checks.signs import check_command, check_position_speed, check
 from pneuopt.logs.checks.standstill import check_has_motion, check_scale
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.noise import noise_level
+from pneuopt.quantities.arrays import Array, Mask
+
+MIN_SPLINE = 4
+"""Samples of a channel through which a cubic spline runs."""
+MAX_STEPS_BETWEEN = 5.0
+"""Time between two samples of a channel over its usual one [1] from which it is a hole: nobody knows what was there."""
 
 
 def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFinding, ...]:
@@ -46,7 +54,9 @@ def examine(experiment: Experiment, axis: StatedAxis = PISTON) -> tuple[LogFindi
     work; the force brakes the motion on balance ; change the sign of 'force'
     """
     experiment = _with_noise(experiment, axis)
-    named = ((name, finding) for name, check in CHECKS.items() for finding in check(experiment, axis))
+    whole = _fill_between(experiment)
+    logs = {name: experiment if name in SINGLE_SAMPLE_CHECKS else whole for name in CHECKS}
+    named = ((name, finding) for name, check in CHECKS.items() for finding in check(logs[name], axis))
     found = [replace(finding, check=name, log=experiment.name) for name, finding in named]
     return tuple(sorted(found, key=lambda f: not f.fault))
 
@@ -58,6 +68,28 @@ def _with_noise(experiment: Experiment, axis: StatedAxis) -> Experiment:
         if name in log and name not in experiment.noise:
             found[name] = noise_level(log[name], log.t)
     return experiment.with_noise({name: level for name, level in found.items() if level > 0})
+
+
+def _fill_between(experiment: Experiment) -> Experiment:
+    """The log with each channel at every instant, as recorders that give each its own rate do not write it.
+
+    A spline runs through the samples, but not across a hole.
+    """
+    log = experiment.trajectory
+    known = {n: np.isfinite(log[n]) for n in log}
+    lacking = [n for n, there in known.items() if MIN_SPLINE <= there.sum() < there.size]
+    return replace(experiment, trajectory=log.with_columns({n: _spline(log.t, log[n], known[n]) for n in lacking}))
+
+
+def _spline(t: Array, column: Array, known: Mask) -> Array:
+    from scipy.interpolate import CubicSpline
+
+    at, steps = t[known], np.diff(t[known])
+    out = np.asarray(CubicSpline(at, column[known], extrapolate=False)(t))
+    before = np.clip(np.searchsorted(at, t, side="right") - 1, 0, steps.size - 1)
+    out[steps[before] > MAX_STEPS_BETWEEN * float(np.median(steps))] = np.nan
+    out[known] = column[known]
+    return out
 
 
 CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {
@@ -74,3 +106,5 @@ CHECKS: dict[str, Callable[[Experiment, StatedAxis], Iterator[LogFinding]]] = {
     "sampling": check_sampling,
 }
 """The checks by the names under which a user accepts what they find: a log that is right all the same."""
+SINGLE_SAMPLE_CHECKS = ("motion", "jumps", "sampling")
+"""Checks of single samples, to which nothing is to be added."""

@@ -40,7 +40,7 @@ BAD_LOGS = {
     "input without a run": (
         log_with(force=np.where(np.arange(100) % 20 < 5, 0.0, math.nan)),
         LogError,
-        "run 0: no 10 samples in a row hold force and an output; log them together",
+        "run 0: no part holds force and 10 samples of an output; log them together",
     ),
     "foreign channel": (
         log_with(pressure_a=np.ones(100)),

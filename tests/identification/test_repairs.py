@@ -98,6 +98,19 @@ def test_ten_samples_are_bridged_and_eleven_are_cut() -> None:
             assert bool(repair_log(DRIVE, log)[0].holes) is holes
 
 
+def test_a_logger_that_polls_one_sensor_after_the_other_is_read_without_a_cut() -> None:
+    """No row holds an input and an output; the position is logged where the force is not.
+
+    What lines between samples 4 ms apart leave out of a sine of 21 rad/s is (21 * .004)^2 / 12 of it, .06 %.
+    """
+    force, position = (WHOLE.trajectory[n].copy() for n in ("force", "position"))
+    force[1::2], position[::2] = math.nan, math.nan
+    log = replace(WHOLE, trajectory=WHOLE.trajectory.with_columns({"force": force, "position": position}))
+    fit = identify(DRIVE, log, FREE)
+    assert "999 samples lack an input, 1 in a row at most; they are bridged" in fit.status.message
+    assert fit.estimates["value"].to_dict() == pytest.approx(TRUTH, rel=2e-3)
+
+
 def test_what_is_left_between_two_holes_has_to_hold_some_samples() -> None:
     few = without(slice(800, 900), slice(900 + MIN_RUN - 1, 1000))
     assert repair_log(DRIVE, few)[0].holes == ((800, 1000),)

@@ -54,6 +54,23 @@ def test_every_check_has_a_log_that_trips_it_alone_and_shows_why() -> None:
         assert all(curve.shape == shown.t.shape for panel in shown.panels for curve in panel.curves.values()), name
 
 
+def thinned(log: Experiment, every: int) -> Experiment:
+    """Each channel in rows of its own, as loggers write that poll one sensor after the other."""
+    columns = {n: log.trajectory[n].copy() for n in log.trajectory}
+    for k, column in enumerate(columns.values()):
+        column[np.arange(T.size) % every != k % every] = np.nan
+    return replace(log, trajectory=log.trajectory.with_columns(columns))
+
+
+@pytest.mark.parametrize("every", [2, 5])
+@pytest.mark.parametrize("name", ["right", *(n for n in BAD_LOGS if n != "sampling")])
+def test_channels_in_rows_of_their_own_are_checked_like_others(name: str, every: int) -> None:
+    log = thinned(BAD_LOGS.get(name, swing()), every)
+    stated = PISTON._replace(inertia=2.65, constant=0.0) if name == "right" else STATED.get(name, PISTON)
+    found = examine(log, stated)
+    assert [f.check for f in found if f.check != "sampling"] == ([] if name == "right" else [name])
+
+
 RECORDER: dict[str, str | bool | dict[str, str | float]] = {
     "time": "t [ms]",
     "valve_voltage": "U_valve [V]",
