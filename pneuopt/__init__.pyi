@@ -126,6 +126,7 @@ from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
+from .studies.bootstrap import Bootstrap, bootstrap
 from .studies.cases import grid, read_cases
 from .studies.journal import Journal
 from .studies.neighbours import search_again, sweep_from_neighbours
@@ -148,6 +149,7 @@ __all__ = [
     "Assumption",
     "Asymmetric",
     "BandCentre",
+    "Bootstrap",
     "Certificate",
     "Checkup",
     "ChosenWidth",
@@ -260,6 +262,7 @@ __all__ = [
     "Waveform",
     "apply_scenario",
     "average_dither",
+    "bootstrap",
     "bumpless_transfer",
     "catalog",
     "certificate",

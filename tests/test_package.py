@@ -26,6 +26,8 @@ PUBLIC_NAMES = [
     "plot_logs",
     "average_dither",
     "BandCentre",
+    "Bootstrap",
+    "bootstrap",
     "bumpless_transfer",
     "catalog",
     "Certificate",

@@ -134,6 +134,14 @@ def identify_command(
             show_default="none",
         ),
     ] = inf,
+    draws: Annotated[
+        int,
+        typer.Option(
+            "--bootstrap",
+            metavar="N",
+            help="Simulate the logs N times with the estimates and true stick-slip, and identify them again.",
+        ),
+    ] = 0,
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
@@ -144,7 +152,9 @@ def identify_command(
         given = drive, _expand_patterns(logs), Outputs(output, json, plot), window, quiet, accept or ()
         require(budget > 0, f"--budget {budget:g}: give the CPU seconds that the search may take")
         require(budget == inf or not select, "--budget limits one fit: leave it out with --select")
-        raise typer.Exit(run_select(*given) if select else run_identify(*given, budget))
+        require(draws == 0 or draws >= 2, f"--bootstrap {draws}: a spread takes two sets of logs at least")
+        require(not (draws and select), "--bootstrap tries one model's fit: leave it out with --select")
+        raise typer.Exit(run_select(*given) if select else run_identify(*given, budget, draws))
 
 
 @app.command("tune")

@@ -22,6 +22,7 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.terminal import progress
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
+from pneuopt.files.rig import stick_slip_drive
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.report import report_agreement
@@ -48,6 +49,7 @@ from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
+from pneuopt.studies.bootstrap import bootstrap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,8 +66,9 @@ def run_identify(
     quiet: bool,
     accept: Sequence[str] = (),
     budget: float = math.inf,
+    draws: int = 0,
 ) -> int:
-    """Identify from logs; returns the exit status."""
+    """Identify from logs, and from simulated ones if draws are asked for; returns the exit status."""
     outputs.check(
         _input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS, *OTHER_CHECKS
     )
@@ -88,13 +91,19 @@ def run_identify(
         "widths": [asdict(width) for width in result.widths],
         "window": asdict(result.window) if result.window else None,
     }
+    report = result.summary()
+    if draws and result.status.converged:
+        sticking = stick_slip_drive(model)
+        with progress("simulating and identifying", quiet=quiet) as report_progress:
+            tried = bootstrap(system, experiments, result, rig=sticking, count=draws, progress=report_progress)
+        report, tables["bootstrap"] = report + tried.summary(), records(tried.table)
     return finish(
         outputs,
         {} if outputs.output is None else {outputs.output: partial(write_fit, source=drive, result=result)},
         tables | stats_and_provenance(result),
         result.status,
         figures=partial(_fit_figures, system, result, experiments, found.findings),
-        report=result.summary(),
+        report=report,
     )
 
 

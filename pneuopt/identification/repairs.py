@@ -100,7 +100,8 @@ def _find_holes(log: Trajectory, known: Mask, system: Fittable) -> list[tuple[in
     at = np.flatnonzero(known)
     far = np.flatnonzero(np.diff(log.t[at]) > (MAX_BRIDGE + 1.5) * float(np.median(np.diff(log.t))))
     begins, ends = [*at[:1], *at[far + 1]], [*(at[far] + 1), *(at[-1:] + 1)]
-    measured = np.isfinite(log.matrix(n for n in names(system.outputs) if n in log)).any(axis=1)
+    outputs = log.matrix(n for n in names(system.outputs) if n in log)
+    measured: Mask = np.asarray(np.isfinite(outputs).any(axis=1))
     runs = [(int(a), int(b)) for a, b in zip(begins, ends, strict=True) if measured[a:b].sum() >= MIN_RUN]
     edges = [0, *(edge for run in runs for edge in run), len(log)]
     inner = range(2, len(edges) - 2, 2)
