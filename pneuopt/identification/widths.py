@@ -24,9 +24,11 @@ from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.budget import BudgetSpentError
+from pneuopt.shooting.equations import weigh_gaps
 from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
+from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
 CHOSEN_WIDTH = "chosen by identify from the logs"
@@ -43,6 +45,9 @@ TRIAL_STAGE = Stage(3e-3, 6)
 CONFIRMING_STAGES = 4
 MAX_TRIAL_SAMPLES = 8000  # of all logs: more take time and tell no more, fewer may leave out where a log sticks
 EXCERPTS = 4  # stretches in which a longer log is tried: fewer may miss where it sticks, more are short
+# foreseen cost over that with the given width [1], below which no search with tight gaps confirms a narrower one:
+# higher trusts equations far from their optimum, lower takes minutes where a sample takes a hundred integration steps
+FORESEEN_RATIO = 0.5
 # fall of the squared residuals that counts, in variances (chi-square with one degree of freedom exceeds it once in a
 # thousand); lower follows chance, higher keeps wrong widths
 SIGNIFICANT_FALL = 10.8
@@ -58,10 +63,11 @@ MAX_WIDENED_MISFIT = 4.0
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A short search with some widths: its cost, and what it found."""
+    """A short search with some widths: its cost, that foreseen with the gaps that confirm a width, what it found."""
 
     widths: dict[str, float]
     cost: float
+    foreseen: float
     count: int
     parameters: ParameterSet
     too_stiff: bool
@@ -190,14 +196,22 @@ def _follow(race: "_Race", width: Width, best: _Trial, factor: float) -> tuple[_
 
 
 def _is_confirmed(race: "_Race", width: Width, given: _Trial, best: _Trial) -> bool:
-    """Whether tighter gaps, too, prefer a width to the given one."""
-    if best is given:
+    """Whether tighter gaps, too, prefer a width to the given one; they are searched only where that is not foreseen."""
+    if best is given or _is_foreseen(width, given, best):
         return True
     trial, other = (race.run(t.widths, race.confirming_stages) for t in (best, given))
     is_wider = trial.widths[width.name] > other.widths[width.name]
     if is_wider and other.cost < inf and trial.misfit > MAX_WIDENED_MISFIT:
         return False
     return _is_better(width, trial, other)
+
+
+def _is_foreseen(width: Width, given: _Trial, best: _Trial) -> bool:
+    """Whether the linearised equations say that tighter gaps, too, prefer a narrower width by far, or see more."""
+    if not (best.widths[width.name] < given.widths[width.name] and 0 < best.foreseen < inf):
+        return False
+    tight, other = (replace(t, cost=t.foreseen) for t in (best, given))
+    return tight.cost < FORESEEN_RATIO * other.cost or _shows_more(width, tight, other)
 
 
 def _is_better(width: Width, trial: _Trial, other: _Trial) -> bool:
@@ -242,7 +256,18 @@ class _Race:
             raise KeyboardInterrupt
         too_stiff = fit.stats["iterations"] == 0 and is_too_stiff(transcription, method)
         cost = inf if too_stiff or not fit.stats["cost"] < inf else fit.stats["cost"]
-        return _Trial(widths, cost, fit.count, fit.parameters, too_stiff)
+        foreseen = inf if too_stiff else _foresee(fit, self.confirming_stages[-1].gap)
+        return _Trial(widths, cost, foreseen, fit.count, fit.parameters, too_stiff)
+
+
+def _foresee(fit: Fit, gap: float) -> float:
+    """The cost to which other gaps would lead by the equations at the end of a search; infinite if there is none."""
+    if fit.optimum is None:
+        return inf
+    sigma = fit.optimum.gap_deviations * (gap / fit.stats["gap_deviation"])
+    equations = fit.optimum.equations
+    tight = weigh_gaps(equations.segments, equations.linearisation, sigma)
+    return 0.5 * max(0.0, tight.promised_squares(fit.optimum.keep))
 
 
 def is_too_stiff(transcription: Transcription, method: LeastSquares) -> bool:

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 import pneuopt as po
+from pneuopt.identification import widths
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.widths import CHOSEN_WIDTH, MAX_TRIAL_SAMPLES, advise_widths, choose_widths, excerpts
-from pneuopt.shooting.least_squares import LeastSquares, Stage
+from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.transcription import Transcription
 
 FREE = ("friction.coulomb", "friction.static", "friction.viscous", "friction.stribeck_velocity")
 WIDTH = "friction.smoothing"
@@ -72,6 +75,24 @@ def test_a_width_is_stated_by_its_source_even_at_the_usual_value() -> None:
     assert len(widths) == 1
     again = choose_widths(problem(system, log, chosen.parameters))[1]
     assert (again[0].value, again[0].given) == (widths[0].value, widths[0].value)
+
+
+def test_a_narrower_width_that_is_foreseen_is_not_searched_with_tight_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The linearised equations of a trial say by themselves that tighter gaps prefer its width by far."""
+    system, log = po.ForceDrive(po.Stribeck()).system(), sticking()
+    posed = problem(system, log, system.parameters.with_values({"load.mass": 5.0}).freed(*FREE))
+    searched = list[int]()
+
+    def record(transcription: Transcription, method: LeastSquares) -> Fit:
+        searched.append(len(method.stages))
+        return solve_least_squares(transcription, method)
+
+    monkeypatch.setattr(widths, "solve_least_squares", record)
+    chosen = choose_widths(posed)[1]
+    assert set(searched) == {2}  # a trial's stage, and an empty one
+    monkeypatch.setattr(widths, "_is_foreseen", lambda *_: False)
+    assert [w.value for w in choose_widths(posed)[1]] == [w.value for w in chosen]
+    assert searched.count(1 + widths.CONFIRMING_STAGES) == 2
 
 
 @pytest.mark.parametrize(("width", "chosen"), [(1e-3, 1e-3), (1e-2, 1e-2)])
