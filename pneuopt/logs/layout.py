@@ -145,8 +145,10 @@ def _is_blank(row: Sequence[str]) -> bool:
 
 
 def _is_no_row(row: Sequence[str]) -> bool:
-    """An empty line or a comment; a row of empty cells is one of missing samples."""
-    return row in ([], [""]) or bool(_COMMENT.match(row[0]))
+    """An empty line or a comment; a row of empty cells is one of missing samples, and so are numbers after a mark."""
+    if row in ([], [""]):
+        return True
+    return bool(_COMMENT.match(row[0])) and not (_COMMENT.fullmatch(row[0]) and any(map(_is_value, row[1:])))
 
 
 def _find_names(rows: Sequence[Sequence[str]], first: int, width: int, downwards: bool) -> int | None:

@@ -106,12 +106,12 @@ class Outcome:
 def try_circumstances(base: Path, word: str = "") -> Iterator[Outcome]:
     """Each circumstance whose name holds a word, in a folder of its own."""
     cache = base / "cache"
-    prepared = Place(_write_inputs(base / "prepared"), cache).run()
+    prepared = Place(write_inputs(base / "prepared"), cache).run()
     assert prepared.returncode == 0, prepared.stderr
     for k, (name, (prepare, status, kept, said)) in enumerate(CIRCUMSTANCES.items()):
         rooted = getattr(prepare, "__name__", "").startswith("_root")
         if word in name and (os.geteuid() == 0 or not rooted):
-            folder = _write_inputs(base / f"run{k}")
+            folder = write_inputs(base / f"run{k}")
             (folder / "out.toml").write_text(EARLIER, encoding="utf-8")
             shutil.copytree(cache, base / f"cache{k}")
             yield _try(name, prepare, Place(folder, base / f"cache{k}"), (status, kept, said))
@@ -147,7 +147,8 @@ def _describe(path: Path) -> str:
         return "HALF A FILE"
 
 
-def _write_inputs(folder: Path) -> Path:
+def write_inputs(folder: Path) -> Path:
+    """Make a folder with the small axis' files; returns it."""
     folder.mkdir()
     texts = {"drive.toml": DRIVE} | {f"{name}.csv": text for name, text in generate_axis_logs().items()}
     for name, text in texts.items():

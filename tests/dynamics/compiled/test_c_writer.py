@@ -119,6 +119,7 @@ def test_an_operation_without_c_is_left_to_the_vm(
 ) -> None:
     expected = computed(ca.sin, EDGES[:4])
     forget()
+    caplog.clear()  # where this machine has no compiler, that was said
     monkeypatch.delitem(emission.C_FUNCTIONS, ca.OP_SIN)
     assert_allclose(computed(ca.sin, EDGES[:4]), expected, rtol=1e-15)
     messages: list[Any] = [r.getMessage() for r in caplog.records]
