@@ -388,5 +388,5 @@ def test_a_mark_in_the_first_sample_s_first_cell_makes_it_no_comment(tmp_path: P
     path.write_text("time [s],position [mm]\n#,50.0\n0.02,61.8\n0.04,72.5\n", encoding="utf-8")
     with pytest.raises(LogError, match="row 2, column 'time"):
         read_log(path)
-    path.write_text("time [s],position [mm]\n# a note, of 1 word\n#\n0.02,61.8\n0.04,72.5\n", encoding="utf-8")
+    path.write_text("time [s],position [mm]\n# a note of 1 word\n#\n0.02,61.8\n0.04,72.5\n", encoding="utf-8")
     assert len(read_log(path).trajectory) == 2
