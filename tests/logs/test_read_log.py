@@ -385,8 +385,9 @@ def test_gauge_sensors_count_from_the_drives_ambient_pressure(tmp_path: Path) ->
 def test_a_mark_in_the_first_sample_s_first_cell_makes_it_no_comment(tmp_path: Path) -> None:
     """No row of samples is skipped silently, though its time cannot be read."""
     path = tmp_path / "run.csv"
-    path.write_text("time [s],position [mm]\n#,50.0\n0.02,61.8\n0.04,72.5\n", encoding="utf-8")
+    names, rows = "time [s],position [mm]\n", "".join(f"{0.02 * k:.2f},{50 + k}\n" for k in range(1, 13))
+    path.write_text(f"{names}#,50.0\n{rows}", encoding="utf-8")
     with pytest.raises(LogError, match="row 2, column 'time"):
         read_log(path)
-    path.write_text("time [s],position [mm]\n# a note of 1 word\n#\n0.02,61.8\n0.04,72.5\n", encoding="utf-8")
-    assert len(read_log(path).trajectory) == 2
+    path.write_text(f"{names}# a note of 1 word\n#\n{rows}", encoding="utf-8")
+    assert len(read_log(path).trajectory) == 12
