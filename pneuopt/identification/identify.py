@@ -382,7 +382,7 @@ def _estimates(
         deviation, dof = math.nan if at_bound[i] else float(stderr[i]), float(misfit.dof[i])
         low, high = confidence_interval(p.value, deviation, log=p.log, dof=dof)
         ends = [_move(p, change) for change in misfit.ranges[i].tolist()]
-        mark = misfit.mark(is_optimum=status.converged and math.isfinite(deviation) and not leaning[i])
+        mark = misfit.mark(i, is_optimum=status.converged and math.isfinite(deviation) and not leaning[i])
         shown = [p.value, low, high, p.unit, mark]
         rows[name] = [*shown, deviation, dof, *ends, p.lower, p.upper, bool(at_bound[i]), p.source]
     return WideFrame.from_dict(rows, orient="index", columns=ESTIMATE_COLUMNS)

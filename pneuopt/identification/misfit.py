@@ -27,7 +27,7 @@ from pneuopt.identification.repairs import window_runs
 from pneuopt.identification.result import Mark, join_names
 from pneuopt.identification.statistics import agreement
 from pneuopt.logs.experiments import Experiment
-from pneuopt.quantities.arrays import Array, Indices
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
@@ -80,8 +80,10 @@ class Misfit:
         Whether the residuals are so large that there is no interval.
     signals : tuple of str
         The simulated signals on which the residuals depend, the clearest first.
-    is_too_wide : bool
-        Whether narrower widths of the model explain the logs better.
+    rejected_widths : tuple of str
+        The widths of the model that the logs reject.
+    biased : ndarray of bool, shape (k,), or None
+        The estimates that such a width biases; None without one.
     is_slow, lone
         As of a `RobustCovariance`; `lone` by name.
     """
@@ -97,17 +99,22 @@ class Misfit:
     signals: tuple[str, ...] = ()
     is_slow: bool = False
     lone: tuple[str, ...] = ()
-    is_too_wide: bool = False
+    rejected_widths: tuple[str, ...] = ()
+    biased: Mask | None = None
 
     @property
     def is_suspect(self) -> bool:
-        """Whether parts of the logs disagree, and no signal is behind it: a width of the model may be."""
-        return self.widened and not self.signals
+        """Whether parts of the logs disagree, or residuals exceed the noise: a width of the model may be behind it.
 
-    def mark(self, *, is_optimum: bool) -> Mark:
+        A signal on which residuals depend already marks all estimates.
+        """
+        return (self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO) and not self.signals
+
+    def mark(self, index: int, *, is_optimum: bool) -> Mark:
         """The mark of an estimate, which may be at an optimum or at a bound."""
         is_missed = self.noisy_states or self.level > MODEL_ERROR_LEVEL
-        if self.signals or self.is_too_wide or is_missed or not is_optimum:
+        is_biased = self.biased is not None and bool(self.biased[index])
+        if self.signals or is_biased or is_missed or not is_optimum:
             return Mark.BIAS_POSSIBLE
         return Mark.WIDENED if self.widened or self.level**2 > MAX_CHI_SQUARE_RATIO else Mark.EXACT
 
@@ -126,8 +133,9 @@ class Misfit:
         found = []
         if self.signals:
             found.append(f"residuals depend on {join_names(self.signals)}: model error, estimates may be biased")
-        if self.is_too_wide:
-            found.append("narrower widths explain the logs better: estimates may be biased by the widths in use")
+        if self.rejected_widths:
+            widths = f"{join_names(self.rejected_widths)} that the logs reject"
+            found.append(f"the model has a value of {widths}: the estimates that it moves may be biased")
         if self.is_slow:
             found.append("the misfit is as slow as the logs, or different from log to log: log more or longer runs")
         if self.lone:

@@ -72,8 +72,8 @@ def test_white_residuals_are_exact() -> None:
 
 def test_the_mark_of_an_estimate_is_the_gravest_that_anything_gives() -> None:
     whole = Misfit(np.eye(1), np.ones(1), 1.0, np.zeros((1, 2)), 1.0, noisy_states=False, is_excessive=False)
-    assert whole.mark(is_optimum=True) is Mark.EXACT
-    assert whole.mark(is_optimum=False) is Mark.BIAS_POSSIBLE  # at a bound, or a fit that did not converge
+    assert whole.mark(0, is_optimum=True) is Mark.EXACT
+    assert whole.mark(0, is_optimum=False) is Mark.BIAS_POSSIBLE  # at a bound, or a fit that did not converge
     for changed, mark in (
         ({"widened": True}, Mark.WIDENED),
         ({"level": 1.3}, Mark.WIDENED),
@@ -82,7 +82,7 @@ def test_the_mark_of_an_estimate_is_the_gravest_that_anything_gives() -> None:
         ({"signals": ("speed",), "widened": True}, Mark.BIAS_POSSIBLE),
     ):
         given: Any = changed
-        assert replace(whole, **given).mark(is_optimum=True) is mark, changed
+        assert replace(whole, **given).mark(0, is_optimum=True) is mark, changed
 
 
 def test_a_slow_residual_below_the_noise_widens_the_intervals() -> None:
@@ -179,11 +179,11 @@ def test_a_mark_that_is_none_is_refused(tmp_path: Path) -> None:
         read_marks(path)
 
 
-def test_a_width_that_the_logs_refute_marks_all_estimates() -> None:
-    plain = Misfit(None, np.full(1, 9.0), 1.0, np.zeros((1, 2)), 1.0, noisy_states=False, is_excessive=False)
-    wide = replace(plain, widened=True, is_too_wide=True)
-    assert (plain.mark(is_optimum=True), wide.mark(is_optimum=True)) == (Mark.EXACT, Mark.BIAS_POSSIBLE)
-    assert "narrower widths explain the logs better" in wide.sentences[0]
+def test_a_width_that_the_logs_reject_marks_what_it_moves() -> None:
+    plain = Misfit(None, np.full(2, 9.0), 1.0, np.zeros((2, 2)), 1.0, noisy_states=False, is_excessive=False)
+    wide = replace(plain, widened=True, rejected_widths=("friction.smoothing",), biased=np.array([True, False]))
+    assert [wide.mark(i, is_optimum=True) for i in range(2)] == [Mark.BIAS_POSSIBLE, Mark.WIDENED]
+    assert "friction.smoothing that the logs reject" in wide.sentences[0]
     assert wide.is_suspect
     assert not replace(wide, signals=("speed",)).is_suspect
     assert not plain.is_suspect

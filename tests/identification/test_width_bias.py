@@ -1,77 +1,105 @@
-"""Widths over which a smooth model turns friction round, and which the logs refute."""
+"""Widths over which a smooth model turns friction round, and which the logs reject."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pneuopt.dynamics.simulate import simulate
 from pneuopt.identification import width_bias
 from pneuopt.identification.checks import check_logs
+from pneuopt.identification.misfit import Misfit, diagnose_misfit
 from pneuopt.identification.problem import EstimationProblem
-from pneuopt.identification.width_bias import prefers_narrower_widths
+from pneuopt.identification.repairs import input_behaviour
+from pneuopt.identification.width_bias import RejectedWidth, score_widths, suspect_widths
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Coulomb, Viscous
+from pneuopt.models.friction import Coulomb, FrictionModel, Viscous
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.shooting.solution import Fit
-from pneuopt.shooting.transcription import Transcription
+
+WIDTH = "friction.smoothing"
+FREE = ("friction.coulomb", "friction.viscous")
+NOISE = 2e-6  # of the position [m]
 
 
-def fitted(friction: Coulomb | Viscous) -> tuple[EstimationProblem, Fit]:
-    system, t = ForceDrive(friction).system(), np.arange(400) * 1e-3
-    position = 0.01 * np.sin(2 * np.pi * 4 * t)
-    log = Experiment(Trajectory(t, {"force": 60 * np.cos(2 * np.pi * 4 * t), "position": position}), name="run")
-    given = system.parameters.freed("friction.viscous")
+def fitted(friction: FrictionModel, width: float = 1.0) -> tuple[EstimationProblem, Fit]:
+    """Friction found in a pushed drive's log by a model whose width is so many times the drive's."""
+    system, t = ForceDrive(friction).system(), np.arange(1000) * 1e-3
+    truth = {n: v for n, v in {"friction.coulomb": 30.0, "friction.viscous": 60.0}.items() if n in system.parameters}
+    own = system.parameters.with_values(truth)
+    force = Trajectory(t, {"force": 60 * np.sin(2 * np.pi * 4 * t)})
+    behaviour = input_behaviour(system, Experiment(force.with_columns({"position": t}), {}, name="run"))
+    run = simulate(system, force, own, initial={"position": 0.0, "speed": 0.0}, intersample=behaviour)
+    position = run["position"] + NOISE * np.random.default_rng(3).standard_normal(1000)
+    log = Experiment(force.with_columns({"position": position}), {"position": NOISE}, name="run")
+    given = own.freed(*truth)
+    if WIDTH in given:
+        given = given.with_values({WIDTH: width * own.value(WIDTH)})
     problem = EstimationProblem(system, tuple(check_logs(system, [log], given)), given, LeastSquares())
-    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), LeastSquares())
-    return problem, replace(fit, jumps=None, stats={**fit.stats, "cost": 1000.0})
+    return problem, solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
 
 
-@pytest.mark.parametrize(("fall", "variance", "told"), [(5.5, 1.0, True), (5.3, 1.0, False), (5.5, 1.2, False)])
-def test_a_fall_beyond_chance_with_half_the_width_is_told(
-    fall: float, variance: float, told: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Chi-square with one degree of freedom exceeds 10.8 once in a thousand; twice the cost counts."""
+def test_the_width_that_made_the_log_is_not_rejected() -> None:
+    (found,) = score_widths(*fitted(Coulomb()))
+    assert found.name == WIDTH
+    assert found.fall < 10.8
+
+
+def test_the_fall_and_the_shifts_are_those_of_a_fit_that_estimates_the_width() -> None:
+    problem, fit = fitted(Coulomb(), 1.1)
+    (found,) = score_widths(problem, fit)
+    freed = replace(problem, parameters=problem.parameters.freed(WIDTH))
+    refit = solve_least_squares(freed.transcription(freed.start_from(fit)), freed.method)
+    assert refit.parameters.value(WIDTH) == pytest.approx(problem.system.parameters.value(WIDTH), rel=0.02)
+    assert found.fall > 10.8
+    assert found.fall == pytest.approx(2 * (fit.stats["cost"] - refit.stats["cost"]), rel=0.2)
+    shifts = [refit.parameters.value(n) - fit.parameters.value(n) for n in FREE]
+    assert dict(zip(FREE, found.shifts, strict=True)) == pytest.approx(dict(zip(FREE, shifts, strict=True)), rel=0.2)
+
+
+def test_noise_of_the_states_has_other_weights_and_a_model_without_a_width_none_to_reject() -> None:
     problem, fit = fitted(Coulomb())
-    used: list[float] = []
-
-    def narrower(transcription: Transcription, _: LeastSquares) -> Fit:
-        used.append(transcription.parameters.value("friction.smoothing"))
-        return replace(fit, stats={**fit.stats, "cost": 1000.0 - fall})
-
-    monkeypatch.setattr(width_bias, "solve_least_squares", narrower)
-    assert prefers_narrower_widths(problem, fit, variance) is told
-    assert used == [0.5 * problem.parameters.value("friction.smoothing")]
+    assert not list(score_widths(problem, replace(fit, jumps=np.zeros((1, 2)))))
+    assert not list(score_widths(*fitted(Viscous())))
+    free = replace(problem, parameters=problem.parameters.freed(WIDTH))
+    assert not list(score_widths(free, solve_least_squares(free.transcription(free.start_from(fit)), free.method)))
 
 
-def test_noise_of_the_states_has_other_weights_and_a_model_without_a_width_none_to_narrow(
+@pytest.mark.parametrize(
+    ("fall", "shift", "inflation", "marked"),
+    [
+        (10.9, 0.6, 1.0, True),
+        (10.7, 0.6, 1.0, False),  # chi-square with one degree of freedom exceeds 10.8 once in a thousand
+        (10.9, 0.4, 1.0, False),  # no harm
+        (10.9, 0.6, 1.1, False),  # what scatters more between parts of the logs is told apart with more
+        (-1.0, 0.6, 1.0, False),
+    ],
+)
+def test_a_rejected_width_marks_the_estimates_that_it_moves(
+    fall: float, shift: float, inflation: float, marked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, fit = fitted(Coulomb())
+    plain = diagnose_misfit(problem, fit, 1.0, 900.0)
+    assert plain.covariance is not None
+    spread = np.sqrt(np.diag(plain.covariance))
+    suspect = replace(plain, widened=True, signals=(), inflation=inflation)
+    moved = RejectedWidth(WIDTH, fall, np.array([shift, 0.1]) * spread)
+    monkeypatch.setattr(width_bias, "score_widths", lambda *_: iter([moved]))
+    found = suspect_widths(suspect, problem, fit, 1.0)
+    assert (found.rejected_widths == (WIDTH,)) is marked
+    assert (None if found.biased is None else found.biased.tolist()) == ([True, False] if marked else None)
+    told = any(WIDTH in sentence for sentence in found.sentences)
+    assert told is marked
+
+
+def test_widths_are_asked_for_where_parts_of_the_logs_disagree_and_no_signal_is_behind_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem, fit = fitted(Coulomb())
-    jumping = replace(fit, jumps=np.zeros((1, 2)), stats={**fit.stats, "cost": 0.0})
-    monkeypatch.setattr(width_bias, "solve_least_squares", lambda *_: jumping)
-    assert not prefers_narrower_widths(problem, fit, 1.0)
-    assert not prefers_narrower_widths(problem, jumping, 1.0)
-    assert not prefers_narrower_widths(*fitted(Viscous()), 1.0)
-
-
-def test_a_width_whose_half_is_too_stiff_is_narrowed_less(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a rig that sticks, at .1 mm/s: half of it was refused unsearched, and a bias of 5.6 deviations not marked."""
-    problem, fit = fitted(Coulomb())
-    own, used = problem.parameters.value("friction.smoothing"), list[float]()
-
-    def narrower(transcription: Transcription, _: LeastSquares) -> Fit:
-        used.append(transcription.parameters.value("friction.smoothing"))
-        return replace(fit, stats={**fit.stats, "cost": 900.0})
-
-    def stiff_below(limit: float) -> None:
-        stiff = lambda transcription, _: transcription.parameters.value("friction.smoothing") < limit * own  # noqa: E731
-        monkeypatch.setattr(width_bias, "is_too_stiff", stiff)
-
-    monkeypatch.setattr(width_bias, "solve_least_squares", narrower)
-    stiff_below(0.6)
-    assert prefers_narrower_widths(problem, fit, 1.0)
-    assert used == [0.75 * own]
-    stiff_below(0.8)
-    assert not prefers_narrower_widths(problem, fit, 1.0)
+    agreeing: Misfit = replace(diagnose_misfit(problem, fit, 1.0, 900.0), widened=False, signals=())
+    monkeypatch.setattr(width_bias, "score_widths", lambda *_: pytest.fail("asked"))
+    assert suspect_widths(agreeing, problem, fit, 1.0) is agreeing
+    signalled = replace(agreeing, widened=True, signals=("speed",))
+    assert suspect_widths(signalled, problem, fit, 1.0) is signalled
