@@ -144,6 +144,10 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple
     found: dict[str, Profile] = {}
     rows = result.estimates
     known = rows.index[np.isfinite(rows["stderr"])]
+    if (
+        result.stats["gap_deviation"] > problem.method.stages[-1].gap
+    ):  # noise of the states: the bias is not in a profile
+        return found, []
     unknowns = problem.unknowns()
     waiting = [n for n in known if unknowns[n].log and rows["stderr"][n] > MAX_LINEAR_DEVIATION * rows["value"][n]]
     try:

@@ -121,13 +121,19 @@ def choose_widths(problem: EstimationProblem) -> tuple[EstimationProblem, tuple[
 
 
 def advise_widths(problem: EstimationProblem) -> tuple[str, ...]:
-    """Other values for the widths that the user has stated, each tried in a short search; empty if none is better."""
+    """Other values for the widths that the user has stated, each tried in a short search; empty if none is better.
+
+    So it is, too, where the CPU budget ends before that is known.
+    """
     given = problem.parameters
     known = [w.name for w in _present(problem) if given[w.name].source != COMMON_WIDTH]
     stated = {n for n in known if not given[n].free and not _is_open(problem, n)}
     if not stated:
         return ()
-    found = _race_widths(problem, stated)[0].widths
+    try:
+        found = _race_widths(problem, stated)[0].widths
+    except BudgetSpentError:
+        return ()
     reason = "a short search then follows the logs better; left out, it is chosen by the logs"
     return tuple(
         f"try {n} = {v:.3g} {given[n].unit} in place of {given.value(n):g} {given[n].unit}: {reason}"

@@ -6,9 +6,11 @@ import pytest
 
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System
-from pneuopt.identification import profiles
+from pneuopt.identification import profiles, review
+from pneuopt.identification.checks import check_logs
 from pneuopt.identification.identify import identify
-from pneuopt.identification.profiles import profile
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.identification.profiles import Profile, profile
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive, MotionDrive
@@ -131,3 +133,23 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="the result is of map, not of these logs"):
         profile(system, [log, log], result, "friction.coulomb")
     assert isinstance(result.parameters, ParameterSet)
+
+
+def test_with_noise_of_the_states_no_interval_is_profiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error of a wrong model is in no profile of it; six refits of a log with hysteresis took 37 CPU s."""
+    log = moved(42.0, 0.5)
+    system, result = fitted(Stribeck(), log, *CURVE)
+    logs = tuple(check_logs(system, [log], result.parameters))
+    problem = EstimationProblem(system, logs, system.parameters | result.parameters, LeastSquares())
+    doubtful = replace(result, estimates=result.estimates.assign(stderr=result.estimates["value"]))
+    traced = list[str]()
+
+    def trace(_: EstimationProblem, found: IdentificationResult, name: str) -> Profile:
+        traced.append(name)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(review, "trace_profile", trace)
+    assert review._profiles(problem, doubtful)[1] == traced == ["friction.stribeck_velocity"]
+    noisy = replace(doubtful, stats={**doubtful.stats, "gap_deviation": 1e-3})
+    assert review._profiles(problem, noisy) == ({}, [])
+    assert len(traced) == 1

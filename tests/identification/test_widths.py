@@ -1,5 +1,7 @@
 """The widths over which a model rounds its kinks are chosen by the logs, unless the user states them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from pneuopt.identification import widths
 from pneuopt.identification.checks import check_logs
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.widths import CHOSEN_WIDTH, MAX_TRIAL_SAMPLES, advise_widths, choose_widths, excerpts
+from pneuopt.shooting.budget import CpuBudget
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
@@ -64,6 +67,14 @@ def test_a_stated_width_stays_and_a_failure_names_a_better_one() -> None:
     assert float(advice.split()[3]) < 5e-4
     better = given.with_values({WIDTH: float(advice.split()[3])})
     assert advise_widths(problem(system, log, better)) == ()
+
+
+def test_a_budget_that_ends_while_advice_is_sought_leaves_none() -> None:
+    """It ended the command in a traceback, in place of a result that had not converged."""
+    system, log = po.ForceDrive(po.Stribeck()).system(), sliding(1e-3)
+    given = system.parameters.with_values({WIDTH: 2e-3}).freed(*FREE[:3])
+    spent = replace(problem(system, log, given), method=po.LeastSquares(budget=CpuBudget(1e-9)))
+    assert advise_widths(spent) == ()
 
 
 def test_a_width_is_stated_by_its_source_even_at_the_usual_value() -> None:
