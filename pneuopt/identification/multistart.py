@@ -18,9 +18,9 @@ from pneuopt.identification.identifiability import rejects_held_values
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
 from pneuopt.shooting.least_squares import solve_least_squares
-from pneuopt.shooting.search import ABANDONED_START
+from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
 from pneuopt.shooting.solution import Fit
 
 GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
@@ -69,7 +69,10 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
         for start in starts_by_cost(problem, confirms, races):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
-            held, fit = fit_holding_unidentifiable(problem, start, limit)
+            known = () if loss is not None or estimate_noise else _joinable_costs(fits)
+            held, fit = fit_holding_unidentifiable(problem, start, limit, known)
+            if fit.status is JOINED_SEARCH:
+                break
             held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
             if _explains_to_noise(held, fit) and not held.held:
                 return held, fit, start.label
@@ -159,7 +162,10 @@ def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> 
 
 
 def fit_holding_unidentifiable(
-    problem: EstimationProblem, start: Start, max_first_misfit: float = math.inf
+    problem: EstimationProblem,
+    start: Start,
+    max_first_misfit: float = math.inf,
+    known_costs: tuple[tuple[float, float], ...] = (),
 ) -> tuple[EstimationProblem, Fit]:
     """Fit from one start; while the data do not determine a parameter, hold that one and fit again.
 
@@ -167,7 +173,7 @@ def fit_holding_unidentifiable(
     ----------
     problem : EstimationProblem
     start : Start
-    max_first_misfit : float
+    max_first_misfit, known_costs
         As of `LeastSquares`, for the first fit.
 
     Returns
@@ -177,7 +183,7 @@ def fit_holding_unidentifiable(
     fit : Fit
         The first one, where holding does not converge, or would leave no parameter to estimate.
     """
-    method = replace(problem.method, max_first_misfit=max_first_misfit)
+    method = replace(problem.method, max_first_misfit=max_first_misfit, known_costs=known_costs)
     first = solve_least_squares(problem.transcription(start), method)
     if not first.unidentifiable or first.status.code is Code.INTERRUPTED:
         return problem, first
@@ -255,11 +261,24 @@ def _is_at_noise(problem: EstimationProblem, fit: Fit) -> bool:
 def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
     """Whether the next start is tried as it is, after fits of which the first is the best.
 
-    So is one start where the best fit converged; and each where its gaps stand for noise of the states, for settling
-    with wide gaps says little there.
+    So is one start where the best fit ended at an optimum; and each where its gaps stand for noise of the states, for
+    settling with wide gaps says little there.
     """
     best = fits[0][1]
-    return best.status.converged and (len(fits) == 1 or best.jumps is not None)
+    return _is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
+
+
+def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
+    """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
+    return fits[0][1].stage_costs if fits and _is_optimum(fits[0][1]) and not fits[0][0].held else ()
+
+
+def _is_optimum(fit: Fit) -> bool:
+    """Whether a search ended at an optimum, be it of a model so wrong that the gaps absorb its misfit."""
+    is_settled = not (fit.unsettled or fit.unidentifiable)
+    is_missed = fit.status.code is Code.NOT_CONVERGED and is_settled and fit.stats["gap_share"] > MAX_GAP_SHARE
+    is_missed &= fit.status is not ABANDONED_START
+    return fit.status.converged or is_missed
 
 
 def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
@@ -282,11 +301,17 @@ def _are_enough(fits: Sequence[Candidate]) -> bool:
     if len(fits) < 2:
         return False
     (held, best, _), (_, second, _) = fits[:2]
-    return _are_alike(best, second) or _explains_to_noise(held, best)
+    # with noise of the states every estimate may be biased, and another optimum of it would not change that
+    is_wrong = best.jumps is not None and best.status.converged and _is_optimum(second)
+    return is_wrong or _are_alike(best, second) or _explains_to_noise(held, best)
 
 
 def _are_alike(best: Fit, second: Fit) -> bool:
-    """Whether both converged, at the same cost."""
-    converged = best.status.converged and second.status.converged
+    """Whether both ended at an optimum, at the same cost."""
     same = (best.jumps is None) == (second.jumps is None)
-    return converged and same and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
+    return (
+        _is_optimum(best)
+        and _is_optimum(second)
+        and same
+        and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
+    )

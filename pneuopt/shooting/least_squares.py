@@ -59,6 +59,9 @@ class LeastSquares:
     max_first_misfit : float
         Squared residuals a sample after the first stage, in noise variances, beyond which the search ends there, for a
         caller who has other starts to try.
+    known_costs : tuple of (float, float)
+        Gaps and costs at which a search from another start has ended its stages, none of which explained the logs to
+        their noise; a search that comes to the same ends there (`JOINED_SEARCH`).
     """
 
     stages: tuple[Stage, ...] = (
@@ -76,6 +79,7 @@ class LeastSquares:
     progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
     budget: CpuBudget | None = field(default=None, repr=False, compare=False)
     max_first_misfit: float = math.inf
+    known_costs: tuple[tuple[float, float], ...] = field(default=(), repr=False, compare=False)
 
 
 def solve_least_squares(transcription: Transcription, method: LeastSquares | None = None) -> Fit:

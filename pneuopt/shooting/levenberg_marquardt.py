@@ -8,6 +8,7 @@ import numpy as np
 
 from pneuopt.quantities.arrays import Array
 from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
+from pneuopt.shooting.budget import CpuBudget
 from pneuopt.shooting.equations import NormalEquations, missed_curvature, normal_equations, second_order_correction
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.segments import IntegrationCorrection, Segments
@@ -19,6 +20,8 @@ MIN_DAMPING = 1e-15
 # actual over promised decrease [1] below which a step is corrected: higher costs evaluations, lower crawls in valleys
 MIN_GAIN_RATIO = 0.5
 MAX_TRIES = 10  # dampings tried for a step: fewer give up where a step exists, more try what no longer moves anything
+# undamped steps over a kink: fewer turn back before the cost has fallen again, more follow steps that diverge
+MAX_LEAP_STEPS = 10
 MAX_LOG_CHANGE = (
     2.0  # e-folds of a log parameter in a step: longer ones leave the model's range, shorter ones take more
 )
@@ -89,7 +92,7 @@ class Descent:
     def __init__(
         self, objective: Objective, damping: float, is_negligible: IsNegligible, *, damps_nodes: bool = False
     ) -> None:
-        self._damps_nodes = damps_nodes
+        self._damps_nodes, self.promised = damps_nodes, math.inf
         self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
         self.node_damping = np.zeros(objective.segments.count)
 
@@ -102,6 +105,8 @@ class Descent:
         for k in range(MAX_TRIES):
             reduced = current.equations.arrow.eliminate(self.damping, self.node_damping)
             step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
+            if k == 0 and step:
+                self.promised = 0.5 * current.equations.arrow.descent_rate(step)
             if reduced and step and np.max(np.abs(step.parameters[scaling.log]), initial=0.0) <= MAX_LOG_CHANGE:
                 is_hardly_damped = self.damping <= INITIAL_DAMPING and (k == 0 or (k == 1 and self.node_damping.any()))
                 if is_hardly_damped and self._is_negligible(current, reduced, step):
@@ -117,6 +122,31 @@ class Descent:
                     continue
             self.damping, raise_by = max(self.damping, MIN_DAMPING) * raise_by, 3 * raise_by
         return None
+
+    def leap(self, current: Iterate, budget: CpuBudget | None = None) -> tuple[Iterate, int]:
+        """Take undamped steps, which may raise the cost for a while: the best iterate among them, and their number.
+
+        Over a kink of the model, at which a descent creeps, this is the way (the watchdog technique: Chamberlain et
+        al., Mathematical Programming Study 16, 1982).
+        """
+        trial: Iterate | None = current
+        best, taken = current, 0
+        while trial is not None and math.isfinite(trial.cost) and taken < MAX_LEAP_STEPS:
+            if budget is not None:
+                budget.check()
+            best, trial = min(best, trial, key=lambda each: each.cost), self._step_undamped(trial)
+            taken += trial is not None
+        return best if trial is None else min(best, trial, key=lambda each: each.cost), taken
+
+    def _step_undamped(self, current: Iterate) -> Iterate | None:
+        """The iterate after an undamped step, whatever its cost; None without one, or where it would be negligible."""
+        reduced, scaling = current.equations.arrow.eliminate(0.0), self.objective.scaling
+        step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
+        if not reduced or not step or self._is_negligible(current, reduced, step):
+            return None
+        z = scaling.project_to_bounds(current.z + step.parameters)
+        shift = reduced.back_substitute(z - current.z)
+        return self.objective.evaluate(current.nodes + shift * self.objective.segments.nominal, z)
 
     def _trial(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> Iterate:
         """The iterate after a step; where the cost falls too little, with its gaps corrected to second order."""

@@ -9,7 +9,7 @@ show that.
 import math
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,8 +28,16 @@ from pneuopt.shooting.equations import correct_residuals, weigh_gaps
 from pneuopt.shooting.integration_steps import IntegrationSteps
 from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
+from pneuopt.shooting.search_end import (
+    ABANDONED_START,
+    GAPS_ABSORB_MISFIT,
+    JOINED_SEARCH,
+    Snapshot,
+    StageEnd,
+    end_search,
+)
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, start_nodes
-from pneuopt.shooting.solution import Fit, Optimum
+from pneuopt.shooting.solution import Fit
 
 if TYPE_CHECKING:
     from pneuopt.shooting.least_squares import LeastSquares, Stage
@@ -47,8 +55,6 @@ FINE_TOLERANCE, COARSE_TOLERANCE = 0.01, 0.5
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
-GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
-ABANDONED_START = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
 # error of the parameters [standard deviations] by derivatives from before the integration was refined: higher shifts
 # estimates, lower costs a run with sensitivities
 MAX_GRADIENT_ERROR = 0.01
@@ -61,16 +67,18 @@ JUMP_COST_TOLERANCE = 1e-2
 # squares that the last stage promises by the linearised equations, in noise variances [1], above which it is not tried
 # right after the first: lower passes over it for a start that is only not yet near, higher iterates for wrong models
 MAX_JUMP_MISFIT = 10.0
-
-
-class _Snapshot(NamedTuple):
-    """Where a search is, and by which integration."""
-
-    stage: "Stage"
-    current: Iterate
-    correction: IntegrationCorrection | None
-    substeps: int
-    output_substeps: int
+# stages at whose gaps noise of the states is tried [1]: fewer miss those at which a search settles, more of them hardly
+# hold the states together
+MAX_LOOSENED = 2
+# creeping steps in a row after which a search with noise of the states leaps: fewer leave a way that leads on, more
+# take long
+MAX_CREEPING_STEPS = 3
+# actual over promised decrease [1] below which such a search creeps: higher leaves a fit that converges, lower follows
+# a kink of the model for hundreds of steps (a log with encoder steps: 50 of .13 each, of 35 promised)
+CREEPING_SHARE = 0.3
+# difference of the costs [1] of two searches that have joined: lower follows one optimum twice, higher takes two for
+# one
+JOINED_COST_TOLERANCE = 1e-3
 
 
 class Search:
@@ -88,7 +96,7 @@ class Search:
         self.gap_scales = gap_scales(segments, method.kinematic)
         self.iterations, self.stage = 0, method.stages[0]
         self.correction: IntegrationCorrection | None
-        self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[tuple[Array, Array, float]]()
+        self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[StageEnd]()
         nodes = start_nodes(segments)
         self.steps = IntegrationSteps(segments, nodes, self.scaling.values(self.scaling.start), method.substeps)
         self.substeps = self.output_substeps = self.steps.start
@@ -102,7 +110,7 @@ class Search:
             status = self._run_stages()
         except KeyboardInterrupt:
             status = Status(Code.INTERRUPTED, ("the best iterate so far", "run again for an answer"))
-        return self._fit(status, time.perf_counter() - began)
+        return end_search(self, status, time.perf_counter() - began)
 
     def _run_stages(self) -> Status:
         if self.steps.are_too_many:
@@ -119,20 +127,32 @@ class Search:
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
             self.has_stalled = self._finish_stage(stage.iterations)
-            self.stage_ends.append((self.current.nodes, self.current.z, self.current.cost))
-            if stage is self.method.stages[0]:
-                if 2 * self.current.cost > self.method.max_first_misfit * self.current.equations.count:
-                    return ABANDONED_START
-                if found := self._jump():
-                    return self._refine_steps(found)
+            self.stage_ends.append(StageEnd(self.current.nodes, self.current.z, self.current.cost))
+            if found := self._early_end(stage):
+                return self._refine_steps(found)
         status = self._convergence_status(self.current)
         # gaps that absorb the misfit of the model: the answer depends on their weight
         gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
         return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
 
+    def _early_end(self, stage: "Stage") -> Status | None:
+        """The status of a search that ends with a stage before the last; None where it goes on."""
+        if self._joins_known_search():
+            return JOINED_SEARCH
+        if stage is not self.method.stages[0]:
+            return None
+        is_far = 2 * self.current.cost > self.method.max_first_misfit * self.current.equations.count
+        return ABANDONED_START if is_far else self._jump()
+
+    def _joins_known_search(self) -> bool:
+        """Whether this search has come to where a known one was after the same stage, and would go on as that one."""
+        known = [cost for gap, cost in self.method.known_costs if gap == self.stage.gap]
+        return any(abs(self.current.cost - cost) <= JOINED_COST_TOLERANCE * cost for cost in known)
+
     def _jump(self) -> Status | None:
         """The status of an optimum that is soon reached after a first stage that explains the log; or None."""
-        if len(self.method.stages) < 3 or not self._is_noise(self.current.cost):
+        stays = len(self.method.stages) < 3 or bool(self.method.known_costs)
+        if stays or not self._is_noise(self.current.cost):
             return None
         count, (first, *between, last) = self.current.equations.count, self.method.stages
         if not self._promised_squares(last) > MAX_JUMP_MISFIT * count:
@@ -167,10 +187,12 @@ class Search:
 
     def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
         """Let the gaps stand for noise of the states of a wrong model: the tightest with which all residuals agree."""
-        for stage, (nodes, z, cost) in reversed(list(zip(self.method.stages[:-1], self.stage_ends, strict=False))):
-            if self._is_noise(cost):
-                found = self._loosen(stage, nodes, z)
-                return found if found.converged else status
+        ended = zip(self.method.stages[:-1], self.stage_ends, strict=False)
+        explaining = [(stage, end) for stage, end in ended if self._is_noise(end.cost)]
+        for stage, end in reversed(explaining[-MAX_LOOSENED:]):
+            found = self._loosen(stage, end.nodes, end.z)
+            if found.converged:
+                return found
         return status
 
     def _loosen(self, stage: "Stage", nodes: Array, z: Array) -> Status:
@@ -185,10 +207,10 @@ class Search:
             self.noisy_gaps = False
         return found
 
-    def _snapshot(self) -> _Snapshot:
-        return _Snapshot(self.stage, self.current, self.correction, self.substeps, self.output_substeps)
+    def _snapshot(self) -> Snapshot:
+        return Snapshot(self.stage, self.current, self.correction, self.substeps, self.output_substeps)
 
-    def _restore(self, to: _Snapshot) -> None:
+    def _restore(self, to: Snapshot) -> None:
         self.stage, self.current, self.correction, self.substeps, self.output_substeps = to
 
     def _enter_stage(self, stage: "Stage", nodes: Array, z: Array) -> None:
@@ -212,7 +234,7 @@ class Search:
         else:
             self.substeps, self.output_substeps, self.correction = steps, steps, None
             self.current = self._evaluate(nodes, z)
-        return self._largest_change(self._outputs() - before)
+        return self.largest_change(self._outputs() - before)
 
     @property
     def _corrects_residuals(self) -> bool:
@@ -221,7 +243,7 @@ class Search:
 
     def _correct_residuals(self, steps: int) -> None:
         """Add what finer steps change to the current residuals; derivatives are computed anew where that is much."""
-        current, before, fine, self.is_coarse = self.current, self._outputs(), self._run(steps), False
+        current, before, fine, self.is_coarse = self.current, self._outputs(), self.run(steps), False
         slopes = current.equations.linearisation
         self.correction = IntegrationCorrection(fine.y - slopes.y, fine.x_end - slopes.x_end, fine)
         self.output_substeps, sigma = steps, self.stage.gap * self.gap_scales
@@ -278,6 +300,7 @@ class Search:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
+        hopeless = 0
         for _ in range(iterations):
             if self.method.budget is not None:
                 self.method.budget.check()
@@ -290,7 +313,26 @@ class Search:
             self.iterations += 1
             before, self.current = self.current.cost, trial
             self._report()
+            hopeless = hopeless + 1 if self._creeps(before, descent.promised) else 0
+            if hopeless == MAX_CREEPING_STEPS:
+                if not self._leap(descent):
+                    return True
+                hopeless = 0
         return before - self.current.cost < STALL_COST_DECREASE * before
+
+    def _leap(self, descent: Descent) -> bool:
+        """Leap over a kink at which a descent with noise of the states creeps; return whether that helps."""
+        if not self.noisy_gaps:
+            return False
+        before, (self.current, taken) = self.current.cost, descent.leap(self.current, self.method.budget)
+        self.iterations += taken
+        return self.current.cost < before
+
+    def _creeps(self, before: float, promised: float) -> bool:
+        """Whether a step from a cost has fallen far short of its promise, and changed little."""
+        return self.noisy_gaps and before - self.current.cost < min(
+            CREEPING_SHARE * promised, STAGE_COST_TOLERANCE * before
+        )
 
     def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
         """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
@@ -319,75 +361,22 @@ class Search:
         return self._objective().evaluate(nodes, z)
 
     def _convergence_status(self, current: Iterate) -> Status:
-        return self._assess(current).status
+        return self.assess(current).status
 
-    def _assess(self, current: Iterate) -> ConvergenceTest:
+    def assess(self, current: Iterate) -> ConvergenceTest:
+        """The convergence test of an iterate."""
         message, tolerance = f"{self.iterations} iterations", self.method.tolerance
         return assess_convergence(
             current.equations, self.scaling, current.z, tolerance, message, noisy_gaps=self.noisy_gaps
         )
 
-    def _fit(self, status: Status, seconds: float) -> Fit:
-        transcription, current, equations = self.segments.transcription, self.current, self.current.equations
-        q, free = self.scaling.values(current.z), transcription.parameters.free_names
-        values = dict(zip(free, q[transcription.free].tolist(), strict=True))
-        is_run = self.correction is not None and math.isfinite(self.integration_change)  # at these very nodes
-        run = self.correction.fine_run if is_run and self.correction else self._run(self.output_substeps)
-        stats = {
-            "iterations": float(self.iterations),
-            "seconds": seconds,
-            "cost": equations.cost,
-            "substeps": float(self.output_substeps),
-            "largest_gap": equations.largest_gap,
-            "gap_share": equations.gap_share,
-            "gap_deviation": self.stage.gap,
-            "integration_error": self._integration_error(run),
-        }
-        at_bound, held = self.scaling.at_bound(current.z) & ~self.scaling.held, self.scaling.held
-        keep = self.scaling.has_effect(equations) & ~at_bound & ~held
-        covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
-        if math.isfinite(equations.cost):
-            covariance = equations.covariance(keep, noisy_gaps=self.noisy_gaps)
-            prior = equations.prior_covariance(keep, held, self.scaling.weak_prior(current.z)) if held.any() else None
-            names = names if status is ABANDONED_START else self._doubtful_parameters()
-        if covariance is not None:
-            gaps = self.stage.gap * self.gap_scales
-            optimum = Optimum(equations, run, current.nodes, q, keep, gaps, self.substeps)
-        return Fit(
-            self.segments.trajectories(run),
-            transcription.parameters.with_values(values),
-            status,
-            stats,
-            covariance,
-            equations.chi_square,
-            equations.count,
-            at_bound,
-            equations.gaps[self.segments.linked] if self.noisy_gaps else None,
-            *names,
-            prior,
-            optimum=optimum,
-        )
-
-    def _doubtful_parameters(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
-        if self.steps.are_too_many:
-            return (), ()
-        free, found = self.segments.transcription.parameters.free_names, self._assess(self.current)
-        return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
-
-    def _integration_error(self, run: RolloutResult) -> float:
-        """Largest change of an output when the steps are halved [noise standard deviations]."""
-        return (
-            self.integration_change
-            if math.isfinite(self.integration_change)
-            else self._largest_change(self._run(2 * self.output_substeps).y - run.y)
-        )
-
-    def _largest_change(self, change: Array) -> float:
+    def largest_change(self, change: Array) -> float:
+        """The largest change of a measured output [noise standard deviations], of all that are given."""
         weighted = np.abs(change) * self.segments.weights
         return float(np.max(weighted, where=np.isfinite(self.segments.measured), initial=0.0))
 
-    def _run(self, steps: int) -> RolloutResult:
+    def run(self, steps: int) -> RolloutResult:
+        """The run of the current iterate by so many integration steps a sample, with states."""
         return self.segments.run(self.current.nodes, self.scaling.values(self.current.z), steps, states=True)
 
     def _report(self) -> None:

@@ -98,6 +98,8 @@ class Fit:
         Factor on the estimates' variance by weighted squares (robust losses).
     optimum : Optimum or None
         None where there is no covariance.
+    stage_costs : tuple of (float, float)
+        The gap and the cost at the end of the stages from the third, and of the search.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -114,6 +116,7 @@ class Fit:
     prior_covariance: Array | None = None
     variance_inflation: float = 1.0
     optimum: Optimum | None = None
+    stage_costs: tuple[tuple[float, float], ...] = ()
 
     def with_effort_of(self, *earlier: "Fit") -> "Fit":
         """The fit with the iterations and seconds of earlier ones added to its own."""

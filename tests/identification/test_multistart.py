@@ -22,7 +22,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.search import ABANDONED_START
+from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
@@ -184,9 +184,11 @@ def test_a_start_that_converged_is_confirmed_before_the_others_settle(monkeypatc
     """Of a model that misses its log a little two starts agree; settling the others costs six times as much."""
     problem, labels = posed(Stribeck()), list[str]()
 
-    def noted(problem: EstimationProblem, start: Start, most: float) -> tuple[EstimationProblem, Fit]:
+    def noted(
+        problem: EstimationProblem, start: Start, most: float, known: tuple[tuple[float, float], ...]
+    ) -> tuple[EstimationProblem, Fit]:
         labels.append(start.label)
-        return fit_holding_unidentifiable(problem, start, most)
+        return fit_holding_unidentifiable(problem, start, most, known)
 
     monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
     monkeypatch.setattr(starting, "fit_holding_unidentifiable", noted)
@@ -258,7 +260,7 @@ def test_a_fit_at_the_noise_that_leaves_one_parameter_unsettled_takes_one_more_s
     """All starts used to be settled and searched, for minutes, before that parameter was held."""
     problem, labels = posed(Stribeck()), list[str]()
 
-    def unsettled(problem: EstimationProblem, start: Start, _: float) -> tuple[EstimationProblem, Fit]:
+    def unsettled(problem: EstimationProblem, start: Start, *_: object) -> tuple[EstimationProblem, Fit]:
         labels.append(start.label)
         fit = solve_least_squares(problem.transcription(start), problem.method)
         status = Status(Code.NOT_CONVERGED, (f"{VELOCITY} would still move by 14 standard deviations",))
@@ -271,3 +273,38 @@ def test_a_fit_at_the_noise_that_leaves_one_parameter_unsettled_takes_one_more_s
     assert fit.status.converged
     assert set(held.held) == {VELOCITY}
     assert labels == [c.label for c in problem.candidates()[:2]]
+
+
+def test_a_start_that_joins_the_best_confirms_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, known = posed(Stribeck()), list[object]()
+
+    def joined(
+        problem: EstimationProblem, start: Start, most: float, costs: tuple[tuple[float, float], ...]
+    ) -> tuple[EstimationProblem, Fit]:
+        known.append(costs)
+        held, fit = fit_holding_unidentifiable(problem, start, most)
+        return held, replace(fit, status=JOINED_SEARCH) if costs else fit
+
+    monkeypatch.setattr(starting, "_explains_to_noise", lambda *_: False)
+    monkeypatch.setattr(starting, "fit_holding_unidentifiable", joined)
+    monkeypatch.setattr(starting, "_settle_start", lambda *_: pytest.fail("settled"))
+    _, fit, label = starting.fit_from_starts(problem)
+    assert fit.status.converged
+    assert label == problem.candidates()[0].label
+    assert known == [(), fit.stage_costs]
+
+
+@pytest.mark.parametrize(
+    ("jumps", "cost", "enough"),
+    [(True, 2.0, True), (False, 2.0, False), (False, 1.0005, True), (True, math.inf, False)],
+)
+def test_noise_of_the_states_asks_for_no_second_equal_optimum(jumps: bool, cost: float, enough: bool) -> None:
+    """Every estimate is marked with it; an infinite cost stands for a second start that did not converge."""
+    problem = posed(Stribeck())
+    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    best = replace(fit, chi_square=1e9, jumps=np.zeros((1, 2)) if jumps else None)
+    failed = Status(Code.NOT_CONVERGED, ("friction.static would still move",))
+    status, share = (fit.status, cost) if cost < math.inf else (failed, 1.0)
+    second = replace(best, status=status, stats={**best.stats, "cost": share * best.stats["cost"]})
+    fits = [(problem, best, "first"), (problem, second, "second")]
+    assert starting._are_enough(fits) is enough

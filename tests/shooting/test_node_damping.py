@@ -1,6 +1,8 @@
 """Nodes at which Gauss-Newton's model overshoots are damped alone, so that the rest of a log converges as fast."""
 
+import math
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -111,3 +113,50 @@ def test_nodes_are_damped_alone_near_an_optimum_only(is_near: bool, monkeypatch:
     monkeypatch.setattr("pneuopt.shooting.search.Descent", descend)
     search._run_stage(8)
     assert damped == [is_near]
+
+
+def iterate(cost: float) -> Iterate:
+    return Iterate(np.zeros((1, 1)), np.zeros(1), Mock(cost=cost))
+
+
+@pytest.mark.parametrize(
+    ("costs", "best", "taken"), [((30.0, 12.0, 5.0), 5.0, 3), ((30.0, 20.0), 10.0, 2), ((30.0, math.inf, 1.0), 10.0, 2)]
+)
+def test_a_leap_may_raise_the_cost_for_a_while(
+    costs: tuple[float, ...], best: float, taken: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Undamped steps end at a negligible one, or where the model is not finite; the least cost counts."""
+    steps = iter([*map(iterate, costs), None])
+    monkeypatch.setattr(Descent, "_step_undamped", lambda *_: next(steps))
+    search = Search(segment(wrong_squares()), LeastSquares())
+    found, count = Descent(search._objective(), 0.0, lambda *_: False).leap(iterate(10.0))
+    assert (found.cost, count) == (best, taken)
+
+
+@pytest.mark.parametrize(("helps", "steps"), [(False, 3), (True, 9)])
+def test_a_search_with_noise_of_the_states_that_creeps_leaps(
+    helps: bool, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a log with encoder steps it took 60 steps of .13 each where 35 were promised, and gave up."""
+    search, leaps, taken = Search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
+    search.noisy_gaps, search.current = True, iterate(1000.0)
+
+    def creep(descent: Descent, current: Iterate) -> Iterate:
+        descent.promised = 35.0
+        taken.append(current.cost)
+        return iterate(current.cost - 0.1)
+
+    def leap(_: Descent, current: Iterate, budget: object) -> tuple[Iterate, int]:
+        leaps.append(current.cost)
+        return iterate(current.cost - 1.0) if helps and len(leaps) < 3 else current, 4
+
+    monkeypatch.setattr(Descent, "step", creep)
+    monkeypatch.setattr(Descent, "leap", leap)
+    monkeypatch.setattr(Search, "_report", lambda _: None)
+    monkeypatch.setattr(Search, "_is_noise", lambda *_: False)
+    search._run_stage(30)
+    assert len(taken) == steps
+    search.noisy_gaps = False
+    leaps.clear()
+    search._run_stage(5)
+    assert not leaps

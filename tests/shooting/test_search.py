@@ -13,6 +13,7 @@ from pneuopt.shooting.equations import correct_residuals, normal_equations
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search import FINE_TOLERANCE, Search
+from pneuopt.shooting.search_end import JOINED_SEARCH
 from pneuopt.shooting.segments import IntegrationCorrection, segment, start_nodes
 from pneuopt.shooting.solution import Fit
 from tests.shooting.test_least_squares import found, shaken, two_logs
@@ -139,3 +140,18 @@ def test_nothing_is_iterated_to_the_end_before_finer_steps_follow(monkeypatch: p
     assert fit.covariance is not None
     assert np.abs((found(fit) - found(fine)) / np.sqrt(np.diag(fit.covariance))).max() < 1e-2
     assert fit.stats["iterations"] < fine.stats["iterations"]
+
+
+def test_a_search_that_comes_to_where_another_one_was_ends_there() -> None:
+    """From there on both would go the same way: the second start of a wrong model took as long as the first."""
+    problem, method = shaken(2e-3), LeastSquares()
+    fit = solve_least_squares(problem, method)
+    again = solve_least_squares(problem, replace(method, known_costs=fit.stage_costs))
+    assert again.status is JOINED_SEARCH
+    gap, cost = fit.stage_costs[-1]
+    assert (gap, cost) == (fit.stats["gap_deviation"], fit.stats["cost"])
+    assert (again.stats["gap_deviation"], again.stats["cost"]) == (gap, pytest.approx(cost, rel=1e-3))
+    other = solve_least_squares(problem, replace(method, known_costs=((gap, 1.01 * cost),)))
+    assert other.status is not JOINED_SEARCH
+    tight = solve_least_squares(two_logs(), LeastSquares(known_costs=((FIRST.gap, 0.0),)))
+    assert [gap for gap, _ in tight.stage_costs] == [stage.gap for stage in (*OTHERS[1:], OTHERS[-1])]

@@ -1,0 +1,121 @@
+"""`end_search`: the `Fit` at the end of a search, and the statuses by which one ends early."""
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+from pneuopt.dynamics.compiled.rollout import RolloutResult
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.status import Code, Status
+from pneuopt.shooting.levenberg_marquardt import Iterate
+from pneuopt.shooting.segments import IntegrationCorrection
+from pneuopt.shooting.solution import Fit, Optimum
+
+if TYPE_CHECKING:
+    from pneuopt.shooting.least_squares import Stage
+    from pneuopt.shooting.search import Search
+
+FIRST_JOINING_STAGE = 2  # stage from which two searches may join: before it the gaps are so wide that all cost alike
+GAPS_ABSORB_MISFIT = Status(Code.NOT_CONVERGED, ("the gaps between segments absorb the misfit of the model",))
+ABANDONED_START = Status(Code.NOT_CONVERGED, ("a start is so far off that the others are tried first",))
+JOINED_SEARCH = Status(Code.NOT_CONVERGED, ("a start has led to where another one was",))
+
+
+class StageEnd(NamedTuple):
+    """Where a stage ended."""
+
+    nodes: Array
+    z: Array
+    cost: float
+
+
+class Snapshot(NamedTuple):
+    """Where a search is, and by which integration."""
+
+    stage: "Stage"
+    current: Iterate
+    correction: IntegrationCorrection | None
+    substeps: int
+    output_substeps: int
+
+
+def end_search(search: "Search", status: Status, seconds: float) -> Fit:
+    """The fit where a search has ended.
+
+    Parameters
+    ----------
+    search : Search
+    status : Status
+    seconds : float
+        That it has taken.
+
+    Returns
+    -------
+    Fit
+    """
+    transcription, current, equations = search.segments.transcription, search.current, search.current.equations
+    q = search.scaling.values(current.z)
+    free = transcription.parameters.free_names
+    values = dict(zip(free, q[transcription.free].tolist(), strict=True))
+    is_run = search.correction is not None and math.isfinite(search.integration_change)  # at these very nodes
+    run = search.correction.fine_run if is_run and search.correction else search.run(search.output_substeps)
+    at_bound, held = search.scaling.at_bound(current.z) & ~search.scaling.held, search.scaling.held
+    keep = search.scaling.has_effect(equations) & ~at_bound & ~held
+    covariance, prior, optimum, names = None, None, None, (tuple[str, ...](), tuple[str, ...]())
+    if math.isfinite(equations.cost):
+        covariance = equations.covariance(keep, noisy_gaps=search.noisy_gaps)
+        prior = equations.prior_covariance(keep, held, search.scaling.weak_prior(current.z)) if held.any() else None
+        names = names if status in (ABANDONED_START, JOINED_SEARCH) else _doubtful_parameters(search)
+    if covariance is not None:
+        gaps = search.stage.gap * search.gap_scales
+        optimum = Optimum(equations, run, current.nodes, q, keep, gaps, search.substeps)
+    return Fit(
+        search.segments.trajectories(run),
+        transcription.parameters.with_values(values),
+        status,
+        _stats(search, run, seconds),
+        covariance,
+        equations.chi_square,
+        equations.count,
+        at_bound,
+        equations.gaps[search.segments.linked] if search.noisy_gaps else None,
+        *names,
+        prior,
+        optimum=optimum,
+        stage_costs=_stage_costs(search),
+    )
+
+
+def _stats(search: "Search", run: RolloutResult, seconds: float) -> dict[str, float]:
+    return {
+        "iterations": float(search.iterations),
+        "seconds": seconds,
+        "cost": search.current.equations.cost,
+        "substeps": float(search.output_substeps),
+        "largest_gap": search.current.equations.largest_gap,
+        "gap_share": search.current.equations.gap_share,
+        "gap_deviation": search.stage.gap,
+        "integration_error": _integration_error(search, run),
+    }
+
+
+def _stage_costs(search: "Search") -> tuple[tuple[float, float], ...]:
+    """The gap and the cost of stages at their ends, and those of the search's end."""
+    ended = [(stage.gap, end.cost) for stage, end in zip(search.method.stages, search.stage_ends, strict=False)]
+    return (*ended[FIRST_JOINING_STAGE:], (search.stage.gap, search.current.cost))
+
+
+def _doubtful_parameters(search: "Search") -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The parameters that the data do not determine, and the one that has not settled; none of a refused start."""
+    if search.steps.are_too_many:
+        return (), ()
+    free, found = search.segments.transcription.parameters.free_names, search.assess(search.current)
+    return tuple(free[i] for i in found.unidentifiable), tuple(free[i] for i in found.unsettled)
+
+
+def _integration_error(search: "Search", run: RolloutResult) -> float:
+    """Largest change of an output when the steps are halved [noise standard deviations]."""
+    return (
+        search.integration_change
+        if math.isfinite(search.integration_change)
+        else search.largest_change(search.run(2 * search.output_substeps).y - run.y)
+    )
