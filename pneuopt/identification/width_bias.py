@@ -90,7 +90,9 @@ def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth
     free = found.parameters.free_names
     scales = np.array([p.value if p.log else 1.0 for p in (found.parameters[n] for n in free)])
     own = [free.index(n) for n in fit.parameters.free_names]
-    for name in names if found.optimum is not None else ():
+    if found.optimum is None:
+        return
+    for name in names:
         moved = _step_with(found.optimum, free.index(name), [free.index(n) for n in names])
         if moved is not None:
             fall, step = moved
