@@ -168,9 +168,7 @@ def _lengths(problem: EstimationProblem) -> list[float]:
 
 def _try_length(problem: EstimationProblem, fit: Fit, length: float) -> _Trial:
     """The fit in windows of one length, a segment each, and what its residuals tell."""
-    # without a gap between segments all stages are alike
-    method = replace(problem.method, segment_time=length, stages=problem.method.stages[-1:])
-    cut = replace(problem, window=length, method=method)
+    cut = replace(problem, window=length, method=replace(problem.method, segment_time=length))
     held, found = fit_holding_unidentifiable(cut, cut.start_from(fit))
     unknowns = len(found.parameters.free_names) + len(held.experiments) * len(held.system.states)
     freedom = max(1, found.count - unknowns)

@@ -11,14 +11,10 @@ from scipy.signal import lfilter
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.dynamics.hooks import Start
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import write_fit
 from pneuopt.files.toml import read_toml
-from pneuopt.identification import windows
 from pneuopt.identification.identify import identify, predict, validate
-from pneuopt.identification.multistart import fit_holding_unidentifiable
-from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.logs.experiments import Experiment
@@ -31,7 +27,6 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.solution import Fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -115,19 +110,6 @@ def test_an_exact_log_needs_no_windows() -> None:
     assert far_off(result) < 0.01
     row = figures(result.fit)
     assert row["free_run_rmse"] < 3 * row["rmse"]
-
-
-def test_windows_are_searched_in_one_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No gap tightens there: six stages alike took three times as long."""
-    stages = list[int]()
-
-    def counted(problem: EstimationProblem, start: Start) -> tuple[EstimationProblem, Fit]:
-        stages.append(len(problem.method.stages))
-        return fit_holding_unidentifiable(problem, start)
-
-    monkeypatch.setattr(windows, "fit_holding_unidentifiable", counted)
-    assert fitted.__wrapped__(1).window is not None
-    assert set(stages) == {1}
 
 
 def test_windows_can_be_given() -> None:
