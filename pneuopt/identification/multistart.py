@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
+from pneuopt.identification.excerpts import cut_excerpts, filter_states
 from pneuopt.identification.identifiability import rejects_held_values
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
@@ -32,6 +33,8 @@ GUESS_BOUND_WIDTH = 1e-9
 # squared residuals a sample, in noise variances, up to which no other start is tried: below 1 every start would be
 # tried, while a wrong basin of soft bristles has left 1.1
 ACCEPTED_CHI_SQUARE_RATIO = 1.05
+# iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
+SHORT_ITERATIONS = 10
 SAME_COST_RATIO = 1.001  # costs of two fits up to which both are one optimum; lower, and rounding makes two of it
 
 Candidate = tuple[EstimationProblem, Fit, str]
@@ -62,6 +65,8 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
     KeyboardInterrupt
         If it comes before the first fit; after that the best fit so far is returned, marked.
     """
+    if loss is None and not estimate_noise and (found := _fit_long_logs(problem)):
+        return found
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
     try:
@@ -91,6 +96,40 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
     if not interrupted:
         held, fit = fit_a_part(held, fit, label)
     return held, replace(fit, status=_status(problem, fit, len(fits), interrupted=interrupted)), label
+
+
+def _fit_long_logs(problem: EstimationProblem) -> Candidate | None:
+    """A fit that explains long logs to their noise, or was interrupted; None if they need a longer search."""
+    for held, fit, label in _tries_of_long_logs(problem):
+        is_answer = _explains_to_noise(held, fit) and not (held.held or fit.unidentifiable)
+        if is_answer or fit.status.code is Code.INTERRUPTED:
+            return held, fit, label
+    return None
+
+
+def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
+    """What is tried before a long search of long logs; nothing where they are short.
+
+    First a short search: most logs need no more. Then the fit that begins with the parameters of a part of each log.
+    The states of the whole logs are filtered by these parameters first: rough states would spoil what the parts have
+    found.
+    """
+    parts = cut_excerpts(problem)
+    if parts is None:
+        return
+    rough, stages = problem.candidates()[0], problem.method.stages
+    method = replace(problem.method, stages=(stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)))
+    short = solve_least_squares(problem.transcription(rough), method)
+    yield problem, short, rough.label
+    held, fit, label = fit_from_starts(parts)
+    if fit.status.code is Code.INTERRUPTED:
+        yield problem, replace(short, status=fit.status), rough.label
+    if not _explains_to_noise(held, fit):
+        return
+    warm = replace(problem, method=replace(problem.method, stages=stages[-REFIT_STAGES:]))
+    start = filter_states(warm, replace(rough, parameters=parts.start_from(fit).parameters))
+    whole, fit = fit_holding_unidentifiable(warm, start)
+    yield replace(whole, method=problem.method), fit, f"{label}, of a part"
 
 
 def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: bool) -> Status:

@@ -1,0 +1,77 @@
+"""`cut_excerpts`: the same problem on the liveliest part of each long log, from whose answer the whole one begins.
+
+A search costs as much as its logs are long, and most of its iterations find the way from a rough start; a part of a
+minute's log shows that way as well (`problems/identify/random_plants.py --kind other`).
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from pneuopt.dynamics.hooks import Start
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.identification.checks import outputs_in_log
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.logs.experiments import Experiment
+from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
+from pneuopt.shooting.state_filter import filter_nodes
+
+# segments of an excerpt: fewer may lack motion that a parameter needs, more cost time
+EXCERPT_SEGMENTS = 1000
+# length of a log, over that of an excerpt, from which on it has one: lower spends more on excerpts than they save,
+# higher searches long logs from a rough start
+MIN_LENGTH_RATIO = 2.5
+MAX_SEGMENTS = 20_000  # of logs whose states are filtered one node after the other: more take longer than they save
+
+
+def cut_excerpts(problem: EstimationProblem) -> EstimationProblem | None:
+    """The problem with an excerpt in place of each long log.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+
+    Returns
+    -------
+    EstimationProblem or None
+        None where there is nothing to gain: no long log, one with holes, windows, or a model without guesses to try.
+    """
+    if math.isfinite(problem.window) or not problem.has_gaps or len(problem.candidates()) < 2:
+        return None
+    if not problem.system.states or any(e.holes for e in problem.experiments) or problem.weights:
+        return None
+    parts = tuple(_cut(problem, e) for e in problem.experiments)
+    whole, kept = (sum(len(e.trajectory) for e in each) for each in (problem.experiments, parts))
+    is_huge = sum(e.trajectory.duration for e in problem.experiments) > MAX_SEGMENTS * problem.method.segment_time
+    return replace(problem, experiments=parts) if whole >= MIN_LENGTH_RATIO * kept and not is_huge else None
+
+
+def filter_states(problem: EstimationProblem, start: Start) -> Start:
+    """The start with states along the logs that fit its parameters (`shooting.state_filter`)."""
+    segments = segment(problem.transcription(start))
+    q = np.array([p.value for p in segments.transcription.parameters.values()])
+    nodes = filter_nodes(segments, start_nodes(segments), q)
+    run = segments.run(nodes, q, stable_substeps(segments, nodes, q, RK4_MAX_H_LAMBDA), states=True)
+    names = (e.name for e in problem.experiments)
+    return replace(start, states=dict(zip(names, segments.trajectories(run), strict=True)))
+
+
+def _cut(problem: EstimationProblem, experiment: Experiment) -> Experiment:
+    """The part of a log with the largest product of its outputs' variances; the log itself where it is short.
+
+    A product, for a part in which one output hardly moves shows no friction, however much the others do.
+    """
+    run = experiment.trajectory
+    step = float(np.median(np.diff(run.t)))
+    count = math.ceil(EXCERPT_SEGMENTS * max(problem.method.segment_time, step) / step)
+    if len(run) < MIN_LENGTH_RATIO * count:
+        return experiment
+    first = np.arange(0, len(run) - count + 1, max(1, count // 10))
+    liveliness = np.zeros(len(first))
+    for name in outputs_in_log(problem.system, experiment):
+        column = run.fill_gaps(name)
+        variances = np.array([np.var(column[i : i + count]) for i in first])
+        liveliness += np.log(np.maximum(variances, np.finfo(float).tiny))
+    begin = int(first[np.argmax(liveliness)])
+    return replace(experiment, trajectory=run.rows(begin, begin + count), source=None)

@@ -1,0 +1,98 @@
+"""Long logs: the part that is searched first, and the whole that begins with its answer."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pneuopt.identification import multistart
+from pneuopt.identification.checks import check_logs
+from pneuopt.identification.excerpts import EXCERPT_SEGMENTS, cut_excerpts, filter_states
+from pneuopt.identification.problem import EstimationProblem
+from pneuopt.logs.experiments import Experiment
+from pneuopt.models.catalog import b32
+from pneuopt.quantities.status import Code
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
+from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.transcription import Transcription
+from problems.shared.b32 import GAINS, run_loop
+
+SAMPLE, NOISE = 2e-3, {"position": 2e-5, "pressure_a": 1e3, "pressure_b": 1e3}  # [s], [m], [Pa]
+FREE = ("friction.coulomb", "friction.static", "friction.stribeck_velocity", "friction.viscous")
+LIVELY = (12.0, 22.0)  # [s], when the drive moves most
+
+
+def posed(seconds: float = 26.0, method: LeastSquares | None = None) -> tuple[EstimationProblem, Trajectory]:
+    """A pneumatic drive in a loop, which moves farther for ten seconds than before and after; and the exact log."""
+    drive, truth = b32()
+    t = np.arange(round(seconds / SAMPLE)) * SAMPLE
+    wanted = 0.1 + np.where((t >= LIVELY[0]) & (t < LIVELY[1]), 0.05, 0.02) * np.sign(np.sin(2 * np.pi * 0.8 * t))
+    exact = run_loop(
+        truth | GAINS, wanted, SAMPLE, {"position": 0.1, "pressure_a": 3.5e5, "pressure_b": 4e5}, substeps=40
+    )
+    rng = np.random.default_rng(3)
+    noisy = {n: exact[n] + sigma * rng.standard_normal(len(t)) for n, sigma in NOISE.items()}
+    log = Experiment(Trajectory(t, {"valve_voltage": exact["valve_voltage"], **noisy}), NOISE, name="run")
+    parameters = truth.with_values({n: drive.parameters.value(n) for n in FREE}).freed(*FREE)
+    logs = tuple(check_logs(drive.system(), [log], parameters))
+    return EstimationProblem(drive.system(), logs, parameters, method or LeastSquares()), exact
+
+
+def test_the_excerpt_is_the_liveliest_part() -> None:
+    parts = cut_excerpts(posed()[0])
+    assert parts is not None
+    t = parts.experiments[0].trajectory.t
+    assert len(t) == pytest.approx(EXCERPT_SEGMENTS * 0.01 / SAMPLE, abs=1)
+    assert t[0] == pytest.approx(LIVELY[0], abs=1.1)
+
+
+def test_short_logs_and_windows_have_no_excerpt() -> None:
+    problem, _ = posed(20.0)
+    assert cut_excerpts(problem) is None
+    assert cut_excerpts(replace(posed()[0], window=0.5)) is None
+
+
+def test_filtered_states_fit_the_parameters() -> None:
+    """The speed along the log comes four times nearer to the truth than that of a filter of the position alone."""
+    problem, states = posed(6.0)
+    rough = problem.candidates()[0]
+    true = {n: b32()[1].value(n) for n in FREE}
+    filtered = filter_states(problem, replace(rough, parameters=true))
+    error, before = (
+        np.sqrt(np.mean((each.states["run"]["speed"] - states["speed"])[100:] ** 2)) for each in (filtered, rough)
+    )
+    assert error < before / 4
+
+
+def test_a_long_log_begins_with_the_answer_of_its_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the short search does not come to an end, only the part is searched from rough states."""
+    lengths: list[tuple[int, int]] = []
+
+    def spied(transcription: Transcription, method: LeastSquares) -> Fit:
+        lengths.append((transcription.phases[0].n, len(method.stages)))
+        return solve_least_squares(transcription, method)
+
+    monkeypatch.setattr(multistart, "SHORT_ITERATIONS", 0)
+    monkeypatch.setattr(multistart, "solve_least_squares", spied)
+    problem, _ = posed()
+    held, fit, label = multistart.fit_from_starts(problem)
+    assert label.endswith("of a part")
+    assert fit.status.converged
+    assert held.method == problem.method
+    searched = [n for n, stages in lengths if stages == len(problem.method.stages)]
+    assert searched == [pytest.approx(EXCERPT_SEGMENTS * 0.01 / SAMPLE, abs=1)]
+    for name in FREE:
+        assert fit.parameters.value(name) == pytest.approx(b32()[1].value(name), rel=0.01)
+
+
+def test_ctrl_c_in_the_short_search_ends_all() -> None:
+    def interrupt(_: str) -> None:
+        raise KeyboardInterrupt
+
+    problem, _ = posed(method=LeastSquares(progress=interrupt))
+    held, fit, _ = multistart.fit_from_starts(problem)
+    assert fit.status.code is Code.INTERRUPTED
+    assert not held.held
+    assert math.isfinite(fit.stats["cost"])
