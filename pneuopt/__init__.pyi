@@ -128,8 +128,10 @@ from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
 from .studies.bootstrap import Bootstrap, bootstrap
 from .studies.cases import grid, read_cases
+from .studies.cluster import open_executor
 from .studies.journal import Journal
 from .studies.neighbours import search_again, sweep_from_neighbours
+from .studies.processes import Processes
 from .studies.sweep import sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
@@ -222,6 +224,7 @@ __all__ = [
     "Polytropic",
     "Presliding",
     "PressureDependent",
+    "Processes",
     "Profile",
     "Progress",
     "PropagatedValue",
@@ -292,6 +295,7 @@ __all__ = [
     "margins",
     "mean_start",
     "monte_carlo",
+    "open_executor",
     "open_loop",
     "pareto_front",
     "plot_bode",

@@ -218,14 +218,33 @@ def study_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
     plot: Plot = None,
+    executor: Annotated[
+        str,
+        typer.Option(
+            metavar="WHERE",
+            help="A number of processes, dask (a cluster on this machine), or the address of a dask scheduler, "
+            "tcp://host:8786.",
+            show_default="one process a CPU",
+        ),
+    ] = "",
+    time_limit: Annotated[
+        float, typer.Option(metavar="SECONDS", help="A case that takes longer is killed.", show_default="none")
+    ] = inf,
+    memory_limit: Annotated[
+        float, typer.Option(metavar="MB", help="A case that needs more memory fails.", show_default="none")
+    ] = inf,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the cases of an earlier run, and refuse if it was another one.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Certify a loop over a grid of any parameters, or tune it along a Pareto front; status 1 if a case fails."""
+    """Certify a loop over any plants, or tune it over a grid or along a Pareto front; status 1 if a case fails."""
     with _report_errors():
         from pneuopt.cli.shared import Outputs
-        from pneuopt.cli.study import run_study
+        from pneuopt.cli.study import Computing, run_study
 
-        raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet))
+        computing = Computing(executor, time_limit, memory_limit, resume)
+        raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet, computing))
 
 
 @app.command("keys")

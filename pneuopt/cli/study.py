@@ -1,14 +1,14 @@
 """`pneuopt study`: a loop certified over a grid of parameters, or tuned along a Pareto front."""
 
-import hashlib
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pneuopt import __version__
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import (
     Outputs,
@@ -46,13 +46,15 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
-from pneuopt.quantities.source import read_once, read_toml_source
+from pneuopt.quantities.source import read_once
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.units import write_value
 from pneuopt.studies.cases import grid
+from pneuopt.studies.cluster import open_executor
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
+from pneuopt.studies.processes import Processes
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.certifier import certified_objective
 from pneuopt.tuning.pareto import pareto_front
@@ -65,15 +67,49 @@ if TYPE_CHECKING:
 OBJECTIVE, FOUND = "objective", "found"
 
 
-def run_study(file: Path, outputs: Outputs, quiet: bool) -> int:
-    """Compute what a study.toml asks for, a grid or a front; returns the exit status."""
+@dataclass(frozen=True)
+class Computing:
+    """How the cases of a study are computed.
+
+    Attributes
+    ----------
+    executor : str
+        As for `open_executor`; empty: one process a CPU.
+    seconds, megabytes : float
+        What a case may take.
+    resume : bool
+        Whether there must be a journal of this study.
+    """
+
+    executor: str = ""
+    seconds: float = math.inf
+    megabytes: float = math.inf
+    resume: bool = False
+
+    @contextmanager
+    def open(self) -> Iterator[Executor | Processes]:
+        """Open the executor."""
+        limits = Processes(None, self.seconds, self.megabytes)
+        if not self.executor:
+            yield limits
+            return
+        here = self.executor.isdecimal() or limits == Processes()
+        require(here, f"--time-limit and --memory-limit hold in processes of this machine, not on {self.executor}")
+        with open_executor(self.executor) as executor:
+            yield replace(limits, count=executor.count) if isinstance(executor, Processes) else executor
+
+
+def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -> int:
+    """Compute what a study.toml asks for, a grid, other cases or a front; returns the exit status."""
     study = read_study(file)
     outputs.check([file, study.drive, study.tuning])
-    run = run_grid if study.pareto is None else run_front
-    return run(study, outputs, quiet)
+    if study.pareto is None:
+        return run_cases(study, outputs, quiet, computing)
+    require(computing == Computing(), f"{file}: a front is one search after another: it takes no option of cases")
+    return run_front(study, outputs, quiet)
 
 
-def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
+def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
     """Certify a loop over a grid or other cases; returns the exit status."""
     file, count = study.path, len(study.axes)
     require(outputs.plot is None or not study.cases, f"{file}: --plot draws a grid of one or two [axes]; leave it out")
@@ -83,14 +119,14 @@ def run_grid(study: Study, outputs: Outputs, quiet: bool) -> int:
     warn_of_status(study.tuning, "tuning")
     (cases, axes), units = _read_cases(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{file}: [metrics] show")
-    with _keep_cases(study, outputs, len(cases)) as journal:
+    with _keep_cases(study, outputs, len(cases), computing.resume) as journal, computing.open() as executor:
         if study.tune:
-            table = _tune_cells(study, task, parameters, axes, quiet, journal)
+            table = _tune_cells(study, task, parameters, axes, quiet, journal, executor)
         else:
             band = study.band or task.specification.band
             certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
             with progress("certifying", quiet=quiet) as report_progress:
-                table = sweep(certify, parameters, cases, progress=report_progress, journal=journal)
+                table = sweep(certify, parameters, cases, executor=executor, progress=report_progress, journal=journal)
     verdict, status = _grid_verdict(table, len(task.references))
     seen = _worst_of_references(table, axes, study.show)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
@@ -122,21 +158,23 @@ def _read_cases(study: Study, parameters: ParameterSet) -> tuple[dict[str, dict[
 
 
 @contextmanager
-def _keep_cases(study: Study, outputs: Outputs, count: int) -> Iterator[Journal | None]:
+def _keep_cases(study: Study, outputs: Outputs, count: int, resume: bool) -> Iterator[Journal | None]:
     """Keep the cases as they come, beside the file that is asked for."""
     place = outputs.output or outputs.json
     if place is None:
+        require(not resume, "--resume goes on where the file of -o or --json was left: name it")
         yield None
         return
-    used = (study.path, study.drive, study.tuning)
-    made_of = [__version__.encode(), *(hashlib.sha256(read_toml_source(path)).digest() for path in used)]
-    journal = Journal(place.with_name(f"{place.name}.journal"), hashlib.sha256(b"".join(made_of)).hexdigest())
+    hashes = file_hashes(study.path, study.drive, study.tuning)
+    journal = Journal(place.with_name(f"{place.name}.journal"), hashes, resume=resume)
     if journal.known:
         warn(f"{journal.path}: {len(journal.known)} of {count} cases are known from an earlier run of this study")
     try:
         yield journal
     finally:
         journal.close(finished=False)
+        if journal.problem:
+            warn(journal.problem)
 
 
 def _tune_cells(
@@ -146,6 +184,7 @@ def _tune_cells(
     axes: Sequence[SweptAxis],
     quiet: bool,
     journal: Journal | None,
+    executor: Executor | Processes,
 ) -> "pd.DataFrame":
     """Tune every cell of the grid, each from the gains of its neighbours: a row a cell, with metrics and gains."""
     require(bool(task.specification.weights), f"{study.tuning}: has nothing to minimise; add [minimise]")
@@ -159,6 +198,7 @@ def _tune_cells(
             points,
             value=OBJECTIVE,
             starts={f"{FOUND} {n}": n for n in free},
+            executor=executor,
             progress=report_progress,
             journal=journal,
         )

@@ -15,13 +15,13 @@ from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.source import MAX_REASON, read_source
 from pneuopt.quantities.units import si_conversion, write_value
+from pneuopt.studies.outcome import CaseValues
 
 if TYPE_CHECKING:
     import pandas as pd
 
 MAX_TABLE_BYTES = 2**28
 """Size of a table of cases [byte], 256 MiB: more fills the memory; less refuses a million cases of ten parameters."""
-CaseValues = ParameterSet | Mapping[str, float]
 _NAMES = "case"  # the column of a table that names its cases, as in the table that `sweep` returns
 
 
@@ -109,7 +109,7 @@ def read_cases(parameters: ParameterSet, table: "pd.DataFrame | str | Path") -> 
     }
     cases = {label: {n: values[n][k] for n in names} for k, label in enumerate(labels)}
     for label, case in cases.items():
-        case_parameters(parameters, case, f"{where}: {label}")
+        check_case(parameters, case, f"{where}: {label}")
     return cases
 
 
@@ -134,15 +134,23 @@ def _read_column(column: "pd.Series[Any]", written: str, unit: str, where: str) 
     return [float(v) for v in factor * numbers + offset]
 
 
-def case_parameters(parameters: ParameterSet, case: CaseValues, name: str) -> ParameterSet:
-    """All parameters of a case, named in the message if there is no such parameter, or its value is out of bounds."""
-    if isinstance(case, ParameterSet):
-        return case
+def check_case(parameters: ParameterSet, case: CaseValues, name: str) -> None:
+    """Raise `InputError`, which names the case, if it has an unknown parameter, or a value out of bounds."""
+    if isinstance(case, ParameterSet) or all(_is_inside(parameters, n, v) for n, v in case.items()):
+        return
     check_names("parameter", case, parameters, name)
     try:
-        return parameters.with_values(case)
+        parameters.with_values(case)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
+
+
+def _is_inside(parameters: ParameterSet, name: str, value: float) -> bool:
+    """Whether a value is certainly good; `ParameterSet.with_values` finds the words where it is not."""
+    if name not in parameters:
+        return False
+    p = parameters[name]
+    return p.lower <= value <= p.upper and (not p.log or value > 0)
 
 
 def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> list[tuple[str, float]]:
@@ -150,7 +158,7 @@ def _label_axis(parameters: ParameterSet, name: str, values: list[float]) -> lis
     require(len(values) > 0, f"axis {name}: no values")
     require(len(set(values)) == len(values), f"axis {name}: a value is there twice; leave one out")
     for value in values:
-        case_parameters(parameters, {name: value}, "axis")
+        check_case(parameters, {name: value}, "axis")
     short, full = ([write_value(v, parameters[name].unit, digits) for v in values] for digits in (6, 17))
     labels = short if len(set(short)) == len(values) else full
     return [(f"{name} = {label}", value) for label, value in zip(labels, values, strict=True)]

@@ -1,14 +1,21 @@
 """`Journal`: the cases of a study on the disk as they come, so that a study that ends early goes on where it was."""
 
-import contextlib
+import hashlib
 import json
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
 
 from pneuopt.quantities.errors import InputError
-from pneuopt.studies.outcome import Outcome
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.provenance import provenance
+from pneuopt.studies.outcome import CaseValues, Outcome
+
+_SYNC_SECONDS = 1.0
+"""Time between two waits for the disk [s]: only what came since is lost where the machine itself loses power; a wait a
+case slows quick cases down. A process that is killed loses nothing."""
 
 
 class Journal:
@@ -18,57 +25,124 @@ class Journal:
     ----------
     path : str or Path
         Made if it is not there. One of another study is begun anew.
-    identity : str
-        What the cases depend on: a hash of the inputs, and the version.
+    identity : str or mapping of str to str
+        What the function of the study depends on: hashes of its inputs, by name. Versions are added to it. Parameters
+        and values of a case are checked case by case.
+    resume : bool
+        Whether the file must be there, and of this study.
 
     Attributes
     ----------
     known : mapping of str to Outcome
         What an earlier run of the same study computed, by case.
+    problem : str
+        Why cases could not be kept, a full disk; empty where all are.
 
     Raises
     ------
     InputError
-        If the file cannot be read or written.
+        If the file cannot be read or written; with `resume` also if it is not there or of another study, with what has
+        changed.
     """
 
-    def __init__(self, path: str | Path, identity: str) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Path, identity: str | Mapping[str, str], *, resume: bool = False) -> None:
+        self.path, self.problem = Path(path), ""
+        study = {**({"study": identity} if isinstance(identity, str) else identity), **_versions()}
         try:
             lines = self.path.read_bytes().splitlines() if self.path.exists() else []
-            same = bool(lines) and _parse(lines[0]) == {"study": identity}
-            self.known: Mapping[str, Outcome] = _read_outcomes(lines[1:]) if same else {}
-            self._count = len(self.known)
-            self._file: IO[str] = self.path.open("a" if same else "w", encoding="utf-8")
-            # a line that was cut ends here
-            self._write("\n" if same else json.dumps({"study": identity}) + "\n")
+            head = _parse(lines[0]) if lines else None
+            before = head.get("study") if isinstance(head, dict) else None
+            if resume:
+                self._check_study(before, study)
+            entries = _read_entries(lines[1:]) if before == study else {}
+            self._marks = {name: mark for name, (mark, _) in entries.items()}
+            self.known: Mapping[str, Outcome] = {name: outcome for name, (_, outcome) in entries.items()}
+            self._count, self._synced, self._is_cut = len(self.known), 0.0, before == study
+            self._file: IO[str] = self.path.open("a" if before == study else "w", encoding="utf-8")
+            self._write([] if before == study else [json.dumps({"study": study})])
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written ({error.strerror}); check the folder") from None
 
-    def add(self, name: str, outcome: Outcome) -> None:
-        """Keep what a case gave; one that failed is computed again by the next run."""
-        if not outcome.error:
-            entry = {"case": name, "results": dict(outcome.results), "seconds": outcome.seconds}
-            with contextlib.suppress(OSError, TypeError):  # a full disk does not end the study
-                self._write(json.dumps(entry) + "\n")
-                self._count += 1
+    def find(self, name: str, mark: str) -> Outcome | None:
+        """What an earlier run computed for a case with the same values, by their mark; None where there is nothing."""
+        return self.known[name] if self._marks.get(name) == mark else None
+
+    def add(self, name: str, mark: str, outcome: Outcome) -> None:
+        """Keep what a case gave, by its name and mark; one that failed is computed again by the next run."""
+        if outcome.error:
+            return
+        entry = {"case": name, "of": mark, "results": dict(outcome.results), "seconds": outcome.seconds}
+        try:
+            self._write([json.dumps(entry)])
+            self._count += 1
+        except OSError as error:  # a full disk does not end the study
+            self._is_cut, self.problem = True, _describe_failure(self.path, error)
 
     def close(self, *, finished: bool) -> None:
         """Close the file; it is deleted where all is done, or nothing is in it."""
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:  # what a full disk has left in the buffer
+            self.problem = _describe_failure(self.path, error)
         if finished or not self._count:
             self.path.unlink(missing_ok=True)
 
-    def _write(self, text: str) -> None:
-        self._file.write(text)
+    def _write(self, lines: list[str]) -> None:
+        """Write whole lines; one that was cut ends first."""
+        self._file.write("\n" * self._is_cut + "".join(f"{line}\n" for line in lines))
         self._file.flush()
-        os.fsync(self._file.fileno())
+        self._is_cut = False
+        if time.monotonic() - self._synced > _SYNC_SECONDS:
+            os.fsync(self._file.fileno())
+            self._synced = time.monotonic()
+
+    def _check_study(self, before: object, study: Mapping[str, str]) -> None:
+        """Raise `InputError` unless the file is of this study."""
+        if not isinstance(before, dict):
+            raise InputError(f"{self.path}: there is nothing to resume; leave out --resume, resume=True in Python")
+        changed = [n for n in {**before, **study} if before.get(n) != study.get(n)]
+        if changed:
+            raise InputError(
+                f"{self.path}: is of another study, {', '.join(changed)} changed since; put that back, or begin anew "
+                "without --resume, resume=True in Python"
+            )
 
 
-def _read_outcomes(lines: list[bytes]) -> dict[str, Outcome]:
-    """The outcomes of the lines that are whole."""
-    entries = [entry for entry in map(_parse, lines) if isinstance(entry, dict) and {"case", "results"} <= entry.keys()]
-    return {entry["case"]: Outcome(entry["results"], float(entry.get("seconds", 0.0))) for entry in entries}
+class CaseMarks:
+    """Hashes of cases: two have the same mark if all their parameters agree.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        What the cases have in common.
+    """
+
+    def __init__(self, parameters: ParameterSet) -> None:
+        self._common = hashlib.sha256(repr(dict(parameters)).encode())
+
+    def of(self, values: CaseValues) -> str:
+        """The mark of a case."""
+        mark = self._common.copy()
+        own = dict(values) if isinstance(values, ParameterSet) else {n: float(v) for n, v in values.items()}
+        mark.update(repr(sorted(own.items(), key=lambda entry: entry[0])).encode())
+        return mark.hexdigest()[:16]
+
+
+def _describe_failure(path: Path, error: OSError) -> str:
+    return f"{path}: cannot be written ({error.strerror}); cases are not kept, make room and run the study again"
+
+
+def _versions() -> dict[str, str]:
+    """What computes, by name and version."""
+    return {f"version of {name}": version for name, version in provenance().items() if name != "options"}
+
+
+def _read_entries(lines: list[bytes]) -> dict[str, tuple[str, Outcome]]:
+    """Marks and outcomes of the lines that are whole, by case; of a case that is there twice, the last."""
+    entries = [entry for entry in map(_parse, lines) if isinstance(entry, dict) and {"case", "of"} <= entry.keys()]
+    return {
+        e["case"]: (e["of"], Outcome(e["results"], float(e.get("seconds", 0.0)))) for e in entries if "results" in e
+    }
 
 
 def _parse(line: bytes) -> object:

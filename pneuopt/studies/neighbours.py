@@ -16,6 +16,7 @@ from pneuopt.quantities.progress import Progress
 from pneuopt.studies.cases import grid
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction
+from pneuopt.studies.processes import Processes
 from pneuopt.studies.sweep import sweep
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def sweep_from_neighbours(
     *,
     value: str,
     starts: Mapping[str, str],
-    executor: Executor | None = None,
+    executor: Executor | Processes | None = None,
     progress: Callable[[Progress], None] | None = None,
     journal: Journal | None = None,
 ) -> "pd.DataFrame":
@@ -117,7 +118,7 @@ def search_again(
     axes: Sequence[str],
     value: str,
     starts: Mapping[str, str],
-    executor: Executor | None = None,
+    executor: Executor | Processes | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> "pd.DataFrame":
     """Compute cells of a grid again that are three times worse than a neighbour, or failed, from that one's result.

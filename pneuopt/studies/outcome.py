@@ -2,7 +2,7 @@
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CaseFunction = Callable[[ParameterSet], Any]
+CaseValues = ParameterSet | Mapping[str, float]
 INTERRUPTED_CASE = "interrupted"
 """The `error` of a case that was not reached, or not finished, when the study was interrupted."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What one case gave.
 
@@ -29,7 +30,7 @@ class Outcome:
     seconds : float
         Time in the function [s].
     error : str
-        Why there are no results; empty where all is well.
+        Why there are no results, or none that is a number; empty where all is well.
     """
 
     results: Mapping[str, Any] = field(default_factory=dict)
@@ -37,16 +38,37 @@ class Outcome:
     error: str = ""
 
 
-def evaluate_case(fn: CaseFunction, values: ParameterSet) -> Outcome:
+def evaluate_cases(fn: CaseFunction, parameters: ParameterSet, cases: Iterable[CaseValues]) -> list[Outcome]:
+    """Evaluate cases one after another; an interruption is the last outcome."""
+    outcomes: list[Outcome] = []
+    for values in cases:
+        outcomes.append(evaluate_case(fn, parameters, values))
+        if outcomes[-1].error == INTERRUPTED_CASE:
+            break
+    return outcomes
+
+
+def evaluate_case(fn: CaseFunction, parameters: ParameterSet, values: CaseValues) -> Outcome:
     """Call the function; whatever it raises becomes the outcome's error, so an outcome always fits through a pipe."""
     begun = time.perf_counter()
     try:
-        result, seconds = fn(values), time.perf_counter() - begun
-        return Outcome(_plain_results(result), seconds)
+        given = values if isinstance(values, ParameterSet) else parameters.with_values(values)
+        begun = time.perf_counter()
+        result, seconds = fn(given), time.perf_counter() - begun
+        results = _plain_results(result)
+        return Outcome(results, seconds, _describe_nan(results))
     except KeyboardInterrupt:
         return Outcome(error=INTERRUPTED_CASE)
     except (Exception, SystemExit) as error:
         return Outcome(seconds=time.perf_counter() - begun, error=describe_error(error))
+
+
+def _describe_nan(results: Mapping[str, Any]) -> str:
+    """What is wrong where no number came out; a NaN among numbers says something: a metric that a response lacks."""
+    numbers = [v for v in results.values() if isinstance(v, float | int) and not isinstance(v, bool)]
+    if not numbers or not all(v != v for v in numbers):  # noqa: PLR0124 - NaN
+        return ""
+    return f"{next(iter(results))} is NaN" if len(results) == 1 else "all its numbers are NaN"
 
 
 def describe_error(error: BaseException) -> str:

@@ -1,24 +1,31 @@
-"""Where a study computes its cases: in processes of its own, or in an executor that the user gives.
+"""Processes of this machine, in which a study computes its cases by default.
 
-Our own are loky's executors of one process each: if a process dies, its executor breaks, and that names the case.
+They are loky's executors of one process each: if a process dies, its executor breaks, and that names the cases that it
+had. They are spawned, not forked, on every system, and have one thread each for linear algebra.
 """
 
 import os
 import pickle
 import re
 import signal
+import sys
 import threading
-from collections import deque
-from collections.abc import Generator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
+import time
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import inf
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for_connections
 from typing import TYPE_CHECKING
 
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.studies.outcome import CaseFunction, Outcome, describe_error, evaluate_case
+from pneuopt.studies.limits import limit_memory
+from pneuopt.studies.outcome import CaseFunction, CaseValues, Outcome, describe_error, evaluate_cases
+from pneuopt.studies.queue import CaseQueue, Chunk
 
 if TYPE_CHECKING:
     import loky
@@ -31,18 +38,66 @@ _NO_START = (
     'the processes of a study cannot start; a script must call the study under `if __name__ == "__main__":`, '
     f"or compute {_THREADS_REMEDY}"
 )
-_function: CaseFunction | None = None  # of a spawned process: what it evaluates
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_LIMIT_SHARE = 0.25  # of a case's time limit that a chunk shall take [1]: one that takes all of it is cut up
+_task: "tuple[CaseFunction, ParameterSet, Processes] | None" = None  # of a spawned process: what it evaluates
 
 
-def run_in_processes(fn: CaseFunction, runs: Mapping[str, ParameterSet]) -> Outcomes:
-    """Evaluate cases in spawned processes, one a CPU, and yield each outcome as it comes.
+@dataclass(frozen=True)
+class Processes:
+    """Processes of this machine as the executor of a study, and what a case may take in them.
 
     Parameters
     ----------
+    count : int, optional
+        By default one a CPU; the table is the same whatever their number.
+    seconds : float
+        Time of a case on the clock [s]; one that takes longer is killed with its process.
+    megabytes : float
+        Memory that a case may take beyond what its process has when the study begins [MiB]; Linux alone.
+    """
+
+    count: int | None = None
+    seconds: float = inf
+    megabytes: float = inf
+
+    def __post_init__(self) -> None:
+        require(self.count is None or self.count >= 1, f"there must be a process at least, got {self.count}")
+        require(self.seconds > 0, f"the time limit of a case must be positive, got {self.seconds:g} s")
+        require(self.megabytes > 0, f"the memory limit of a case must be positive, got {self.megabytes:g} MB")
+        on_linux = sys.platform == "linux" or self.megabytes == inf
+        require(on_linux, "a memory limit of cases needs Linux; leave it out, and compute fewer cases at once")
+
+    @property
+    def time_reason(self) -> str:
+        """Why a case that took too long has no result."""
+        return f"killed: took longer than the {self.seconds:g} s that a case may take"
+
+    @property
+    def memory_reason(self) -> str:
+        """Why a case that needs too much memory has no result."""
+        return f"needs more memory than the {self.megabytes:g} MB that a case may take"
+
+
+def run_in_processes(
+    chosen: Processes,
+    fn: CaseFunction,
+    parameters: ParameterSet,
+    cases: Iterable[tuple[str, CaseValues]],
+    count: int,
+) -> Outcomes:
+    """Evaluate cases in spawned processes and yield each outcome as it comes.
+
+    Parameters
+    ----------
+    chosen : Processes
     fn : callable
         It travels by pickle, once to each process.
-    runs : mapping of str to ParameterSet
-        Parameters by the name of the case.
+    parameters : ParameterSet
+        What the cases have in common.
+    cases : iterable of str and mapping or ParameterSet
+    count : int
+        How many there are.
 
     Yields
     ------
@@ -53,58 +108,132 @@ def run_in_processes(fn: CaseFunction, runs: Mapping[str, ParameterSet]) -> Outc
     InputError
         If the function cannot travel, or no process can start.
     """
-    packed, waiting = _pickle_function(fn), deque(runs.items())
-    crew: list[loky.ProcessPoolExecutor] = []
-    busy: dict[Future[Outcome | None], tuple[loky.ProcessPoolExecutor, str | None]] = {}
-    began = False
-
-    def start_process() -> None:
-        crew.append(_spawn_process())
-        busy[crew[-1].submit(_load_function, packed)] = crew[-1], None
-
+    wanted = min(count, chosen.count or os.cpu_count() or 1, _MAX_PROCESSES)
+    queue = CaseQueue(cases, count, wanted, _LIMIT_SHARE * chosen.seconds)
+    crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
     try:
-        for _ in range(min(len(runs), os.cpu_count() or 1, _MAX_PROCESSES)):
-            start_process()
-        while busy:
-            future = next(iter(wait(busy, return_when=FIRST_COMPLETED).done))
-            process, case = busy.pop(future)
-            outcome = _process_outcome(future, began=began)
-            began = True
-            if isinstance(future.exception(), BrokenProcessPool):
-                crew.remove(process)
-                if waiting and case is not None:
-                    start_process()
-            elif waiting:
-                name, values = waiting.popleft()
-                busy[process.submit(_evaluate, values)] = process, name
-            if case is not None and outcome is not None:
-                yield case, outcome
+        for _ in range(wanted):
+            crew.start()
+        while crew.busy:
+            for run, future in crew.wait():
+                yield from _receive(crew, queue, run, future)
+            yield from _stop_late(crew, queue)
+        while chunk := queue.take():
+            yield from ((name, Outcome(error="no process could be started for it")) for name in chunk.cases)
     finally:
-        computing = {process for process, _ in busy.values()}
-        for process in crew:
+        crew.shut_down()
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What a process computes; without a chunk it loads the function. `deadline` is of `time.monotonic` [s]."""
+
+    process: "loky.ProcessPoolExecutor"
+    chunk: Chunk | None
+    deadline: float
+
+
+class _Crew:
+    """The processes of a study, and what each computes now."""
+
+    def __init__(self, packed: bytes, limits: Processes) -> None:
+        self._packed, self.limits, self.began = packed, limits, False
+        self._processes: list[loky.ProcessPoolExecutor] = []
+        self.busy: dict[Future[list[Outcome]], _Run] = {}
+
+    def start(self) -> None:
+        """Start a process."""
+        process = _spawn_process()
+        self._processes.append(process)
+        with _one_thread_each():
+            self.busy[process.submit(_load_task, self._packed)] = _Run(process, None, inf)
+
+    def give(self, process: "loky.ProcessPoolExecutor", chunk: Chunk) -> None:
+        """Let a process compute a chunk."""
+        run = _Run(process, chunk, time.monotonic() + self.limits.seconds)
+        self.busy[process.submit(_evaluate_chunk, list(chunk.cases.values()))] = run
+
+    def wait(self) -> list[tuple[_Run, "Future[list[Outcome]]"]]:
+        """Wait until a process is done, or has had its time; those that are done, in the order of their chunks."""
+        patience = min(run.deadline for run in self.busy.values()) - time.monotonic()
+        done = wait(self.busy, None if patience == inf else max(patience, 0.0), FIRST_COMPLETED).done
+        return [(self.busy.pop(future), future) for future in list(self.busy) if future in done]
+
+    def late(self) -> list[_Run]:
+        """End the processes that had their time; what they computed."""
+        now = time.monotonic()
+        late = {future: run for future, run in self.busy.items() if run.deadline <= now and not future.done()}
+        for future, run in late.items():
+            del self.busy[future]
+            self.remove(run.process)
+        return list(late.values())
+
+    def remove(self, process: "loky.ProcessPoolExecutor") -> None:
+        """Give a process up."""
+        self._processes.remove(process)
+        process.shutdown(kill_workers=True)
+
+    def shut_down(self) -> None:
+        """End all processes, those that compute at once."""
+        computing = {run.process for run in self.busy.values()}
+        for process in self._processes:
             process.shutdown(kill_workers=process in computing)
 
 
-def run_in_executor(executor: Executor, fn: CaseFunction, runs: Mapping[str, ParameterSet]) -> Outcomes:
-    """Evaluate cases in somebody else's threads, processes or machines, and yield each outcome as it comes."""
-    if isinstance(executor, ProcessPoolExecutor):
-        _pickle_function(fn)
-    futures: dict[Future[Outcome], str] = {}
+def _receive(
+    crew: _Crew, queue: CaseQueue, run: _Run, future: "Future[list[Outcome]]"
+) -> Iterator[tuple[str, Outcome]]:
+    """What a process gave; it, or another if it died, goes on with the next chunk."""
     try:
-        for name, values in runs.items():
-            futures[executor.submit(evaluate_case, fn, values)] = name
-        for future in as_completed(futures):
-            yield futures[future], _executor_outcome(future)
-    finally:
-        for future in futures:
-            future.cancel()
+        outcomes = future.result()
+    except BrokenProcessPool as error:
+        require(crew.began, _NO_START)
+        crew.remove(run.process)
+        if run.chunk is not None:
+            yield from queue.give_back(run.chunk, _describe_death(error))
+        if queue and run.chunk is not None:
+            crew.start()
+        return
+    crew.began = True
+    queue.measure(outcomes)
+    chunk = queue.take()
+    if chunk is not None:
+        crew.give(run.process, chunk)
+    if run.chunk is not None:
+        yield from zip(run.chunk.cases, outcomes, strict=False)  # fewer outcomes where the last is an interruption
+
+
+def _stop_late(crew: _Crew, queue: CaseQueue) -> Iterator[tuple[str, Outcome]]:
+    """Kill what takes too long, and let other processes go on."""
+    for run in crew.late():
+        if run.chunk is not None:
+            yield from queue.separate(run.chunk, crew.limits.time_reason)
+        if queue:
+            crew.start()
+
+
+def _describe_death(error: BrokenProcessPool) -> str:
+    code = re.search(r"\((-?\w+)\)", str(error))  # loky gives it in words only, and not on Windows
+    return "its process died twice" + (f" (exit code {code[1]})" if code else "")
 
 
 def _spawn_process() -> "loky.ProcessPoolExecutor":
-    """An executor of one process, which follows this one."""
+    """An executor of one process, which follows this one, and has one thread for linear algebra: it shares the CPUs."""
     import loky
 
     return loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_follow_parent)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes that are started within have one thread for linear algebra; what the user has said of it goes first."""
+    own = {n: "1" for n in _THREAD_VARIABLES if n not in os.environ}
+    os.environ.update(own)
+    try:
+        yield
+    finally:
+        for n in own:
+            del os.environ[n]
 
 
 def _follow_parent() -> None:
@@ -121,44 +250,40 @@ def _end_with(sentinel: int) -> None:
     os._exit(1)
 
 
-def _load_function(packed: bytes) -> None:
+def _load_task(packed: bytes) -> list[Outcome]:
     """In a spawned process: unpack the function, once for all its cases."""
-    global _function  # noqa: PLW0603 - the state of a worker process, which serves one study
+    global _task  # noqa: PLW0603 - the state of a worker process, which serves one study
+    import pandas as pd  # noqa: F401 - of the results: no case's time
+
     try:
-        _function = pickle.loads(packed)
+        _task = pickle.loads(packed)
     except Exception as error:  # whatever its module raises when imported
         raise InputError(
             f"the function cannot be loaded by other processes: {describe_error(error)}; "
             f"define it in a module that can be imported, or compute {_THREADS_REMEDY}"
         ) from None
+    assert _task is not None
+    limit_memory(_task[2].megabytes)
+    return []
 
 
-def _evaluate(values: ParameterSet) -> Outcome:
+def _evaluate_chunk(cases: list[CaseValues]) -> list[Outcome]:
     """In a spawned process: evaluate its function."""
-    assert _function is not None, "_load_function comes first"
-    return evaluate_case(_function, values)
+    assert _task is not None, "_load_task comes first"
+    fn, parameters, limits = _task
+    outcomes = evaluate_cases(fn, parameters, cases)
+    return [Outcome(seconds=o.seconds, error=limits.memory_reason) if _lacks_memory(o, limits) else o for o in outcomes]
 
 
-def _process_outcome(future: "Future[Outcome | None]", *, began: bool) -> Outcome | None:
-    """What a process gave; None where it has only started, and an `InputError` where none can."""
+def _lacks_memory(outcome: Outcome, limits: Processes) -> bool:
+    """Whether an allocation has failed, in Python or in C++."""
+    return limits.megabytes < inf and bool(re.search("MemoryError|bad_alloc", outcome.error))
+
+
+def pickle_function(fn: CaseFunction, *others: object) -> bytes:
+    """A function with what it needs, as it travels to other processes; `InputError` if it cannot."""
     try:
-        return future.result()
-    except BrokenProcessPool as error:
-        require(began, _NO_START)
-        code = re.search(r"\((-?\d+)\)", str(error))  # loky gives it in words only, and not on Windows
-        return Outcome(error="its process died" + (f" (exit code {code[1]})" if code else ""))
-
-
-def _executor_outcome(future: "Future[Outcome]") -> Outcome:
-    try:
-        return future.result()
-    except Exception as error:  # the executor's own: a broken pool, a cancelled future
-        return Outcome(error=describe_error(error))
-
-
-def _pickle_function(fn: CaseFunction) -> bytes:
-    try:
-        return pickle.dumps(fn)
+        return pickle.dumps((fn, *others))
     except Exception as error:  # pickle raises what it likes
         raise InputError(
             f"the function cannot go to other processes ({error}); give a function of a module, or "

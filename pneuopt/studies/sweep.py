@@ -5,24 +5,27 @@ spawned, not forked, on every system: the function is pickled once for each of t
 `System`, a `ClosedLoop`); machine code comes from the cache.
 """
 
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from contextlib import closing, suppress
-from math import nan
-from typing import TYPE_CHECKING, Any
+from datetime import timedelta
+from typing import TYPE_CHECKING
 
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
-from pneuopt.studies.cases import CaseValues, case_parameters
-from pneuopt.studies.journal import Journal
-from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, Outcome
-from pneuopt.studies.processes import run_in_executor, run_in_processes
+from pneuopt.studies.cases import check_case
+from pneuopt.studies.executors import run_in_executor
+from pneuopt.studies.journal import CaseMarks, Journal
+from pneuopt.studies.outcome import INTERRUPTED_CASE, CaseFunction, CaseValues
+from pneuopt.studies.processes import Processes, run_in_processes
+from pneuopt.studies.rows import CaseRows
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_STUDY_COLUMNS = ("case", "seconds", "error")
+_RATE_AFTER = 5.0  # time after the first case until a rate is shown [s]: earlier ones jump
 
 
 def sweep(
@@ -30,7 +33,7 @@ def sweep(
     parameters: ParameterSet,
     cases: Mapping[str, CaseValues],
     *,
-    executor: Executor | None = None,
+    executor: Executor | Processes | None = None,
     progress: Callable[[Progress], None] | None = None,
     journal: Journal | None = None,
 ) -> "pd.DataFrame":
@@ -45,20 +48,23 @@ def sweep(
         What the cases have in common.
     cases : mapping of str to mapping of str to float, or to ParameterSet
         By the case's name the values that differ, as from `grid`; or all its parameters.
-    executor : concurrent.futures.Executor, optional
-        Where to compute: threads, a cluster's (dask: ``client.get_executor()``). By default one process a CPU.
+    executor : concurrent.futures.Executor or Processes, optional
+        Where to compute: processes of this machine, with limits of time and memory a case, by default one process a
+        CPU; threads; a cluster's (`open_executor`). The table is the same.
     progress : callable, optional
-        Called with a `Progress`, a line of text that knows how many cases are done, after each case.
+        Called with a `Progress`, a line of text that knows how many cases are done, after each case; with the rate and
+        the time left, once there is something to say.
     journal : Journal, optional
-        Keeps each case on the disk as it comes; those that it has already are not computed again.
+        Keeps each case on the disk as it comes; those that it has already, with the same values, are not computed
+        again.
 
     Returns
     -------
     DataFrame
         A row a case, in their order. Columns: "case"; each parameter in which the cases differ from `parameters` [SI];
         the results ("value" for a number; of a DataFrame with one row the columns, with one column the rows, otherwise
-        "row[column]"); "seconds", the time in `fn`; "error", empty where all is well, else the reason, and the results
-        are missing.
+        "row[column]"); "seconds", the time in `fn`; "error", empty where all is well, else the reason: what `fn`
+        raised, a process that died twice, a limit, or results of NaN alone. The results are missing then.
 
     Raises
     ------
@@ -79,50 +85,46 @@ def sweep(
     from pneuopt.quantities.frames import WideFrame  # now: what is interrupted has no seconds left to import pandas
 
     require(len(cases) > 0, "a study needs a case")
-    runs = {str(name): case_parameters(parameters, case, str(name)) for name, case in cases.items()}
-    found = {} if journal is None else {name: journal.known[name] for name in runs if name in journal.known}
-    missing = {name: values for name, values in runs.items() if name not in found}
-    outcomes = run_in_processes(fn, missing) if executor is None else run_in_executor(executor, fn, missing)
-    report = ProgressReporter(progress, "sweep")
+    cases = {str(name): values for name, values in cases.items()}
+    for name, values in cases.items():
+        check_case(parameters, values, name)
+    rows, marks = CaseRows(parameters, cases), CaseMarks(parameters)
+    if journal is not None:
+        for name, values in cases.items():
+            if (outcome := journal.find(name, marks.of(values))) is not None:
+                rows.add(name, outcome)
+    missing = ((name, values) for name, values in cases.items() if rows.is_missing(name))
+    given = fn, parameters, missing, len(cases) - rows.done
+    if executor is None or isinstance(executor, Processes):
+        outcomes = run_in_processes(executor or Processes(), *given)
+    else:
+        outcomes = run_in_executor(executor, *given)
+    report, meter = ProgressReporter(progress, "sweep"), _Meter(rows)
     with closing(outcomes), suppress(KeyboardInterrupt):
-        for name, outcome in outcomes if missing else ():
+        for name, outcome in outcomes if rows.done < len(cases) else ():
             if outcome.error == INTERRUPTED_CASE:
                 break
-            found[name] = outcome
+            rows.add(name, outcome)
             if journal is not None:
-                journal.add(name, outcome)
-            report(_progress_text(found, len(runs)), len(found), len(runs))
-    return WideFrame(_study_columns(parameters, runs, found))
+                journal.add(name, marks.of(cases[name]), outcome)
+            report(meter.text(), rows.done, len(cases))
+    return WideFrame(rows.columns())
 
 
-def _progress_text(found: Mapping[str, Outcome], total: int) -> str:
-    failed = sum(bool(outcome.error) for outcome in found.values())
-    return f"{len(found)} of {total} cases" + (f", {failed} failed" if failed else "")
+class _Meter:
+    """How far a study is, how fast it goes and how long it will take."""
 
+    def __init__(self, rows: CaseRows) -> None:
+        self._rows = rows
+        self._first: tuple[int, float] | None = None  # cases that were done as the first came, and when [s]
 
-def _study_columns(
-    parameters: ParameterSet, runs: Mapping[str, ParameterSet], found: Mapping[str, Outcome]
-) -> dict[str, list[Any]]:
-    swept = list(dict.fromkeys(n for values in runs.values() for n in values if _differs(n, values, parameters)))
-    outcomes = {
-        name: _check_column_names(found.get(name, Outcome(error=INTERRUPTED_CASE)), {*_STUDY_COLUMNS, *swept})
-        for name in runs
-    }
-    results = dict.fromkeys(n for outcome in outcomes.values() for n in outcome.results)
-    columns: dict[str, list[Any]] = {"case": list(runs)}
-    columns |= {n: [v.value(n) if n in v else nan for v in runs.values()] for n in swept}
-    columns |= {n: [outcome.results.get(n, nan) for outcome in outcomes.values()] for n in results}
-    columns |= {n: [getattr(outcome, n) for outcome in outcomes.values()] for n in ("seconds", "error")}
-    return columns
-
-
-def _differs(name: str, values: ParameterSet, parameters: ParameterSet) -> bool:
-    return name not in parameters or values.value(name) != parameters.value(name)
-
-
-def _check_column_names(outcome: Outcome, taken: set[str]) -> Outcome:
-    twice = taken.intersection(outcome.results)
-    if not twice:
-        return outcome
-    said = f"{', '.join(sorted(twice))}: a result has the name of a column of the study; rename it"
-    return Outcome(seconds=outcome.seconds, error=said)
+    def text(self) -> str:
+        """A line; rate and time left are in it some seconds after the first case."""
+        rows, now = self._rows, time.monotonic()
+        known, begun = self._first = self._first or (rows.done, now)
+        text = f"{rows.done} of {rows.count} cases" + (f", {rows.failed} failed" if rows.failed else "")
+        if now - begun < _RATE_AFTER:
+            return text
+        rate = (rows.done - known) / (now - begun)
+        left = round((rows.count - rows.done) / rate)
+        return f"{text}, {rate:.3g} a second, {timedelta(seconds=left)} left"

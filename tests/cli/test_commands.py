@@ -2,10 +2,11 @@
 
 import json
 import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -68,6 +69,11 @@ points = 3
 FRONT_LINE = "study front.toml -o front.csv --json front.json --plot front.png"
 
 
+def in_threads(function: Callable[..., Any], executor: Executor) -> Callable[..., Any]:
+    """A study that starts no processes."""
+    return lambda *given, **options: function(*given, **{**options, "executor": executor})
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The files of a study, which runs in a thread."""
@@ -76,7 +82,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     with ThreadPoolExecutor(1) as executor:
-        monkeypatch.setattr(study_module, "sweep", partial(sweep, executor=executor))
+        monkeypatch.setattr(study_module, "sweep", in_threads(sweep, executor))
         yield tmp_path
 
 
@@ -112,7 +118,7 @@ def tuned(front: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     edit("tuning.toml", "[limits]", '[minimise]\nsettling_time = { band = "5 %", weight = 1.0 }\n[limits]')
     edit("tuning.toml", 'settling_time = { max = "250 ms", band = "5 %" }', "")
     edit("tuning.toml", "[limits]", '[method]\nkind = "racing"\ntrials = 40\npolish = 0\n[limits]')
-    inside = partial(sweep_from_neighbours, executor=ThreadPoolExecutor(1))
+    inside = in_threads(sweep_from_neighbours, ThreadPoolExecutor(1))
     monkeypatch.setattr(study_module, "sweep_from_neighbours", inside)
     return front
 
@@ -222,7 +228,7 @@ def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pyte
         raise KeyboardInterrupt
 
     with ThreadPoolExecutor(1) as executor:
-        interrupted = partial(sweep, executor=executor)
+        interrupted = in_threads(sweep, executor)
         monkeypatch.setattr(study_module, "sweep", lambda *a, **k: interrupted(*a, **{**k, "progress": interrupt}))
         result = run(LINE)
     assert result.exit_code == 130
@@ -230,11 +236,54 @@ def test_an_interrupted_study_keeps_what_is_done(folder: Path, monkeypatch: pyte
     assert pd.read_csv("cases.csv")["error"].fillna("").tolist() == ["", *["interrupted"] * 3]
     assert not Path("map.png").exists(), "an interrupted command ends soon, without a figure"
     assert len(Path("cases.csv.journal").read_text("utf-8").splitlines()) == 2
-    monkeypatch.setattr(study_module, "sweep", partial(sweep, executor=ThreadPoolExecutor(1)))
+    monkeypatch.setattr(study_module, "sweep", in_threads(sweep, ThreadPoolExecutor(1)))
     again = run(LINE)
     assert again.stderr.startswith("warning: cases.csv.journal: 1 of 4 cases are known from an earlier run")
     assert pd.read_csv("cases.csv")["error"].isna().all()
     assert not Path("cases.csv.journal").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--executor somewhere", "executor 'somewhere': give a number of processes, dask, or a scheduler, tcp://"),
+        ("--executor 0", "there must be a process at least, got 0"),
+        ("--executor dask --time-limit 5", "hold in processes of this machine, not on dask"),
+        ("--time-limit -1", "the time limit of a case must be positive, got -1 s"),
+        ("--memory-limit 0", "the memory limit of a case must be positive, got 0 MB"),
+        ("--resume", "--resume goes on where the file of -o or --json was left: name it"),
+        ("-o cases.csv --resume", "cases.csv.journal: there is nothing to resume; leave out --resume"),
+    ],
+)
+def test_bad_options_of_a_study_are_refused(folder: Path, options: str, said: str) -> None:
+    result = run(f"study study.toml -q {options}")
+    assert result.exit_code == 2
+    assert said in " ".join(result.stderr.split())
+    assert not Path("cases.csv.journal").exists()
+
+
+def test_a_changed_file_is_not_resumed(folder: Path) -> None:
+    Path("cases.csv.journal").write_text('{"study": {"sha256[study.toml]": "0"}}\n', encoding="utf-8")
+    result = run("study study.toml -q -o cases.csv --resume")
+    assert result.exit_code == 2
+    assert "is of another study, sha256[study.toml], " in " ".join(result.stderr.split())
+    assert Path("cases.csv.journal").exists()
+
+
+def test_samples_are_certified_and_shown(folder: Path) -> None:
+    edit(
+        "study.toml",
+        "[axes]",
+        "[samples]\ncount = 3\n'load.mass' = { distribution = 'normal', spread = '5 %' }\n[axess]",
+    )
+    text = Path("study.toml").read_text("utf-8").partition("[axess]")[0]
+    Path("study.toml").write_text(text, encoding="utf-8")
+    result = run("study study.toml -q -o cases.csv")
+    assert result.stdout.startswith("3 cases, each the worst of 2 references")
+    assert pd.read_csv("cases.csv")["load.mass [kg]"].between(4, 6).all()
+    assert "--plot draws a grid of one or two [axes]" in " ".join(
+        run("study study.toml -q --plot map.png").stderr.split()
+    )
 
 
 def test_processes_do_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,12 @@
 """A study that ends early goes on where it was."""
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from math import nan
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -16,6 +20,7 @@ from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
 from pneuopt.studies.sweep import sweep
 
 RIG = ParameterSet({"mass": Parameter(1.0, "kg"), "gain": Parameter(1.0, "1")})
+ONE = ThreadPoolExecutor(1)
 CASES = grid(RIG, {"mass": [1.0, 2.0, 3.0, 4.0]})
 
 
@@ -64,7 +69,7 @@ def test_what_another_study_has_left_is_not_read(tmp_path: Path) -> None:
 
 def test_a_study_that_is_done_leaves_no_journal(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal", "study")
-    journal.add("a", Outcome({"x": 1.0}, 0.1))
+    journal.add("a", "0", Outcome({"x": 1.0}, 0.1))
     journal.close(finished=True)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(InputError, match="cannot be written"):
@@ -92,3 +97,94 @@ def test_an_interrupted_search_from_neighbours_begins_no_other_wave() -> None:
     assert table["error"].tolist() == ["", *[INTERRUPTED_CASE] * 3]
     assert table["mass"].tolist() == [1.0, 2.0, 3.0, 4.0]
     assert not table["again"].any()
+
+
+def test_a_case_of_the_same_name_with_other_values_is_computed_again(tmp_path: Path) -> None:
+    def run(parameters: ParameterSet, mass: float) -> float:
+        journal = Journal(tmp_path / "journal", "study")
+        cases = {"sample 1": {"mass": mass}}
+        table = sweep(lambda p: p.value("mass") * p.value("gain"), parameters, cases, executor=ONE, journal=journal)
+        journal.close(finished=False)
+        return float(table["value"].iloc[0])
+
+    assert [run(RIG, 2.0), run(RIG, 3.0), run(RIG.with_values({"gain": 5.0}), 3.0)] == [2.0, 3.0, 15.0]
+
+
+def test_a_study_is_resumed_only_if_nothing_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, inputs = tmp_path / "journal", {"drive.toml": "1", "tuning.toml": "2"}
+    with pytest.raises(InputError, match="there is nothing to resume; leave out --resume"):
+        Journal(path, inputs, resume=True)
+    journal = Journal(path, inputs)
+    journal.add("a", "mark", Outcome({"x": 1 / 3}, 0.1))
+    journal.close(finished=False)
+    again = Journal(path, inputs, resume=True)
+    again.close(finished=False)
+    assert again.find("a", "mark") == Outcome({"x": 1 / 3}, 0.1)
+    said = r"is of another study, tuning\.toml changed since; put that back, or begin anew"
+    with pytest.raises(InputError, match=said):
+        Journal(path, {**inputs, "tuning.toml": "3"}, resume=True)
+    monkeypatch.setattr("pneuopt.studies.journal.provenance", lambda: {"casadi": "9.9", "options": ""})
+    with pytest.raises(InputError, match="version of casadi"):
+        Journal(path, inputs, resume=True)
+    assert len(path.read_text("utf-8").splitlines()) > 1  # what was refused is still there
+
+
+class FullDisk:
+    """A file that has no room for a while."""
+
+    def __init__(self, file: Any) -> None:
+        self.file, self.full = file, True
+
+    def write(self, text: str) -> None:
+        self.file.write(text[:10] if self.full else text)
+        if self.full:
+            raise OSError(28, "No space left on device")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
+
+
+def test_a_full_disk_costs_rows_of_the_journal_and_is_said(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal", "study")
+    journal._file = disk = FullDisk(journal._file)  # type: ignore[assignment]
+    journal.add("a", "0", Outcome({"x": 1.0}, 0.1))
+    assert "No space left on device" in journal.problem
+    disk.full = False
+    journal.add("b", "0", Outcome({"x": 2.0}, 0.1))
+    journal.close(finished=False)
+    again = Journal(tmp_path / "journal", "study")
+    again.close(finished=False)
+    assert dict(again.known) == {"b": Outcome({"x": 2.0}, 0.1)}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="kills itself")
+def test_a_study_that_is_killed_loses_no_row_and_ends_in_the_same_table(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, signal, sys\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "from pneuopt import Journal, Parameter, ParameterSet, sweep\n"
+        "rig = ParameterSet({'mass': Parameter(1.0, 'kg')})\n"
+        "cases = {f'case {k}': {'mass': 1 + k / 7} for k in range(40)}\n"
+        "journal = Journal('journal', 'study')\n"
+        "print(len(journal.known))\n"
+        "def kill(news):\n"
+        "    if news.done == 17 and 'kill' in sys.argv:\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "table = sweep(lambda p: p.value('mass') ** 0.3, rig, cases, executor=ThreadPoolExecutor(1),\n"
+        "              journal=journal, progress=kill)\n"
+        "print([v.hex() for v in table['value']])\n",
+        encoding="utf-8",
+    )
+
+    def run(*words: str) -> tuple[int, list[str]]:
+        done = subprocess.run(
+            [sys.executable, script, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        return done.returncode, done.stdout.splitlines()
+
+    assert run("kill")[0] == -9
+    code, (known, resumed) = run()
+    assert (code, known) == (0, "17")
+    (tmp_path / "journal").unlink()
+    assert run() == (0, ["0", resumed])
