@@ -1,0 +1,72 @@
+"""How `pneuopt study` computes its cases, and which it takes."""
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pneuopt.cli import study as study_module
+from pneuopt.studies.sweep import sweep
+from tests.cli.test_commands import DRIVE, STUDY, TUNING, in_threads, run
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The files of a study, which runs in a thread."""
+    for name, text in {"drive": DRIVE, "tuning": TUNING, "study": STUDY}.items():
+        (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    with ThreadPoolExecutor(1) as executor:
+        monkeypatch.setattr(study_module, "sweep", in_threads(sweep, executor))
+        yield tmp_path
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--executor somewhere", "executor 'somewhere': give a number of processes, dask, or a scheduler, tcp://"),
+        ("--executor 0", "there must be a process at least, got 0"),
+        ("--executor dask --time-limit 5", "hold in processes of this machine, not on dask"),
+        ("--time-limit -1", "the time limit of a case must be positive, got -1 s"),
+        ("--memory-limit 0", "the memory limit of a case must be positive, got 0 MB"),
+        ("--resume", "--resume goes on where the file of -o or --json was left: name it"),
+        ("-o cases.csv --resume", "cases.csv.journal: there is nothing to resume; leave out --resume"),
+    ],
+)
+def test_bad_options_of_a_study_are_refused(folder: Path, options: str, said: str) -> None:
+    result = run(f"study study.toml -q {options}")
+    assert result.exit_code == 2
+    assert said in " ".join(result.stderr.split())
+    assert not Path("cases.csv.journal").exists()
+
+
+def test_a_changed_file_is_not_resumed(folder: Path) -> None:
+    Path("cases.csv.journal").write_text('{"study": {"sha256[study.toml]": "0"}}\n', encoding="utf-8")
+    result = run("study study.toml -q -o cases.csv --resume")
+    assert result.exit_code == 2
+    assert "is of another study, sha256[study.toml], " in " ".join(result.stderr.split())
+    assert Path("cases.csv.journal").exists()
+
+
+def test_samples_are_certified_and_shown(folder: Path) -> None:
+    text = Path("study.toml").read_text("utf-8").partition("[axes]")[0]
+    text += "[samples]\ncount = 3\n'load.mass' = { distribution = 'normal', spread = '5 %' }\n"
+    Path("study.toml").write_text(text, encoding="utf-8")
+    result = run("study study.toml -q -o cases.csv")
+    assert result.stdout.startswith("3 cases, each the worst of 2 references")
+    assert pd.read_csv("cases.csv")["load.mass [kg]"].between(4, 6).all()
+    assert "--plot draws a grid of one or two [axes]" in " ".join(
+        run("study study.toml -q --plot map.png").stderr.split()
+    )
+
+
+def test_processes_do_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run("study study.toml -o threads.csv")
+    monkeypatch.setattr(study_module, "sweep", sweep)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert run("study study.toml -o processes.csv").exit_code == 0
+    one, other = (pd.read_csv(f"{name}.csv").drop(columns="seconds [s]") for name in ("threads", "processes"))
+    pd.testing.assert_frame_equal(one, other)
