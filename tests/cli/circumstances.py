@@ -290,7 +290,7 @@ CIRCUMSTANCES: dict[str, tuple[Callable[[Place], "str | None"], int, str, str]] 
     "no HOME": (_no_home, 0, NEW, ""),
     "a user without an entry or HOME": (_root_unknown_user, 0, NEW, ""),
     "read-only everything": (_root_read_only, 0, OLD, "converged"),
-    "read-only everything, with -o": (_root_read_only_with_output, BAD, OLD, "cannot be written"),
+    "read-only everything, with -o": (_root_read_only_with_output, BAD, OLD, "write-protected"),
 }
 """What is prepared, which may give another command; then the exit status, what becomes of out.toml, and words said."""
 
