@@ -11,8 +11,9 @@ whole study is --count 200.
 
 `other` are rigs of other sizes and loops (problems/shared/random_rig.py): hunting, staircases, chirps, one-way motion,
 strokes, up to 60 s at 0.5 to 2 kHz, noise not stated; every other five with bristles. Their logs need not identify
-every parameter: a parameter that is named unidentifiable is no lie, and `.named` is the share of these. Its whole
-study is --count 100.
+every parameter: a parameter that is named unidentifiable is no lie, and `.named` is the share of these. A search ends
+after 60 CPU s, which counts as not converged. Each rig's line is printed to stderr as it ends. Its whole study is
+--count 100.
 
 --encoder logs the position in steps of that size in place of its noise, --outliers puts that fraction of the samples of
 each channel 20 standard deviations off; the figures are then shown, and nothing is claimed.
@@ -55,6 +56,7 @@ RANGES = {  # lower, upper; all but Coulomb friction and leak are uniform in the
 UNIFORM = ("friction.coulomb", "valve.leak")
 BRISTLES = ("friction.bristle_stiffness", "friction.bristle_damping")
 PERCENT, DEVIATIONS, OUTLYING = 2.0, 4.0, 20.0
+LONGEST = 60.0  # [CPU s] after which a rig's search ends: three times what is claimed of the worst
 
 
 def main(
@@ -132,15 +134,20 @@ def identified_rig(given: po.ParameterSet) -> dict[str, Any]:
     log = random_rig.record(rig, seed)
     own = {"motion": rig.motion, "seconds_logged": rig.samples * rig.sample, "rate": 1 / rig.sample}
     known = rig.truth.select(po.catalog.b32(rig.lugre)[1])
-    return _row(kind, log, known, rig.truth) | own | {"oscillation": random_rig.oscillation(log)}
+    row = _row(kind, log, known, rig.truth, LONGEST)
+    shown = {n: row[n] for n in ("converged", "outside_unnamed", "worst", "cpu", "misfit")}
+    print(f"{rig.motion} {seed} {kind} {rig.samples}: {shown}", file=sys.stderr)
+    return row | own | {"oscillation": random_rig.oscillation(log)}
 
 
-def _row(kind: str, log: po.Experiment, given: po.ParameterSet, truth: po.ParameterSet) -> dict[str, Any]:
+def _row(
+    kind: str, log: po.Experiment, given: po.ParameterSet, truth: po.ParameterSet, longest: float = math.inf
+) -> dict[str, Any]:
     """What an identification without a guess makes of a log."""
     unit, free, drive = _unit(kind), _free(kind), po.catalog.b32(kind == "lugre")[0]
     blind = given.with_values({n: drive.parameters.value(n) for n in free}).freed(*free)
     began = time.process_time()
-    fit = po.identify(drive.system(), [log], blind, throw=False)
+    fit = po.identify(drive.system(), [log], blind, cpu_seconds=longest, throw=False)
     seconds = time.process_time() - began
     percent, sigmas = _off(fit.estimates, truth)
     outside = np.minimum(percent / PERCENT, np.where(np.isnan(sigmas), np.inf, sigmas) / DEVIATIONS)
