@@ -40,10 +40,14 @@ class Asker:
         if not self.interactive:
             self.assumed.append(f"{question.channel}: {question.text} Taken: {question.options[0]}")
             return question.options[0]
-        answer = ""
-        while answer not in question.options:
-            answer = typer.prompt(f"{question.text} ({' / '.join(question.options)})", default=question.options[0])
-        return answer
+        while True:
+            text = f"{question.text}\n  {' / '.join(question.options)}"
+            answer = typer.prompt(text, default=question.options[0]).strip()
+            letter = f"({answer.strip('()')})"  # of "bar(g)"
+            for option in question.options:
+                if answer == option or option.endswith(letter):
+                    return option
+            typer.echo(f"answer one of {', '.join(question.options)}")
 
 
 def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], log: Path | None, force: bool) -> int:

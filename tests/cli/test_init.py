@@ -363,7 +363,7 @@ def test_a_log_that_does_not_is_met_with_a_question(tmp_path: Path) -> None:
     assert not (tmp_path / "drive.toml").exists()
 
 
-def test_on_a_terminal_the_user_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_terminal_the_user_is_asked(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     asked: list[str] = []
     answers = iter(["furlong", "m"])
 
@@ -374,4 +374,12 @@ def test_on_a_terminal_the_user_is_asked(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("pneuopt.cli.init.typer.prompt", prompt)
     ask = Asker(interactive=True)
     assert ask(Question("position", "In which unit?", ("mm", "m"))) == "m"
-    assert (asked, ask.assumed) == (["In which unit? (mm / m) mm"] * 2, [])
+    assert (asked, ask.assumed) == (["In which unit?\n  mm / m mm"] * 2, [])
+    assert capsys.readouterr().out == "answer one of mm, m\n"
+
+
+@pytest.mark.parametrize("answer", ["g", "(g)", " bar(g) "])
+def test_a_question_takes_the_letter_that_it_names(answer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pneuopt.cli.init.typer.prompt", lambda *_, **__: answer)
+    ask = Asker(interactive=True)
+    assert ask(Question("pressure_a", "Absolute (a), or gauge (g)?", ("bar(a)", "bar(g)"))) == "bar(g)"
