@@ -4,7 +4,7 @@ A simulated log has the inputs of the logged one, its noise, its resolution and 
 fitted state, and again wherever the simulation has left the fitted motion (`MAX_WANDER`), as an axis without its loop
 does: the excitation is that of the log. What the fits of simulated logs make of estimates that are known then shows
 what the one fit of the real logs has made of the truth. Source: Efron, Tibshirani, An Introduction to the Bootstrap,
-1993, chapter 6 (the parametric bootstrap).
+1993, chapters 6 (the parametric bootstrap) and 10 (the value less its bias).
 """
 
 import itertools
@@ -67,9 +67,10 @@ class Bootstrap(Shown):
     Attributes
     ----------
     table : DataFrame
-        A row an estimate: value, the fit's, with which the logs were simulated; unit; bias, the mean of the draws less
-        the value; bias_error, its standard error; spread, the standard deviation of the draws; stderr, as the fit of
-        the real logs claims it; intervals, the draws that had one, and covered, those whose interval holds the value.
+        A row an estimate: value, the fit's, with which the logs were simulated; unit; corrected, the value less the
+        bias; bias, the mean of the draws less the value; bias_error, its standard error; spread, the standard deviation
+        of the draws; stderr, as the fit of the real logs claims it; intervals, the draws that had one, and covered,
+        those whose interval holds the value.
     draws : DataFrame
         A row a draw: "error", empty where it was fitted; "verdict"; by estimate its value and the ends of its interval.
     """
@@ -95,13 +96,14 @@ class Bootstrap(Shown):
         head = [Line(f"{lead}; distrust {', '.join(wrong)}", Tone.DOUBTFUL) if wrong else Line(good, Tone.GOOD)]
         head += [Line(f"{name}: {why}", indent=2) for name, why in wrong.items()]
         head += [Line(f"{len(failed)} not fitted, the first one: {failed.iloc[0]}", indent=2)] if len(failed) else []
-        figures = ("value", "bias", "error of bias", "spread", "claimed")
+        figures = ("value", "bias", "corrected", "spread", "claimed")
         rows = []
         for name, row in self.table.iterrows():
             held = f"{row['covered']:.0f} of {row['intervals']:.0f}"
-            numbers = (row["value"], row["bias"], row["bias_error"], row["spread"], row["stderr"])
-            rows.append((str(name), *(format_number(v, 3) for v in numbers), held, str(row["unit"])))
-        columns = *text_columns("parameter"), *number_columns(*figures, "intervals that hold"), *text_columns("unit")
+            given = (row["value"], row["bias"], row["corrected"], row["spread"], row["stderr"])
+            numbers = (format_number(v, digits) for v, digits in zip(given, (4, 2, 4, 2, 2), strict=True))
+            rows.append((str(name), *numbers, held, str(row["unit"])))
+        columns = *text_columns("parameter"), *number_columns(*figures, "interval holds"), *text_columns("unit")
         return Report((*head, Table(columns, tuple(rows))))
 
 
@@ -310,12 +312,14 @@ def _tabulate(fit: IdentificationResult, draws: "pd.DataFrame") -> "pd.DataFrame
         if row["mark"] == Mark.UNIDENTIFIABLE or f"{name}.value" not in draws:
             continue
         value, found = float(row["value"]), draws[f"{name}.value"].dropna()
+        bias = float(found.mean()) - value
         low, high = (draws[f"{name}.{end}"] for end in ("ci_low", "ci_high"))
         spread = float(found.std())
         rows[name] = {
             "value": value,
             "unit": row["unit"],
-            "bias": float(found.mean()) - value,
+            "corrected": value - bias,
+            "bias": bias,
             "bias_error": spread / math.sqrt(max(len(found), 1)),
             "spread": spread,
             "stderr": float(row["stderr"]),

@@ -13,7 +13,7 @@ from tests.cli.test_check import folder, run, write
 from tests.logs.bad_logs import swing
 
 __all__ = ["folder"]  # the fixture: a drive.toml in a folder of its own
-ROW = {"value": 30.0, "unit": "N", "bias": 1.5, "bias_error": 0.1, "spread": 0.2, "stderr": 0.2}
+ROW = {"value": 30.0, "unit": "N", "corrected": 28.5, "bias": 1.5, "bias_error": 0.1, "spread": 0.2, "stderr": 0.2}
 FOUND = Bootstrap(
     pd.DataFrame({"friction.coulomb": ROW | {"intervals": 3, "covered": 0}}).T.infer_objects(),
     pd.DataFrame({"error": ["", "", ""]}),

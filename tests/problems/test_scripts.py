@@ -7,7 +7,17 @@ import pytest
 
 from problems.demo import other_rigs, rig_demo
 from problems.friction import stick_slip
-from problems.identify import b32, b32_partial, emps, foreign_rig, real_logs, seal_friction, step_response, windows
+from problems.identify import (
+    b32,
+    b32_partial,
+    bootstrap_bias,
+    emps,
+    foreign_rig,
+    real_logs,
+    seal_friction,
+    step_response,
+    windows,
+)
 from problems.speed import simulation_speed
 from problems.tune import pareto, supply_and_load, tune_drive
 
@@ -41,6 +51,11 @@ def test_step_response() -> None:
 @pytest.mark.slow
 def test_windows() -> None:
     assert failed(windows.main()) == []
+
+
+@pytest.mark.slow
+def test_bootstrap_bias() -> None:
+    assert failed(bootstrap_bias.main(bootstrap_bias.run(count=3, rigs=[2]))) == []
 
 
 @pytest.mark.slow

@@ -69,6 +69,8 @@ def test_the_bias_of_a_model_that_does_not_stick_is_told_with_its_sign_and_size(
     found = tried(log, fit, STICKING, count=3)
     done = fit.estimates["value"].loc[list(FREE)] - np.array([TRUTH.value(n) for n in FREE])
     assert found.table["bias"].loc[list(FREE)].to_numpy() == pytest.approx(done.to_numpy(), rel=0.35)
+    off = found.table["corrected"].loc[list(FREE)] - np.array([TRUTH.value(n) for n in FREE])
+    assert (off.abs() < 0.35 * done.abs()).all()
     assert set(found.doubts) == set(FREE)
     assert "too" in found.doubts["friction.coulomb"]
 
