@@ -44,7 +44,7 @@ def main(found: Found) -> "pd.DataFrame":
     before, after = (np.concatenate([t[part] for t in found.values()]) for part in ("error", "corrected"))
     left = float(np.linalg.norm(after) / np.linalg.norm(before))
     claims.append(Claim("demo.right_signs", right, "1", len(marked), f">= {len(marked)}"))
-    return frame([*claims, Claim("left", left, "1", None, "<= 0.6")])
+    return frame([*claims, Claim("left", left, "1", None, "<= 0.5")])
 
 
 def run(count: int = COUNT, rigs: Sequence[int] = RIGS) -> Found:
