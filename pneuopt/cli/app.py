@@ -139,7 +139,7 @@ def identify_command(
         typer.Option(
             "--bootstrap",
             metavar="N",
-            help="Simulate the logs N times with the estimates and true stick-slip, and identify them again.",
+            help="Simulate the logs N times with the estimates, and with stick-slip if the fit misses them; fit again.",
         ),
     ] = 0,
     quiet: Quiet = False,

@@ -81,10 +81,10 @@ class Bootstrap(Shown):
     @property
     def doubts(self) -> Mapping[str, str]:
         """By estimate, why its value or its interval is not to be trusted; what is not here may be."""
-        return {str(n): why for n, row in self.table.iterrows() if (why := _distrust(row))}
+        return {str(n): why for n, row in self.table.iterrows() if (why := _reason_for_doubt(row))}
 
     def summary(self) -> Report:
-        """Which estimates to distrust, and why; then a row an estimate."""
+        """Which estimates to doubt, and why; then a row an estimate."""
         failed = self.draws["error"][self.draws["error"] != ""]
         fitted, wrong = len(self.draws) - len(failed), self.doubts
         if not fitted:
@@ -92,8 +92,8 @@ class Bootstrap(Shown):
                 (Line(f"none of {len(failed)} simulated sets of logs is fitted: {failed.iloc[0]}", Tone.BAD),)
             )
         lead = f"{fitted} of {len(self.draws)} simulated sets of logs are fitted"
-        good = f"{lead}; no estimate is to be doubts"
-        head = [Line(f"{lead}; distrust {', '.join(wrong)}", Tone.DOUBTFUL) if wrong else Line(good, Tone.GOOD)]
+        good = f"{lead}; no estimate is to be doubted"
+        head = [Line(f"{lead}; doubt {', '.join(wrong)}", Tone.DOUBTFUL) if wrong else Line(good, Tone.GOOD)]
         head += [Line(f"{name}: {why}", indent=2) for name, why in wrong.items()]
         head += [Line(f"{len(failed)} not fitted, the first one: {failed.iloc[0]}", indent=2)] if len(failed) else []
         figures = ("value", "bias", "corrected", "spread", "claimed")
@@ -172,7 +172,7 @@ def bootstrap(
     return Bootstrap(_tabulate(fit, draws), draws)
 
 
-def _distrust(row: "pd.Series[Any]") -> str:
+def _reason_for_doubt(row: "pd.Series[Any]") -> str:
     """Why an estimate is not to be trusted; empty where it may be."""
     from scipy.stats import binom
 

@@ -1,6 +1,7 @@
 """`pneuopt identify --bootstrap`: a fit is tried on simulated logs of the drive that truly sticks."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,9 @@ import pandas as pd
 import pytest
 
 import pneuopt.cli.identify as identify_module
+from pneuopt.identification.identify import identify
+from pneuopt.identification.marks import Mark
+from pneuopt.identification.result import IdentificationResult
 from pneuopt.studies.bootstrap import Bootstrap
 from tests.cli.test_check import folder, run, write
 from tests.logs.bad_logs import swing
@@ -20,20 +24,29 @@ FOUND = Bootstrap(
 )
 
 
-def test_the_table_follows_the_fit_on_the_screen_and_in_json(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("mark", "friction"), [(Mark.EXACT, "Coulomb"), (Mark.BIAS_POSSIBLE, "Karnopp")])
+def test_the_table_follows_the_fit_and_a_rig_that_sticks_stands_in_where_the_fit_misses_the_logs(
+    mark: Mark, friction: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     given: dict[str, Any] = {}
 
     def keep(*_: object, **options: object) -> Bootstrap:
         given.update(options)
         return FOUND
 
+    def fit(*arguments: Any, **options: Any) -> IdentificationResult:
+        result = identify(*arguments, **options)
+        return replace(result, estimates=result.estimates.assign(mark=str(mark)))
+
     monkeypatch.setattr(identify_module, "bootstrap", keep)
+    monkeypatch.setattr(identify_module, "identify", fit)
     write(swing().select(["position", "force"]))
     result = run("identify drive.toml run.csv -q --bootstrap 3 --json fit.json")
     assert result.exit_code == 0
     assert given["count"] == 3
-    assert "Karnopp" in repr(given["rig"].friction)
-    assert "distrust friction.coulomb" in result.stdout
+    assert type(given["rig"].friction).__name__ == friction
+    assert ("truly sticks" in result.stdout) == (mark == Mark.BIAS_POSSIBLE)
+    assert "doubt friction.coulomb" in result.stdout
     assert "5 % too high, and 0 of 3 intervals hold its value" in " ".join(result.stdout.split())
     assert json.loads((folder / "fit.json").read_text("utf-8"))["bootstrap"][0]["bias"] == 1.5
 

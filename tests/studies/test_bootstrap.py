@@ -58,7 +58,7 @@ def test_the_fit_of_a_right_model_holds(right: tuple[Experiment, IdentificationR
     assert (found.table["intervals"] == 8).all()
     assert found.doubts == {}
     assert (found.table["spread"] / found.table["stderr"]).between(0.5, 2.0).all()
-    assert "8 of 8 simulated sets of logs are fitted; no estimate is to be doubts" in repr(found)
+    assert "8 of 8 simulated sets of logs are fitted; no estimate is to be doubted" in repr(found)
 
 
 def test_the_bias_of_a_model_that_does_not_stick_is_told_with_its_sign_and_size() -> None:
