@@ -337,7 +337,8 @@ class Search:
     def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
         """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
 
-        The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts.
+        The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts;
+        where no parameter is free, the states are what is asked for.
         """
         promised = 0.5 * current.equations.arrow.descent_rate(step)
         is_last, misfit = self.stage is self.method.stages[-1], max(1.0, 2 * current.cost / current.equations.count)
@@ -346,8 +347,9 @@ class Search:
             return promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
         if is_last and promised < FINAL_COST_TOLERANCE * misfit:
             return True
-        is_settled = promised < SETTLED_COST_DECREASE * misfit or self.noisy_gaps or self.is_coarse
-        if not (is_settled and promised < STAGE_COST_TOLERANCE * current.cost):
+        asks_parameters = bool(self.segments.transcription.parameters.free_names)
+        is_settled = asks_parameters and (self.is_coarse or promised < SETTLED_COST_DECREASE * misfit)
+        if not ((is_settled or self.noisy_gaps) and promised < STAGE_COST_TOLERANCE * current.cost):
             return False
         keep = self.scaling.movable(current.z, current.equations, reduced)
         largest = largest_parameter_step(current.equations, keep, reduced, step)

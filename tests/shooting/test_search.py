@@ -9,14 +9,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pneuopt.quantities.arrays import Array
+from pneuopt.shooting.arrow import GaussNewtonStep, ReducedEquations
 from pneuopt.shooting.equations import correct_residuals, normal_equations
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
+from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search import FINE_TOLERANCE, Search
 from pneuopt.shooting.search_end import JOINED_SEARCH
 from pneuopt.shooting.segments import IntegrationCorrection, segment, start_nodes
 from pneuopt.shooting.solution import Fit
-from tests.shooting.test_least_squares import found, shaken, two_logs
+from tests.shooting.test_least_squares import TRUTH, found, shaken, two_logs
 
 FIRST, *OTHERS = LeastSquares().stages
 
@@ -156,3 +158,19 @@ def test_a_search_that_comes_to_where_another_one_was_ends_there() -> None:
     assert other.status is not JOINED_SEARCH
     tight = solve_least_squares(two_logs(), LeastSquares(known_costs=((FIRST.gap, 0.0),)))
     assert [gap for gap, _ in tight.stage_costs] == [stage.gap for stage in (*OTHERS[1:], OTHERS[-1])]
+
+
+def test_states_are_searched_to_the_end_where_no_parameter_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A prediction starts from them; no parameter's step says that they have settled."""
+    problem, left, is_negligible = two_logs(), dict[float, float](), Search._is_negligible_step
+
+    def record(search: Search, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
+        found = is_negligible(search, current, reduced, step)
+        if found:
+            left[search.stage.gap] = 0.5 * current.equations.arrow.descent_rate(step)
+        return found
+
+    monkeypatch.setattr(Search, "_is_negligible_step", record)
+    fixed = problem.parameters.with_values(TRUTH).fixed("*")
+    assert solve_least_squares(replace(problem, parameters=fixed)).status.converged
+    assert left[LeastSquares().stages[-1].gap] < 1e-6
