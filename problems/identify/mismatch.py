@@ -209,9 +209,10 @@ def figure(rows: "pd.DataFrame") -> "Figure":
             nth = part.groupby("kind").cumcount().to_numpy(dtype=float)
             places = np.array([cases.index(kind) for kind in part["kind"]]) + 0.12 * nth
             spread = 1.96 * np.nan_to_num(part[f"stderr {name}"].to_numpy(dtype=float))
-            if len(part):
-                ax.errorbar(places, part[f"bias {name}"], spread, fmt="o", ms=3, capsize=2, color=colour, label=label)
+            ax.errorbar(places, part[f"bias {name}"], spread, fmt="o", ms=3, capsize=2, color=colour, label=label)
         ax.set_yscale("symlog", linthresh=3.0)
+        ax.set_yticks([sign * size for size in (3, 30, 300) for sign in (-1, 1)] + [0], minor=False)
+        ax.yaxis.set_major_formatter("{x:g}")
         ax.set_xticks(range(len(cases)), [c.replace("_", " ") for c in cases], rotation=35, ha="right", fontsize=7)
         ax.set_title(name.replace(".", ": ").replace("_", " "), fontsize=9)
     for row in grid:
