@@ -2,7 +2,7 @@
 
 The first start is tried alone. Where it fails, the guessed parameters of each other start (`trial_parameters`, as the
 Stribeck velocity) are held for a few iterations, until the states and the other parameters have settled to them; the
-starts are then tried by the cost they reached.
+first that explains the logs is tried at once, the others are then tried by the cost they reached.
 
 A parameter that the data do not determine is held at its given value. A weak prior (a decade about that value) would
 leave it there, too; holding it needs no weight for the prior beside that of the data, and the prior's spread is counted
@@ -25,8 +25,9 @@ from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
 from pneuopt.shooting.solution import Fit
 
 GUESS_STAGES = 3  # stages of a search with guesses held: more force a wrong guess on the log, fewer rank starts wrongly
-# squared residuals a sample after the first stage, in noise variances, beyond which the first start waits for the
-# others: lower settles all starts of a model that misses the log a little, higher follows hopeless ones to the end
+# squared residuals a sample after the first stage or before the last, in noise variances, beyond which the first start
+# waits for the others: lower settles all starts of a model that misses the log a little, higher follows hopeless starts
+# to their end
 HOPELESS_MISFIT = 3.0
 # relative width of the bounds that hold a guess; equal bounds would compile other equations than those of the search
 GUESS_BOUND_WIDTH = 1e-9
@@ -70,8 +71,8 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
     fits: list[Candidate] = []
     interrupted, tightest = False, problem.method.stages[-1].gap
     try:
-        confirms, races = lambda: _only_needs_confirmation(fits), lambda: fits[0][1].status is ABANDONED_START
-        for start in starts_by_cost(problem, confirms, races):
+        confirms, left_after = lambda: _only_needs_confirmation(fits), lambda: _stages_before_left(problem, fits[0][1])
+        for start in starts_by_cost(problem, confirms, left_after):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
             known = () if loss is not None or estimate_noise else _joinable_costs(fits)
@@ -146,7 +147,9 @@ def _status(problem: EstimationProblem, fit: Fit, starts: int, *, interrupted: b
 
 
 def starts_by_cost(
-    problem: EstimationProblem, confirms: Callable[[], bool] = lambda: False, races: Callable[[], bool] = lambda: False
+    problem: EstimationProblem,
+    confirms: Callable[[], bool] = lambda: False,
+    left_after: Callable[[], int] = lambda: 0,
 ) -> Iterator[Start]:
     """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
 
@@ -157,13 +160,14 @@ def starts_by_cost(
         Called before each further start: whether the first led to an optimum that only needs confirmation. The next
         start is then taken as it is, for settling all would cost more; the others are settled where it is not called
         enough.
-    races : callable
-        Called before the others settle: whether the first start was left after its first stage. The others then get
-        no more than that, either.
+    left_after : callable
+        Called before the others settle: the stages after which the first start was left, 0 if it was not. The others
+        then get no more than those, either.
 
     Yields
     ------
     Start
+        One that explains the logs to their noise with its guesses held comes as soon as it has settled.
 
     Raises
     ------
@@ -177,15 +181,28 @@ def starts_by_cost(
         yield candidates[0]
     guessed = [c for c in candidates if c.trial_parameters]
     # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
-    stages = GUESS_STAGES if problem.has_gaps and not races() else 1
-    settled = [_settle_start(problem, c, stages) for c in guessed] if len(guessed) > 1 else []
+    left = left_after()
+    stages = min(GUESS_STAGES, left or GUESS_STAGES) if problem.has_gaps else 1
+    settled = list[tuple[tuple[float, float], Start]]()
+    for guess in guessed if len(guessed) > 1 else []:
+        cost, start, explains = _settle_start(problem, guess, stages)
+        if explains:
+            yield start
+        else:
+            settled.append((cost, start))
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
-    yield from [c for c in candidates[1:] if not settled or not c.trial_parameters]
-    yield from candidates[:1] if races() and not settled else []
+    yield from [c for c in candidates[1:] if len(guessed) < 2 or not c.trial_parameters]
+    yield from candidates[:1] if left and len(guessed) < 2 else []
 
 
-def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start]:
-    """What a start reaches in some stages with its guesses held, and the start from there.
+def _stages_before_left(problem: EstimationProblem, fit: Fit) -> int:
+    """The stages after which a search was left for other starts; 0 if it was not."""
+    gaps = [stage.gap for stage in problem.method.stages]
+    return 1 + gaps.index(fit.stats["gap_deviation"]) if fit.status is ABANDONED_START else 0
+
+
+def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
+    """What a start reaches in some stages with its guesses held, the start from there, and whether that is the noise.
 
     A search that ends with wider gaps has a lower cost, which says nothing; it ranks behind those with tight ones.
     """
@@ -197,13 +214,16 @@ def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> 
     if fit.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt
     start = problem.start_from(fit, f"{candidate.label}, settled")
-    return (fit.stats["gap_deviation"], fit.stats["cost"]), replace(start, parameters={**start.parameters, **guesses})
+    gap, cost = fit.stats["gap_deviation"], fit.stats["cost"]
+    is_tight = stages == GUESS_STAGES and fit.jumps is None
+    explains = is_tight and 2 * cost <= ACCEPTED_CHI_SQUARE_RATIO * fit.count
+    return (gap, cost), replace(start, parameters={**start.parameters, **guesses}), explains
 
 
 def fit_holding_unidentifiable(
     problem: EstimationProblem,
     start: Start,
-    max_first_misfit: float = math.inf,
+    max_misfit: float = math.inf,
     known_costs: tuple[tuple[float, float], ...] = (),
 ) -> tuple[EstimationProblem, Fit]:
     """Fit from one start; while the data do not determine a parameter, hold that one and fit again.
@@ -212,7 +232,7 @@ def fit_holding_unidentifiable(
     ----------
     problem : EstimationProblem
     start : Start
-    max_first_misfit, known_costs
+    max_misfit, known_costs
         As of `LeastSquares`, for the first fit.
 
     Returns
@@ -222,7 +242,7 @@ def fit_holding_unidentifiable(
     fit : Fit
         The first one, where holding does not converge, or would leave no parameter to estimate.
     """
-    method = replace(problem.method, max_first_misfit=max_first_misfit, known_costs=known_costs)
+    method = replace(problem.method, max_misfit=max_misfit, known_costs=known_costs)
     first = solve_least_squares(problem.transcription(start), method)
     if not first.unidentifiable or first.status.code is Code.INTERRUPTED:
         return problem, first

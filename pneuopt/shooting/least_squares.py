@@ -56,9 +56,9 @@ class LeastSquares:
         Receives one line of text an iteration.
     budget : CpuBudget, optional
         Ends the search as Ctrl-C does, before the iteration that comes next.
-    max_first_misfit : float
-        Squared residuals a sample after the first stage, in noise variances, beyond which the search ends there, for a
-        caller who has other starts to try.
+    max_misfit : float
+        Squared residuals a sample, in noise variances, beyond which the search ends after the first stage, or before
+        the last where the gaps do not absorb the misfit, for a caller who has other starts to try.
     known_costs : tuple of (float, float)
         Gaps and costs at which a search from another start has ended its stages, none of which explained the logs to
         their noise; a search that comes to the same ends there (`JOINED_SEARCH`).
@@ -78,7 +78,7 @@ class LeastSquares:
     kinematic: float = 0.01
     progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
     budget: CpuBudget | None = field(default=None, repr=False, compare=False)
-    max_first_misfit: float = math.inf
+    max_misfit: float = math.inf
     known_costs: tuple[tuple[float, float], ...] = field(default=(), repr=False, compare=False)
 
 

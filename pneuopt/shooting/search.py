@@ -123,6 +123,8 @@ class Search:
                 allowed = self._allow_state_noise()
                 if allowed.converged:
                     return self._refine_steps(allowed)
+            elif stage is last and self.stage_ends and self._is_hopeless():
+                return ABANDONED_START
             self._enter_stage(stage, self.current.nodes, self.current.z)
             if not math.isfinite(self.current.cost):
                 return Status(Code.DIVERGED, ("the model is not finite at the start", "check values and units"))
@@ -141,8 +143,11 @@ class Search:
             return JOINED_SEARCH
         if stage is not self.method.stages[0]:
             return None
-        is_far = 2 * self.current.cost > self.method.max_first_misfit * self.current.equations.count
-        return ABANDONED_START if is_far else self._jump()
+        return ABANDONED_START if self._is_hopeless() else self._jump()
+
+    def _is_hopeless(self) -> bool:
+        """Whether this search is to be left for those from other starts."""
+        return 2 * self.current.cost > self.method.max_misfit * self.current.equations.count
 
     def _joins_known_search(self) -> bool:
         """Whether this search has come to where a known one was after the same stage, and would go on as that one."""

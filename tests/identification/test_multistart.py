@@ -75,6 +75,48 @@ def test_the_others_settle_with_their_guess_held_and_come_by_cost(monkeypatch: p
     assert settled[0].parameters["friction.coulomb"] == pytest.approx(30, rel=0.05)
 
 
+def test_a_start_that_explains_the_log_as_it_settles_comes_before_the_others_settle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, settled = posed(Stribeck()), list[str]()
+    first, second, third, *others = problem.candidates()
+
+    def settle(problem: EstimationProblem, start: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:
+        settled.append(start.label)
+        return (1e-3, -float(len(settled))), start, start.label == third.label
+
+    monkeypatch.setattr(starting, "_settle_start", settle)
+    starts = starting.starts_by_cost(problem)
+    labels = [next(starts).label, next(starts).label]
+    assert labels == [first.label, third.label]
+    assert settled == [first.label, second.label, third.label]
+    assert [s.label for s in starts] == [*(s.label for s in reversed(others)), second.label, first.label]
+
+
+@pytest.mark.parametrize(
+    ("candidate", "stages", "accepted", "explains"),
+    [
+        (-1, starting.GUESS_STAGES, 1.5, True),  # 1.13 squares a sample
+        (-1, starting.GUESS_STAGES, 1.05, False),
+        (-1, 1, 1.5, False),  # with wide gaps all starts explain the log
+        (0, starting.GUESS_STAGES, 1.5, False),  # and so they do with noise of the states: .98
+    ],
+)
+def test_a_start_explains_the_log_by_tight_gaps_only(
+    candidate: int, stages: int, accepted: float, explains: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = posed(Stribeck())
+    monkeypatch.setattr(starting, "ACCEPTED_CHI_SQUARE_RATIO", accepted)
+    assert starting._settle_start(problem, problem.candidates()[candidate], stages)[2] == explains
+
+
+def test_the_others_settle_by_no_more_stages_than_the_first_start_had() -> None:
+    problem = posed(Stribeck())
+    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    left = [replace(fit, status=ABANDONED_START, stats={**fit.stats, "gap_deviation": gap}) for gap in (1e-2, 1e-4)]
+    assert [starting._stages_before_left(problem, each) for each in (*left, fit)] == [1, 5, 0]
+
+
 def test_without_guesses_the_candidates_are_tried_as_they_are() -> None:
     assert [s.label for s in starting.starts_by_cost(posed(Coulomb()))] == ["equation error"]
 

@@ -15,7 +15,7 @@ from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squa
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search import FINE_TOLERANCE, Search
-from pneuopt.shooting.search_end import JOINED_SEARCH
+from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH, StageEnd
 from pneuopt.shooting.segments import IntegrationCorrection, segment, start_nodes
 from pneuopt.shooting.solution import Fit
 from tests.shooting.test_least_squares import TRUTH, found, shaken, two_logs
@@ -142,6 +142,25 @@ def test_nothing_is_iterated_to_the_end_before_finer_steps_follow(monkeypatch: p
     assert fit.covariance is not None
     assert np.abs((found(fit) - found(fine)) / np.sqrt(np.diag(fit.covariance))).max() < 1e-2
     assert fit.stats["iterations"] < fine.stats["iterations"]
+
+
+@pytest.mark.parametrize(("share", "is_left"), [(0.5, True), (2.0, False)])
+def test_a_search_that_is_far_off_before_its_last_stage_is_left(share: float, is_left: bool) -> None:
+    """The last stage took a Stribeck log's first start 60 iterations, and led nowhere."""
+    lines, unsettled = list[str](), Stage(1e-5, 0)  # gaps that nothing has tightened yet
+    method = LeastSquares(stages=(replace(FIRST, iterations=1), unsettled, OTHERS[-1]))
+    ends: list[float] = [2 * e.cost for e in _stage_ends(method)]
+    assert ends[1] > 2 * ends[0]
+    limit = share * ends[1] / solve_least_squares(two_logs()).count
+    fit = solve_least_squares(two_logs(), replace(method, max_misfit=limit, progress=lines.append))
+    assert (fit.status is ABANDONED_START) == is_left
+    assert any(line.startswith("stage 3/3") for line in lines) != is_left
+
+
+def _stage_ends(method: LeastSquares) -> list[StageEnd]:
+    search = Search(segment(two_logs()), method)
+    search.solve()
+    return search.stage_ends
 
 
 def test_a_search_that_comes_to_where_another_one_was_ends_there() -> None:
