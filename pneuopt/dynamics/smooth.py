@@ -16,6 +16,7 @@ from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
 from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.system import System, names
+from pneuopt.dynamics.work_arrays import WorkArrays
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
@@ -154,6 +155,7 @@ class SmoothIntegration:
         scale = np.array([q.nominal for q in system.states])
         options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MAX_INTERNAL_STEPS}
         self._integrator = integrate.ode(self._rate).set_integrator(**options)
+        self._work = WorkArrays()
 
     def _rate(self, t: float, x: Array) -> Array:
         return self._state_rate(self._origin + t, x, self._inputs.at(t), self._p)
@@ -162,6 +164,7 @@ class SmoothIntegration:
         """See `Integration`."""
         self._inputs = Ramp(t - self._origin, u, slope)
         self._integrator.set_initial_value(x, t - self._origin)
+        self._work.give_to(self._integrator._integrator)
 
     def advance(self, t: float) -> Array:
         """See `Integration`."""

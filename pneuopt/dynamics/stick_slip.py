@@ -20,6 +20,7 @@ from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
 from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.smooth import Recorder
 from pneuopt.dynamics.system import FRICTION_DIRECTION, System, names
+from pneuopt.dynamics.work_arrays import WorkArrays
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, ModelError, require
 from pneuopt.quantities.trajectories import Trajectory
@@ -74,6 +75,7 @@ class StickSlipIntegration:
         self._standstill_speed = 10 * atols[self._speed]  # rounding must not end a motion that has just begun
         self._mode: int | None = None
         self._solver: integrate.OdeSolver
+        self._work = WorkArrays()
         self._event_time, self._last_indicator = inf, 0.0
         self._dense: Callable[[float], Array] | None = None
         self._record = Recorder(system, grid, ("stuck",))
@@ -127,6 +129,7 @@ class StickSlipIntegration:
         self._mode, self._event_time, self._dense = mode, inf, None
         self._now, self._x = t, x
         self._solver = integrate.LSODA(self._rate, t, x, self._end, **self._options)
+        self._work.give_to(self._solver._lsoda_solver._integrator)
         self._last_indicator = self._mode_indicator(t, x)
 
     def _note_event(self, t: float, mode: int, before: int) -> None:
