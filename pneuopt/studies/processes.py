@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -40,6 +41,7 @@ _NO_START = (
 )
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _LIMIT_SHARE = 0.25  # of a case's time limit that a chunk shall take [1]: one that takes all of it is cut up
+_packed = b""  # of a spawned process: its function, as it came
 _task: "tuple[CaseFunction, ParameterSet, Processes] | None" = None  # of a spawned process: what it evaluates
 
 
@@ -108,6 +110,7 @@ def run_in_processes(
     InputError
         If the function cannot travel, or no process can start.
     """
+    warnings.filterwarnings("ignore", message="A worker was restarted")  # its chunk is given to its successor
     wanted = min(count, chosen.count or os.cpu_count() or 1, _MAX_PROCESSES)
     queue = CaseQueue(cases, count, wanted, _LIMIT_SHARE * chosen.seconds)
     crew = _Crew(pickle_function(fn, parameters, chosen), chosen)
@@ -143,10 +146,10 @@ class _Crew:
 
     def start(self) -> None:
         """Start a process."""
-        process = _spawn_process()
+        process = _spawn_process(self._packed)
         self._processes.append(process)
         with _one_thread_each():
-            self.busy[process.submit(_load_task, self._packed)] = _Run(process, None, inf)
+            self.busy[process.submit(_load_task)] = _Run(process, None, inf)
 
     def give(self, process: "loky.ProcessPoolExecutor", chunk: Chunk) -> None:
         """Let a process compute a chunk."""
@@ -217,11 +220,14 @@ def _describe_death(error: BrokenProcessPool) -> str:
     return "its process died twice" + (f" (exit code {code[1]})" if code else "")
 
 
-def _spawn_process() -> "loky.ProcessPoolExecutor":
-    """An executor of one process, which follows this one, and has one thread for linear algebra: it shares the CPUs."""
+def _spawn_process(packed: bytes) -> "loky.ProcessPoolExecutor":
+    """An executor of one process, which follows this one, and has one thread for linear algebra: it shares the CPUs.
+
+    Loky puts another process in its place where its memory grows.
+    """
     import loky
 
-    return loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_follow_parent)
+    return loky.ProcessPoolExecutor(1, context=get_context("spawn"), initializer=_begin, initargs=(packed,))
 
 
 @contextmanager
@@ -236,8 +242,10 @@ def _one_thread_each() -> Iterator[None]:
             del os.environ[n]
 
 
-def _follow_parent() -> None:
-    """In a spawned process: ignore Ctrl-C, which reaches all processes of a terminal, and end when the first has."""
+def _begin(packed: bytes) -> None:
+    """In a spawned process: keep the function; ignore Ctrl-C, which reaches all processes; end when the first has."""
+    global _packed  # noqa: PLW0603 - the state of a worker process, which serves one study
+    _packed = packed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is not None:
@@ -250,13 +258,13 @@ def _end_with(sentinel: int) -> None:
     os._exit(1)
 
 
-def _load_task(packed: bytes) -> list[Outcome]:
+def _load_task() -> list[Outcome]:
     """In a spawned process: unpack the function, once for all its cases."""
     global _task  # noqa: PLW0603 - the state of a worker process, which serves one study
     import pandas as pd  # noqa: F401 - of the results: no case's time
 
     try:
-        _task = pickle.loads(packed)
+        _task = pickle.loads(_packed)
     except Exception as error:  # whatever its module raises when imported
         raise InputError(
             f"the function cannot be loaded by other processes: {describe_error(error)}; "
@@ -269,7 +277,9 @@ def _load_task(packed: bytes) -> list[Outcome]:
 
 def _evaluate_chunk(cases: list[CaseValues]) -> list[Outcome]:
     """In a spawned process: evaluate its function."""
-    assert _task is not None, "_load_task comes first"
+    if _task is None:  # in a process that stands in for one that had grown
+        _load_task()
+    assert _task is not None
     fn, parameters, limits = _task
     outcomes = evaluate_cases(fn, parameters, cases)
     return [Outcome(seconds=o.seconds, error=limits.memory_reason) if _lacks_memory(o, limits) else o for o in outcomes]

@@ -30,6 +30,13 @@ def greedy(p):
         return {"a": float("nan"), "word": "poor"}
     return {"a": mass, "word": "good"}
 
+def hoarding(p):
+    HOARD.append(os.urandom(20_000_000))
+    time.sleep(1.1)  # loky looks once a second
+    return {"hoarded": len(HOARD)}
+
+HOARD = []
+
 def unlucky(folder, p):
     mass = p.value("load.mass")
     seen = Path(folder) / f"{mass}"
@@ -106,3 +113,13 @@ def test_memory_is_limited_on_linux_alone(monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(InputError, match="needs Linux; leave it out"):
         Processes(megabytes=100.0)
     assert Processes(seconds=1.0).count is None
+
+
+def test_a_process_that_grows_is_replaced_and_its_successor_goes_on(
+    functions: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The new process has the function, too: its first case was an assertion that failed, and ended the study."""
+    monkeypatch.setenv("LOKY_MAX_MEMORY_LEAK_SIZE", "1e6")
+    table = sweep(functions.hoarding, RIG, masses(1, 2, 3), executor=Processes(1))
+    assert table["error"].tolist() == [""] * 3
+    assert max(table["hoarded"]) < 3  # not all in one process
