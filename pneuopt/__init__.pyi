@@ -114,6 +114,7 @@ from .plotting import (
     plot_map,
     plot_prediction,
     plot_residuals,
+    plot_sensitivity,
     plot_steps,
     save_figure,
 )
@@ -132,6 +133,7 @@ from .studies.cluster import open_executor
 from .studies.journal import Journal
 from .studies.neighbours import search_again, sweep_from_neighbours
 from .studies.processes import Processes
+from .studies.sensitivity import Sensitivity, sensitivity
 from .studies.sweep import sweep
 from .tuning.pareto import pareto_front
 from .tuning.racing import Racing
@@ -239,6 +241,7 @@ __all__ = [
     "RotaryDrive",
     "Sampling",
     "SecondOrder",
+    "Sensitivity",
     "Sensor",
     "SensorLag",
     "SeriesForm",
@@ -308,6 +311,7 @@ __all__ = [
     "plot_map",
     "plot_prediction",
     "plot_residuals",
+    "plot_sensitivity",
     "plot_steps",
     "plotting",
     "predict",
@@ -327,6 +331,7 @@ __all__ = [
     "save_figure",
     "search_again",
     "select_model",
+    "sensitivity",
     "simulate",
     "simulate_stick_slip",
     "split",

@@ -154,7 +154,7 @@ class SmoothIntegration:
         self._record = Recorder(system, grid)
         scale = np.array([q.nominal for q in system.states])
         options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MAX_INTERNAL_STEPS}
-        self._integrator = integrate.ode(self._rate).set_integrator(**options)
+        self._integrator: Any = integrate.ode(self._rate).set_integrator(**options)
         self._work = WorkArrays()
 
     def _rate(self, t: float, x: Array) -> Array:

@@ -74,7 +74,7 @@ class StickSlipIntegration:
         self._options: dict[str, Any] = {"rtol": rtol, "atol": atols}
         self._standstill_speed = 10 * atols[self._speed]  # rounding must not end a motion that has just begun
         self._mode: int | None = None
-        self._solver: integrate.OdeSolver
+        self._solver: Any
         self._work = WorkArrays()
         self._event_time, self._last_indicator = inf, 0.0
         self._dense: Callable[[float], Array] | None = None

@@ -188,15 +188,48 @@ def samples(
     100
     """
     require(count >= 1, f"count must be at least 1, got {count}")
-    axes = _axis_names(parameters, spreads)
-    shares = unit_points(sampling, count, len(axes), seed)
+    shares = unit_points(sampling, count, len(axis_labels(parameters, spreads)), seed)
+    return {f"sample {k}": row for k, row in enumerate(values_at(parameters, spreads, shares), 1)}
+
+
+def axis_labels(parameters: ParameterSet, spreads: SampleSpreads) -> tuple[str, ...]:
+    """The axes of a box of spreads, in order: "load.mass", or "friction.coulomb + friction.static" that vary together.
+
+    Raises
+    ------
+    InputError
+        As for `samples`.
+    """
+    return tuple(_axis_names(parameters, spreads))
+
+
+def values_at(parameters: ParameterSet, spreads: SampleSpreads, shares: Array) -> list[dict[str, float]]:
+    """Parameter values at points of a box of spreads.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+    spreads : mapping
+        As for `samples`.
+    shares : ndarray, shape (n, axes)
+        Of each axis, from 0 to 1: of its width, or of its distribution's probability.
+
+    Returns
+    -------
+    list of dict of str to float
+        A point each [SI].
+
+    Raises
+    ------
+    InputError
+        As for `samples`.
+    """
     columns = {
         n: _sample_values(parameters, n, spread, shares[:, k]).tolist()
-        for k, (names, spread) in enumerate(axes.values())
+        for k, (names, spread) in enumerate(_axis_names(parameters, spreads).values())
         for n in names
     }
-    rows = zip(*columns.values(), strict=True)
-    return {f"sample {k}": dict(zip(columns, row, strict=True)) for k, row in enumerate(rows, 1)}
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def draws(

@@ -16,6 +16,7 @@ from pneuopt.plotting.logs import plot_logs
 from pneuopt.plotting.loop_diagram import plot_loop
 from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
+from pneuopt.plotting.sensitivities import plot_sensitivity
 
 __all__ = [
     "BLUE",
@@ -39,6 +40,7 @@ __all__ = [
     "plot_map",
     "plot_prediction",
     "plot_residuals",
+    "plot_sensitivity",
     "plot_steps",
     "save_figure",
 ]

@@ -1,0 +1,30 @@
+"""The figure of sensitivities: bars as long as the indices, the axis that matters most on top."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from matplotlib.patches import Rectangle
+
+from pneuopt.plotting import plot_sensitivity
+from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.studies.sensitivity import sensitivity
+
+CUBE = ParameterSet(dict.fromkeys(("little", "much"), Parameter(1.0, "1")))
+
+
+def figures(p: ParameterSet) -> dict[str, float]:
+    value = 0.2 * p.value("little") + p.value("much")
+    return dict.fromkeys(("SettlingTime", "Overshoot", "ISE", "Ripple"), value)
+
+
+def test_bars_are_the_indices_and_what_is_left_out_is_said() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        found = sensitivity(figures, CUBE, dict.fromkeys(CUBE, 0.1), count=32, executor=executor)
+    picture = plot_sensitivity(found)
+    panels = picture.axes
+    assert [panel.get_title() for panel in panels] == ["SettlingTime", "Overshoot", "ISE"]
+    assert [text.get_text() for text in panels[0].get_yticklabels()] == ["much", "little"]
+    widths = [bar.get_width() for bar in panels[0].patches if isinstance(bar, Rectangle)]
+    own = found.table.loc["SettlingTime"]
+    assert widths == pytest.approx([*own["total"][["much", "little"]], *own["first"][["much", "little"]]])
+    assert [text.get_text() for text in picture.texts] == ["3 of 4 figures"]
