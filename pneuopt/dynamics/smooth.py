@@ -164,7 +164,8 @@ class SmoothIntegration:
         """See `Integration`."""
         self._inputs = Ramp(t - self._origin, u, slope)
         self._integrator.set_initial_value(x, t - self._origin)
-        self._work.give_to(self._integrator._integrator)
+        if self._system.states:  # without any SciPy takes another integrator, which is never run
+            self._work.give_to(self._integrator._integrator)
 
     def advance(self, t: float) -> Array:
         """See `Integration`."""
