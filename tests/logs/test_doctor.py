@@ -71,6 +71,18 @@ def test_channels_in_rows_of_their_own_are_checked_like_others(name: str, every:
     assert [f.check for f in found if f.check != "sampling"] == ([] if name == "right" else [name])
 
 
+def test_nothing_is_assumed_of_a_channel_across_a_hole() -> None:
+    """The position lacks 3.5 s, in which the force pushes up and the piston comes down: work that nobody saw.
+
+    A spline would run through them, and the force would brake on balance.
+    """
+    hole = (T > 0.25) & (T < 3.75)
+    force, position = (swing().trajectory[n].copy() for n in ("force", "position"))
+    force[hole] = 300.0
+    position[hole] = np.nan
+    assert examine(swing(force=force, position=position).select(["position", "force"])) == ()
+
+
 RECORDER: dict[str, str | bool | dict[str, str | float]] = {
     "time": "t [ms]",
     "valve_voltage": "U_valve [V]",
