@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -283,25 +283,33 @@ def test_a_function_may_interrupt_the_study(functions: ModuleType) -> None:
     assert table["error"].tolist() == ["", INTERRUPTED_CASE, INTERRUPTED_CASE]
 
 
-@pytest.mark.skipif(os.name == "nt", reason="sends SIGINT to a group of processes")
-def test_ctrl_c_in_a_terminal_reaches_everybody_and_loses_nothing(functions: ModuleType, tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
+@contextmanager
+def running_study(folder: Path, *, before: str = "", after: str = "") -> "Iterator[subprocess.Popen[str]]":
+    """A script with a study whose second case hangs, once the first is done."""
+    script = folder / "script.py"
     script.write_text(
         "import signal\n"
         "from pneuopt import Parameter, ParameterSet, sweep\n"
         "from study_functions import hung\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a job in the background inherits it as ignored
+        f"{before}\n"
         "if __name__ == '__main__':\n"
         "    rig = ParameterSet({'load.mass': Parameter(1.0, 'kg')})\n"
         "    cases = {'quick': {}, 'hung': {'load.mass': 2.0}, 'never': {'load.mass': 3.0}}\n"
         "    table = sweep(hung, rig, cases, progress=lambda line: print(line, flush=True))\n"
-        "    print(table['error'].tolist())\n",
+        f"    {after}\n",
         encoding="utf-8",
     )
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True, start_new_session=True) as run:
         assert run.stdout is not None
         assert run.stdout.readline() == "1 of 3 cases\n"
+        yield run
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends SIGINT to a group of processes")
+def test_ctrl_c_in_a_terminal_reaches_everybody_and_loses_nothing(functions: ModuleType, tmp_path: Path) -> None:
+    listen = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # a background job ignores it
+    with running_study(tmp_path, before=listen, after="print(table['error'].tolist())") as run:
         os.killpg(run.pid, signal.SIGINT)
         out, err = run.communicate(timeout=30)
     assert (run.returncode, out, err) == (0, "['', 'interrupted', 'interrupted']\n", "")
@@ -310,20 +318,7 @@ def test_ctrl_c_in_a_terminal_reaches_everybody_and_loses_nothing(functions: Mod
 @pytest.mark.skipif(os.name == "nt", reason="no process ends without a word there")
 def test_the_processes_of_a_study_that_is_killed_end_with_it(functions: ModuleType, tmp_path: Path) -> None:
     """They hold its pipes: a shell that reads them waited for ever."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from pneuopt import Parameter, ParameterSet, sweep\n"
-        "from study_functions import hung\n"
-        "if __name__ == '__main__':\n"
-        "    rig = ParameterSet({'load.mass': Parameter(1.0, 'kg')})\n"
-        "    cases = {'quick': {}, 'hung': {'load.mass': 2.0}, 'never': {'load.mass': 3.0}}\n"
-        "    sweep(hung, rig, cases, progress=lambda line: print(line, flush=True))\n",
-        encoding="utf-8",
-    )
-    pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True, start_new_session=True) as run:
-        assert run.stdout is not None
-        assert run.stdout.readline() == "1 of 3 cases\n"
+    with running_study(tmp_path) as run:
         run.kill()
         try:
             run.communicate(timeout=30)
