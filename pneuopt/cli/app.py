@@ -213,7 +213,7 @@ def simulate_command(
 @app.command("study")
 def study_command(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning, and a grid's axes or a front.")
+        Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning, and which cases, or a front.")
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
