@@ -82,6 +82,7 @@ from .logs.experiments import Experiment, differentiate, resample, split
 from .logs.read_log import read_log
 from .models import catalog
 from .models.drive import ForceDrive, MotionDrive
+from .models.drive_kinds import stick_slip_drive
 from .models.friction import (
     Asymmetric,
     Coulomb,
@@ -336,6 +337,7 @@ __all__ = [
     "simulate_stick_slip",
     "split",
     "step_metrics",
+    "stick_slip_drive",
     "sweep",
     "sweep_from_neighbours",
     "to_parallel",

@@ -138,6 +138,7 @@ PUBLIC_NAMES = [
     "plot_map",
     "plot_sensitivity",
     "Sensitivity",
+    "stick_slip_drive",
     "sensitivity",
     "plot_prediction",
     "plot_residuals",

@@ -22,7 +22,6 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.terminal import progress
 from pneuopt.dynamics.system import System
 from pneuopt.files.drive import ambient_pressure, read_drive, write_fit
-from pneuopt.files.rig import stick_slip_drive
 from pneuopt.identification.checkup import OTHER_CHECKS, check
 from pneuopt.identification.identify import identify, predict, validate
 from pneuopt.identification.marks import Mark
@@ -34,7 +33,7 @@ from pneuopt.logs.doctor import CHECKS
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.read_log import read_log
 from pneuopt.models.declaration import Drive
-from pneuopt.models.drive_kinds import DRIVE_KINDS
+from pneuopt.models.drive_kinds import DRIVE_KINDS, stick_slip_drive
 from pneuopt.models.friction_laws import friction_ladder, usual_unknowns
 from pneuopt.plotting import (
     has_friction_map,

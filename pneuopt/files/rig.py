@@ -24,9 +24,8 @@ from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.files.toml import construct_at, read_fixed_value, read_toml
 from pneuopt.models.declaration import Drive
-from pneuopt.models.drive_kinds import DRIVE_KINDS
-from pneuopt.models.karnopp import Karnopp
-from pneuopt.quantities.errors import ModelError, check_names, require
+from pneuopt.models.drive_kinds import stick_slip_drive
+from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.keys import Key, table
 from pneuopt.quantities.unit_algebra import difference_unit
 
@@ -90,19 +89,6 @@ def read_rig(path: str | Path, drive: Drive, loop: ClosedLoop) -> Rig:
     encoder = _read_encoder(sections.get("encoder", {}), loop, f"{path}: [encoder]")
     sensors = _read_sensors(sections.get("sensors", {}), loop, f"{path}: [sensors") or _own_sensors(loop)
     return construct_at(lambda: Rig(own, sensors, actuator, encoder), str(path))
-
-
-def stick_slip_drive(drive: Drive) -> Drive:
-    """The drive with Karnopp's friction where its own is a static map with a Coulomb level; else as it is."""
-    friction = getattr(drive, "friction", None)
-    if friction is None or not DRIVE_KINDS[drive.kind].any_friction:
-        return drive
-    try:
-        sticking: Any = Karnopp(friction)
-    except ModelError:  # bristles stick by themselves; viscous friction never does
-        return drive
-    same: Any = drive
-    return replace(same, friction=sticking)  # type: ignore[no-any-return]
 
 
 def _read_sensors(entries: Mapping[str, Any], loop: ClosedLoop, where: str) -> dict[str, Sensor]:

@@ -1,12 +1,19 @@
-"""The registry of drives, a row for each kind: files and the command line read drives through it."""
+"""The registry of drives, a row for each kind: files and the command line read drives through it.
+
+`stick_slip_drive` makes of a smooth drive one that truly sticks.
+"""
 
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
-from pneuopt.models.declaration import DriveKind
+from pneuopt.models.declaration import Drive, DriveKind
 from pneuopt.models.drive import FORCE_KIND, MOTION_KIND
+from pneuopt.models.karnopp import Karnopp
 from pneuopt.models.linear import LINEAR_KIND
 from pneuopt.models.pneumatic.drive_file import PNEUMATIC_KIND
 from pneuopt.models.rotary import ROTARY_KIND
+from pneuopt.quantities.errors import ModelError
 
 DRIVE_KINDS: Mapping[str, DriveKind] = {
     kind.name: kind
@@ -18,3 +25,34 @@ DRIVE_KINDS: Mapping[str, DriveKind] = {
         ROTARY_KIND,
     )
 }
+
+
+def stick_slip_drive(drive: Drive) -> Drive:
+    """The drive with Karnopp's friction where its own is a static map with a Coulomb level; else as it is.
+
+    Parameters
+    ----------
+    drive : drive
+
+    Returns
+    -------
+    drive
+        For simulation: with bristles it is the drive itself, as they stick by themselves, and with viscous friction,
+        which never does.
+
+    Examples
+    --------
+    >>> from pneuopt.models.drive import ForceDrive
+    >>> from pneuopt.models.friction import Coulomb
+    >>> type(stick_slip_drive(ForceDrive(Coulomb())).friction).__name__
+    'Karnopp'
+    """
+    friction = getattr(drive, "friction", None)
+    if friction is None or not DRIVE_KINDS[drive.kind].any_friction:
+        return drive
+    try:
+        sticking: Any = Karnopp(friction)
+    except ModelError:
+        return drive
+    same: Any = drive
+    return replace(same, friction=sticking)  # type: ignore[no-any-return]

@@ -65,7 +65,7 @@ def tried(
     began = time.process_time()
     fit = po.identify(drive, log, given, throw=False)
     hardware = the_rig(RIG)
-    plant = po.PneumaticDrive(friction=po.Karnopp(po.Stribeck())).system()
+    plant = po.stick_slip_drive(drive).system()
     rig = po.Rig(plant, hardware.sensors, hardware.actuator, actuated="valve_voltage")
     result = po.bootstrap(drive, log, fit, rig=rig, count=count)
     print(

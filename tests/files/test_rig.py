@@ -9,12 +9,10 @@ from pneuopt.control.pid import PID
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.evaluation.rig import Actuator, Rig, Sensor
 from pneuopt.files.drive import read_drive
-from pneuopt.files.rig import read_rig, stick_slip_drive
+from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import read_tuning
 from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import LuGre, Stribeck, Viscous
-from pneuopt.models.karnopp import Karnopp
-from pneuopt.models.linear import SecondOrder
+from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.errors import InputError
 
 DRIVE = ForceDrive(Stribeck())
@@ -45,12 +43,6 @@ def test_without_sensors_the_loop_s_own_stands_there(tmp_path: Path) -> None:
     counts = ClosedLoop(DRIVE.system(), PID(sample_time=1e-3), sensor=Encoder(1e-5))
     rig = read(tmp_path, "", counts)
     assert (rig.sensors, rig.encoder.resolution) == ({"position": Sensor()}, 1e-5)
-
-
-def test_dry_friction_sticks_and_what_has_none_stays() -> None:
-    assert stick_slip_drive(DRIVE) == ForceDrive(Karnopp(Stribeck()))
-    for drive in (ForceDrive(LuGre()), ForceDrive(Viscous()), SecondOrder()):
-        assert stick_slip_drive(drive) is drive
 
 
 @pytest.mark.parametrize(

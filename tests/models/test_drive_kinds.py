@@ -18,8 +18,12 @@ from pneuopt.dynamics.system import System, names, parameter_vector
 from pneuopt.files.drive import read_drive, write_fit
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.models.declaration import Drive
-from pneuopt.models.drive_kinds import DRIVE_KINDS
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.drive_kinds import DRIVE_KINDS, stick_slip_drive
+from pneuopt.models.friction import LuGre, Stribeck, Viscous
 from pneuopt.models.friction_laws import friction_ladder
+from pneuopt.models.karnopp import Karnopp
+from pneuopt.models.linear import SecondOrder
 from pneuopt.plotting import has_friction_map
 from pneuopt.quantities.errors import InputError, UnknownNameError
 from pneuopt.quantities.parameters import ParameterSet
@@ -198,3 +202,9 @@ def test_every_friction_law_fits_where_it_is_declared(kind: str, drive: Drive) -
         other = replace(built, friction=law).system()
         assert {n for n in other.parameters if n.startswith("friction.")} == {f"friction.{n}" for n in law.parameters}
         assert all(math.isfinite(p.value) for p in other.parameters.values())
+
+
+def test_dry_friction_sticks_and_what_has_none_stays() -> None:
+    assert stick_slip_drive(ForceDrive(Stribeck())) == ForceDrive(Karnopp(Stribeck()))
+    for drive in (ForceDrive(LuGre()), ForceDrive(Viscous()), SecondOrder()):
+        assert stick_slip_drive(drive) is drive
