@@ -75,8 +75,8 @@ RIG_BOUNDS = {"overshoot": "<= 8", "steady_state_error": "<= 1"}  # its settling
 SAVED = ">= 0.25"  # of the settling time on the rig, by dither: as tune_drive.py asks of another drive
 SHOWN = {
     "hand": (ORANGE, "before"),
-    "pid_only": (GREY, "PID tuned"),
-    "tuned": (BLUE, "PID and dither tuned"),
+    "pid_only": (GREY, "PID alone"),
+    "tuned": (BLUE, "PID and dither"),
 }
 
 
