@@ -159,10 +159,23 @@ def _find_names(rows: Sequence[Sequence[str]], first: int, width: int, downwards
         return near[-1] if near and _is_header(rows[near[-1]]) else None
     if downwards:
         return may_name[0]
-    last = may_name[-1]
+    last = _skip_comments(rows, may_name)
     above = last - 1
     named_above = above >= 0 and abs(len(rows[above]) - len(rows[last])) < 2 and not _is_value(rows[above][0])
     return above if named_above and any(rows[above]) and is_unit_row(rows[last], len(rows[above])) else last
+
+
+def _skip_comments(rows: Sequence[Sequence[str]], may_name: Sequence[int]) -> int:
+    """The last row that may name the columns; a comment does so if it says more units than the uncommented above it."""
+    last = may_name[-1]
+    plain = [i for i in may_name if not _COMMENT.match(rows[i][0])]
+    if not plain or _count_units(rows[last]) > _count_units(rows[plain[-1]]):
+        return last
+    return plain[-1]
+
+
+def _count_units(row: Sequence[str]) -> int:
+    return sum(bool(_BRACKETS.search(cell)) for cell in row)
 
 
 def _is_header(row: Sequence[str]) -> bool:

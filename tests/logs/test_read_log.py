@@ -391,3 +391,10 @@ def test_a_mark_in_the_first_sample_s_first_cell_makes_it_no_comment(tmp_path: P
         read_log(path)
     path.write_text(f"{names}# a note of 1 word\n#\n{rows}", encoding="utf-8")
     assert len(read_log(path).trajectory) == 12
+
+
+@pytest.mark.parametrize(
+    "head", [HEADER + "# run 2, after\n", "time_s,position_mm\n# run 2, after\n", f"by,Smith\n# {HEADER}"]
+)
+def test_a_comment_with_a_comma_names_no_columns_unless_it_says_their_units(tmp_path: Path, head: str) -> None:
+    assert read_log(written(tmp_path, head + BODY)).trajectory["position"][-1] == pytest.approx(0.011)
