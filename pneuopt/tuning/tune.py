@@ -48,6 +48,7 @@ __all__ = ["TuningResult", "prepare_search", "prepare_task", "tune"]
 MIN_AGREEING = 2
 # Endings of a search that contradictory limits may have caused: `tune` then seeks how far they have to give way.
 INFEASIBILITY_CODES = (Code.INFEASIBLE, Code.NOT_CONVERGED, Code.ITERATION_LIMIT)
+STOPPED = "a second search was interrupted, and the design was not tried on other plants"
 
 
 def tune(
@@ -140,7 +141,7 @@ def tune(
     if rig is not None:
         check_rig(rig, task)
     _warn_of_swing(task)
-    search, result = _search(task, method, ProgressReporter(progress, "tune"))
+    search, result, is_stopped = _search(task, method, ProgressReporter(progress, "tune"))
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
     result = confirm_refusal(search, result) if result.status.code is Code.NOT_CERTIFIED else result
     tuned = search.space.names
@@ -159,7 +160,9 @@ def tune(
     if result.status.converged and rig is not None:
         search.progress("certifying on the rig's model")
         result = certify_on_rig(task, result, rig)
-    if result.status.converged:
+    if result.status.converged and is_stopped:
+        result = replace(result, status=result.status.with_details(STOPPED))
+    elif result.status.converged:
         result = _try_on_plants(task, result, plants, search.progress)
     if throw and not result.status.converged:
         raise ConvergenceError(f"tuning {result.status.with_remedies('the given gains stand')}", result)
@@ -175,20 +178,25 @@ def _warn_of_swing(task: TuningTask) -> None:
         warnings.warn(told, PhysicsWarning, stacklevel=3)
 
 
-def _search(task: TuningTask, method: Method | None, progress: ProgressCallback) -> tuple[Search, TuningResult]:
-    """The search of a method, by default the first that suits, and where its answer is in doubt the better of two."""
+def _search(task: TuningTask, method: Method | None, progress: ProgressCallback) -> tuple[Search, TuningResult, bool]:
+    """The search of a method, by default the first that suits, and where its answer is in doubt the better of two.
+
+    The third says whether the second was interrupted while the first one's design stands.
+    """
     search = prepare_search(task, method, progress)
     result = search.run()
     successor = search.method.successor
     found_once = result.stats.get("starts_agreeing", inf) < MIN_AGREEING
     doubtful = not result.status.converged or found_once
     if method is not None or successor is None or not doubtful or result.status.code is Code.INTERRUPTED:
-        return search, result
+        return search, result, False
     other = prepare_search(task, successor, progress)
     found = other.run()
     before, after = (certified_objective(task.spec, r) for r in (result, found))
     worse = not found.status.converged or after >= before
-    return (search, result) if result.status.converged and worse else (other, found)
+    if result.status.converged and worse:
+        return search, result, found.status.code is Code.INTERRUPTED
+    return other, found, False
 
 
 def _try_on_plants(

@@ -108,3 +108,23 @@ def test_where_fewer_than_two_starts_agree_another_search_runs_and_the_better_de
     assert found.parameters.value("pid.Ki") == expected
     doubtful = agreeing < 2 or math.isnan(exact)
     assert ran == ([TwoPhase, Racing] if doubtful else [TwoPhase])
+
+
+def test_where_the_second_search_is_interrupted_the_first_one_s_design_is_tried_on_no_plants(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The trial takes longer than a user waits who has pressed Ctrl-C."""
+    loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
+    given = loop.parameters.with_values({"pid.Kp": 4.0, "pid.Ki": 1.0, "pid.Tf": 0.1})
+    given = given.with_bounds({"pid.Ki": (0.5, 20.0)}).freed("pid.Ki")
+
+    def run(search: Search) -> TuningResult:
+        found = search.certify_point(np.array([5.0]))
+        if isinstance(search.method, TwoPhase):
+            return replace(found, stats={**found.stats, "starts_agreeing": 1.0})
+        return replace(found, status=Status(Code.INTERRUPTED))
+
+    monkeypatch.setattr(Search, "run", run)
+    found = tune(loop, Step(1.0, horizon=4.0), given, minimise=SettlingTime())
+    assert (found.status.converged, found.validation) == (True, None)
+    assert "interrupted" in str(found.status)
