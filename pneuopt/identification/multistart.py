@@ -111,9 +111,9 @@ def _fit_long_logs(problem: EstimationProblem) -> Candidate | None:
 def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
     """What is tried before a long search of long logs; nothing where they are short.
 
-    First a short search: most logs need no more. Then the fit that begins with the parameters of a part of each log.
-    The states of the whole logs are filtered by these parameters first: rough states would spoil what the parts have
-    found.
+    First a short search: most logs need no more, and one that is cut near the noise goes on. Then the fit that begins
+    with the parameters of a part of each log. The states of the whole logs are filtered by these parameters first:
+    rough states would spoil what the parts have found.
     """
     parts = cut_excerpts(problem)
     if parts is None:
@@ -122,6 +122,11 @@ def _tries_of_long_logs(problem: EstimationProblem) -> Iterator[Candidate]:
     method = replace(problem.method, stages=(stages[0], replace(stages[-1], iterations=SHORT_ITERATIONS)))
     short = solve_least_squares(problem.transcription(rough), method)
     yield problem, short, rough.label
+    is_near = short.jumps is None and 2 * short.stats["cost"] <= MAX_CHI_SQUARE_RATIO * short.count
+    if is_near and not short.status.converged:
+        last = replace(problem.method, stages=stages[-1:])
+        longer = solve_least_squares(problem.transcription(problem.start_from(short)), last)
+        yield problem, longer.with_effort_of(short), rough.label
     held, fit, label = fit_from_starts(parts)
     if fit.status.code is Code.INTERRUPTED:
         yield problem, replace(short, status=fit.status), rough.label

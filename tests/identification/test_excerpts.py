@@ -12,7 +12,7 @@ from pneuopt.identification.excerpts import EXCERPT_SEGMENTS, cut_excerpts, filt
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.catalog import b32
-from pneuopt.quantities.status import Code
+from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares, solve_least_squares
 from pneuopt.shooting.solution import Fit
@@ -85,6 +85,24 @@ def test_a_long_log_begins_with_the_answer_of_its_part(monkeypatch: pytest.Monke
     assert searched == [pytest.approx(EXCERPT_SEGMENTS * 0.01 / SAMPLE, abs=1)]
     for name in FREE:
         assert fit.parameters.value(name) == pytest.approx(b32()[1].value(name), rel=0.01)
+
+
+def test_a_short_search_that_is_cut_near_the_noise_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is cut so near its end has no need of a part, whose search begins anew."""
+    lengths: list[int] = []
+
+    def cut(transcription: Transcription, method: LeastSquares) -> Fit:
+        fit = solve_least_squares(transcription, method)
+        lengths.append(transcription.phases[0].n)
+        return fit if lengths[1:] else replace(fit, status=Status(Code.NOT_CONVERGED, ("cut",)))
+
+    monkeypatch.setattr(multistart, "solve_least_squares", cut)
+    problem, _ = posed()
+    held, fit, label = multistart.fit_from_starts(problem)
+    assert lengths == 2 * [len(problem.experiments[0].trajectory)]
+    assert fit.status.converged
+    assert held.method == problem.method
+    assert not label.endswith("of a part")
 
 
 def test_ctrl_c_in_the_short_search_ends_all() -> None:
