@@ -1,5 +1,6 @@
 """Random plants: what is drawn, how exact the logs are, what the rows say; the slow part identifies a few."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,16 @@ def test_rigs_of_other_kinds_move_as_they_are_called(seed: int, monkeypatch: pyt
         again = random_rig.draw(seed, random_plants.drawn("stribeck", seed))
         assert again.truth.value("loop.gain") == rig.truth.value("loop.gain")
         assert rig.truth.value("loop.damping") == 0
+
+
+def test_the_log_of_a_light_load_does_not_depend_on_the_integration_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    seed = 1034  # friction turns round so fast that steps of 10 us are unstable
+    rig = replace(random_rig.draw(seed, random_plants.drawn("stribeck", seed)), samples=4000)
+    log = random_rig.record(rig, seed).trajectory
+    monkeypatch.setattr(random_rig, "STEPS", random_rig.STEPS / 8)
+    fine = random_rig.record(rig, seed).trajectory
+    for name, (least, _) in random_rig.NOISE.items():
+        assert np.max(np.abs(log[name] - fine[name])) < 0.1 * least
 
 
 def test_the_oscillation_is_that_of_the_speed() -> None:
