@@ -178,6 +178,29 @@ def test_a_load_that_is_only_lowered_may_be_braked() -> None:
     assert faults(Experiment(Trajectory(T, down))) == []
 
 
+def test_a_rest_before_a_motion_one_way_is_no_stop() -> None:
+    """The noise of a slow motion goes to and fro, which is no motion back: there is no middle of two pushes."""
+    rng = np.random.default_rng(9)
+    advance = np.clip(T - 1.0, 0.0, None) % 1.0 < 0.5
+    position = 0.1 + np.cumsum(0.02 * advance * (T >= 1.0)) * 1e-3 + 5e-5 * rng.standard_normal(T.size)
+    force = np.where(T < 1.0, 2.0, 16.0) + 0.3 * rng.standard_normal(T.size)
+    assert faults(Experiment(Trajectory(T, {"position": position, "force": force}))) == []
+
+
+@pytest.mark.parametrize("slip", [0.1, 0.15])
+def test_a_mass_that_sticks_and_slips_is_not_blamed(slip: float) -> None:
+    """While a part of a window rests, the force there is what friction holds, and no acceleration goes with it."""
+    t, cycle, mass, rng = np.arange(10_000) * 2e-3, 1.0, 3.0, np.random.default_rng(6)
+    side, since = np.where((t // cycle) % 2 < 1, 1.0, -1.0), t % cycle
+    moves, w, size = since < slip, np.pi / slip, 8e-3
+    shift = size * np.where(moves, 0.5 - 0.5 * np.cos(w * since), 1.0)
+    position = 0.1 + np.where(side > 0, shift, size - shift) + 4e-5 * rng.standard_normal(t.size)
+    rest = side * (20.0 - 100.0 * np.clip((since - slip) / (cycle - slip), 0.0, 1.0))
+    force = np.where(moves, side * (40.0 + mass * size / 2 * w**2 * np.cos(w * since)), rest)
+    log = Experiment(Trajectory(t, {"position": position, "force": force}))
+    assert [f.message for f in examine(log, PISTON._replace(inertia=mass)) if f.fault] == []
+
+
 def test_units_of_position_and_speed_must_agree() -> None:
     told = faults(swing(speed=1e3 * swing().trajectory["speed"]))
     assert any("times the slope of the position: check both units" in message for message in told)

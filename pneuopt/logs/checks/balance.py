@@ -161,12 +161,16 @@ def _fit_balance(experiment: Experiment, axis: StatedAxis) -> Balance | None:
         return None
     mass = 0.0 if math.isnan(axis.inertia) else axis.inertia
     one = [(np.column_stack([a, s, v, np.ones(v.size)]), f) for _, a, s, v, f in lags]
-    fits = [(*np.linalg.lstsq(A, f)[:1], A, f) for A, f in one]
-    values, A, f = min(fits, key=lambda fit: _rms(fit[2] - fit[1] @ fit[0]))
+    left = [_residual(A, f) for A, f in one]
+    # a lag turns speed into acceleration: where the log hardly tells lags apart, the least one is assumed
+    told = [k for k in range(len(one)) if left[k] <= MIN_RESIDUAL_FACTOR * min(left)]
+    chosen = min(told, key=lambda k: (abs(lags[k][0]), left[k]))
+    A, f = one[chosen]
+    values = np.linalg.lstsq(A, f)[0]
     stated = min(_residual(A[:, 1:], f - mass * A[:, 0]) for A, f in one)
     centred = min(_residual(A[:, :3], f) for A, f in one)
     found = [float(value) for value in values]
-    return Balance(found[0], found[3], found[1], _rms(f - A @ values), stated, centred, float(f.std()))
+    return Balance(found[0], found[3], found[1], left[chosen], stated, centred, float(f.std()))
 
 
 class _Rows(NamedTuple):
@@ -203,12 +207,13 @@ def _weigh(experiment: Experiment, axis: StatedAxis) -> _Rows | None:
 def _rows(t: Array, x: Array, a: Array, force: Array, half: int) -> _Rows:
     step = float(t[1] - t[0])
     hat = (half - np.abs(np.arange(1 - half, half))) / half**2
-    before, after = (x[half:-half] - x[: -2 * half]) / (half * step), (x[2 * half :] - x[half:-half]) / (half * step)
-    speed = (before + after) / 2
+    speed = (x[2 * half :] - x[: -2 * half]) / (2 * half * step)
+    # by quarters: where a part of a window rests, friction is what holds the body there, and looks like a mass
+    each, count = max(1, half // 2), speed.size
+    edges = range(0, 2 * half, each)
+    parts = np.array([x[k + each : k + each + count] - x[k : k + count] for k in edges]) / (each * step)
     least = LARGE_SHARE * float(np.nanquantile(np.abs(speed), 0.99))
-    direction = np.where(
-        (before > least) & (after > least), 1.0, np.where((before < -least) & (after < -least), -1.0, 0.0)
-    )
+    direction = np.where((parts > least).all(axis=0), 1.0, np.where((parts < -least).all(axis=0), -1.0, 0.0))
     mean = np.convolve(force, hat, "same")[half:-half]
     return _Rows(t[half:-half], a, speed, mean, direction)
 

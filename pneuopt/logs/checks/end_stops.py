@@ -57,9 +57,13 @@ def check_end_stops(experiment: Experiment, axis: StatedAxis) -> Iterator[LogFin
 def _usual_push(inside: Mask, motion: Array, push: Array) -> tuple[float, float]:
     """The middle of the pushes that move the body each way, and how far from it a push moves or holds it."""
     fast = LARGE_SHARE * float(np.nanquantile(np.abs(motion), 0.99))
-    ways = [push[side * motion > fast] for side in (1, -1)]
+    moving = [side * motion > fast for side in (1, -1)]
+    ways = [push[each] for each in moving]
     known = [float(np.nanmedian(way)) for way in ways if way.size >= MIN_STOP_SAMPLES]
-    middle = sum(known) / 2 if len(known) == 2 else 0.0
+    travels = [float(np.sum(np.abs(motion[each]))) for each in moving]
+    # noise in rest goes either way: a body that only advances has no middle
+    goes_back = min(travels) > LARGE_SHARE * max(travels)
+    middle = sum(known) / 2 if len(known) == 2 and goes_back else 0.0
     pushes = np.abs(np.concatenate(ways) - middle)
     held = np.abs(push[(np.abs(motion) < fast) & inside] - middle)
     holding = float(np.nanquantile(held, 0.99)) if held.size >= MIN_STOP_SAMPLES else 0.0
