@@ -109,7 +109,7 @@ def worst_values(found: Sequence[dict[str, float]]) -> dict[str, float]:
 def is_sound(y: Array, x_end: Array) -> Mask:
     """Which lanes did not run away, shape (m,)."""
     with np.errstate(all="ignore"):
-        tame = np.all(np.abs(y) < RUNAWAY_LEVEL, axis=(1, 2))
+        tame = (y.max(axis=(1, 2)) < RUNAWAY_LEVEL) & (y.min(axis=(1, 2)) > -RUNAWAY_LEVEL)  # NaN is neither
     return np.asarray(tame & np.isfinite(x_end).all(axis=1))
 
 

@@ -39,7 +39,8 @@ def prepare_rollout(
     Returns
     -------
     functions : dict of str to casadi.Function
-        "step", "output" and, if there is one, "update": ``(..., x, u, p, S) -> (value, its sensitivity)``.
+        "step", "output" and, if there is one, "update": ``(..., x, u, p, S) -> (value, its sensitivity)``; of an ODE
+        "rate", too: ``(t, x, u, p) -> (xdot, its Jacobians to x and to the chosen parameters)``.
     source : str
         Empty where an operation has no form in C, which is said once.
     """
@@ -96,6 +97,10 @@ def _with_sensitivities(
         "step": piece_function("step", [t, h], x_next, S_next),
         "output": piece_function("output", [t], y, value_sensitivity(y)),
     }
+    if ode is not None:
+        xdot = ode(t, x, u, p)[0]
+        slopes = [ca.densify(xdot), ca.jacobian(xdot, x), ca.jacobian(xdot, p)[:, list(wrt)]]
+        functions["rate"] = ca.Function("system_rate", [t, x, u, p], slopes, {"cse": True})
     if update is not None:
         after = update(t, x, u, p)
         functions["update"] = piece_function("update", [t], after, value_sensitivity(after))

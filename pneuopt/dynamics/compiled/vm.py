@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.dynamics.compiled.array_program import ArrayProgram
+from pneuopt.dynamics.compiled.array_step import bind_array_step
 from pneuopt.quantities.arrays import Array
 
 # Operations, segments times those of the model, that a thread is started for, half a millisecond. Fewer, and starting
@@ -84,7 +85,7 @@ def run_in_vm(
     Parameters
     ----------
     functions : mapping of str to casadi.Function
-        "step", "output" and, if there is one, "update", as `prepare_rollout` makes them.
+        "step", "output" and, if there are such, "update" and "rate", as `prepare_rollout` makes them.
     given : tuple of ndarray
         x0, u, p, t and h, as `Rollout.run` takes them.
     start_columns : int
@@ -137,7 +138,7 @@ def _run(
     read_output = engine.bind(functions["output"], (at, *arguments), (y, dy))
     step, times = engine.fold(functions["step"], substeps)
     operations = functions["step"].n_instructions() * substeps // times
-    advance = engine.bind(step, (at, size, *arguments), (x_next, S_next), operations)
+    advance = engine.bind_step(step, (at, size, *arguments), (x_next, S_next), operations, functions.get("rate"))
     update = engine.bind(functions["update"], (at, *arguments), (x_next, S_next)) if "update" in functions else None
     kept = np.empty((m, -(-n // states), nx)) if states else None
     run = VmRun(np.empty((m, n, ny)), np.empty((m, n, ns, ny)), kept, np.empty((m, nx)), np.empty((m, ns, nx)))
@@ -185,6 +186,16 @@ class _Machine:
         mapped = function.map(self._m, "thread", parts) if parts > 1 else function.map(self._m)
         return bind_function(mapped, inputs, results)
 
+    def bind_step(
+        self,
+        step: ca.Function,
+        inputs: Sequence[Array],
+        results: Sequence[Array],
+        operations: int,
+        _rate: ca.Function | None,
+    ) -> Callable[[], object]:
+        return self.bind(step, inputs, results, operations)
+
 
 class _Arrays:
     """Functions of m segments at once as operations on arrays; in memory, a number of all segments stands together."""
@@ -203,9 +214,24 @@ class _Arrays:
     ) -> Callable[[], None]:
         program = _find_program(function)
         assert program is not None, "asked before"
-        return program.bind(
-            *([np.moveaxis(a, 0, -1).reshape(-1, self._m) for a in group] for group in (inputs, results))
-        )
+        return program.bind(self._as_rows(inputs), self._as_rows(results))
+
+    def bind_step(
+        self,
+        step: ca.Function,
+        inputs: Sequence[Array],
+        results: Sequence[Array],
+        operations: int,
+        rate: ca.Function | None,
+    ) -> Callable[[], None]:
+        """As `bind`; the columns of an ODE's sensitivities together."""
+        program = None if rate is None or not inputs[-1].size else _find_program(rate)
+        if rate is None or program is None:
+            return self.bind(step, inputs, results, operations)
+        return bind_array_step(rate, program, self._as_rows(inputs), self._as_rows(results))
+
+    def _as_rows(self, arrays: Sequence[Array]) -> list[Array]:
+        return [np.moveaxis(a, 0, -1).reshape(-1, self._m) for a in arrays]
 
 
 @functools.lru_cache(maxsize=64)
