@@ -43,7 +43,7 @@ def plot_sensitivity(found: Sensitivity) -> "Figure":
             spread = np.nan_to_num(np.abs([value - low, high - value]))
             panel.barh(places + shift, value, 0.36, xerr=spread, color=colour, label=label, ecolor="k", capsize=2)
         panel.set_yticks(places, order if panel is row[0] else [""] * len(order))
-        panel.set_xlim(left=min(0.0, panel.get_xlim()[0]))
+        panel.set_xlim(0.0, max(1.0, panel.get_xlim()[1]))  # one scale, so that panels compare, and a constant's is 0
         panel.set_title(str(figure), fontsize=10)
         panel.set_xlabel("share of its variance [1]")
         panel.invert_yaxis()

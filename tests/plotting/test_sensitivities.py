@@ -28,3 +28,18 @@ def test_bars_are_the_indices_and_what_is_left_out_is_said() -> None:
     own = found.table.loc["SettlingTime"]
     assert widths == pytest.approx([*own["total"][["much", "little"]], *own["first"][["much", "little"]]])
     assert [text.get_text() for text in picture.texts] == ["3 of 4 figures"]
+
+
+def test_panels_have_one_scale_whose_end_is_the_whole_variance_for_a_constant_too() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        found = sensitivity(
+            lambda p: {"moves": p.value("much"), "stays": 1.0},
+            CUBE,
+            dict.fromkeys(CUBE, 0.1),
+            count=32,
+            executor=executor,
+        )
+    ends = [panel.get_xlim() for panel in plot_sensitivity(found).axes]
+    assert [low for low, _ in ends] == [0.0, 0.0]
+    assert ends[0][1] >= 1.0
+    assert ends[1][1] == 1.0
