@@ -128,6 +128,7 @@ from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
+from .studies.batch import BatchEvaluation, evaluate_batch
 from .studies.bootstrap import Bootstrap, bootstrap
 from .studies.cases import grid, read_cases
 from .studies.cluster import open_executor
@@ -154,6 +155,7 @@ __all__ = [
     "Assumption",
     "Asymmetric",
     "BandCentre",
+    "BatchEvaluation",
     "Bootstrap",
     "Certificate",
     "Checkup",
@@ -259,6 +261,7 @@ __all__ = [
     "Stribeck",
     "System",
     "Thermal",
+    "Tracking",
     "Trajectory",
     "TuningResult",
     "TwoPhase",
@@ -284,6 +287,7 @@ __all__ = [
     "dither_effect",
     "draws",
     "evaluate",
+    "evaluate_batch",
     "examine_logs",
     "expected_plants",
     "find_limit_cycle",

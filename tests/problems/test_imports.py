@@ -16,6 +16,7 @@ INSIDE = {
     "problems/shared/mismatched_rig.py": "makes its logs by machine code, of the library's valve and chambers",
     "problems/speed/benchmark_identification.py": "times the full-space solver from the start that the log gives",
     "problems/speed/linear_tuning.py": SEARCH,
+    "problems/speed/batched_monte_carlo.py": "times the compiled simulation of one plant, beside many in lanes",
     "problems/speed/simulation_speed.py": "times the compiled simulation, lane by lane",
     "problems/speed/t32.py": SEARCH,
     "problems/tune/random_designs.py": "confirms refusals by brute force on the search's batched simulator",

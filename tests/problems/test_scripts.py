@@ -18,7 +18,7 @@ from problems.identify import (
     step_response,
     windows,
 )
-from problems.speed import simulation_speed
+from problems.speed import batched_monte_carlo, simulation_speed
 from problems.tune import pareto, supply_and_load, tune_drive
 
 DATASETS = Path(__file__).parents[3] / "shared" / "datasets"
@@ -130,3 +130,10 @@ def test_pareto(tmp_path: Path) -> None:
     for name, picture in pareto.figures(job).items():
         picture.savefig(tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+def test_batched_monte_carlo_agrees_with_the_certificate() -> None:
+    rows = batched_monte_carlo.main(plants=50, recertify=0.02).set_index("name")["value"].to_dict()
+    assert rows["failed"] == 0
+    assert rows["apart"] == 0
+    assert rows["certified"] >= 2
