@@ -69,10 +69,13 @@ from .files.tuning import read_tuning, write_tuned
 from .identification.assumptions import Assumption
 from .identification.checkup import Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs
+from .identification.criteria import AOptimal, DOptimal, Precision
 from .identification.examination import examine_logs
+from .identification.experiment_design import ExperimentDesign
 from .identification.identifiability import identifiability
 from .identification.identify import identify, predict, validate
 from .identification.losses import Huber, SoftL1
+from .identification.next_experiment import next_experiment
 from .identification.profiles import Profile, profile
 from .identification.propagation import PropagatedValue, propagate_error
 from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
@@ -150,6 +153,7 @@ __all__ = [
     "ISE",
     "ITAE",
     "PID",
+    "AOptimal",
     "Actuator",
     "AirUse",
     "Assumption",
@@ -168,6 +172,7 @@ __all__ = [
     "ConvergenceError",
     "Coulomb",
     "Cylinder",
+    "DOptimal",
     "DeadZoneInverse",
     "Defect",
     "DesignValidation",
@@ -180,6 +185,7 @@ __all__ = [
     "EventKind",
     "ExpectedPlants",
     "Experiment",
+    "ExperimentDesign",
     "Factor",
     "Feedforward",
     "Finding",
@@ -227,6 +233,7 @@ __all__ = [
     "PneumaticDrive",
     "PneuoptError",
     "Polytropic",
+    "Precision",
     "Presliding",
     "PressureDependent",
     "Processes",
@@ -303,6 +310,7 @@ __all__ = [
     "margins",
     "mean_start",
     "monte_carlo",
+    "next_experiment",
     "open_executor",
     "open_loop",
     "pareto_front",

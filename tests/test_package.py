@@ -15,6 +15,11 @@ import pneuopt
 
 ROOT = Path(__file__).parents[1]
 PUBLIC_NAMES = [
+    "AOptimal",
+    "DOptimal",
+    "ExperimentDesign",
+    "next_experiment",
+    "Precision",
     "Actuator",
     "AirUse",
     "apply_scenario",

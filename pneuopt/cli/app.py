@@ -1,4 +1,4 @@
-"""The command line: `pneuopt init | check | identify | tune | simulate | study | keys | info`.
+"""The commands `pneuopt init | check | identify | tune | simulate | study | next-experiment | track | keys | info`.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
 error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it
@@ -245,6 +245,48 @@ def study_command(
 
         computing = Computing(executor, time_limit, memory_limit, resume)
         raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet, computing))
+
+
+@app.command("next-experiment")
+def next_experiment_command(
+    fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml: estimates, their covariance, what is free.")],
+    duration: Annotated[str, typer.Option(metavar="TIME", help="Of a run: 10s.")],
+    limit: Annotated[
+        list[str],
+        typer.Option(metavar="SIGNAL=LOW..HIGH", help="Kept at every sample: position=20mm..180mm; repeatable."),
+    ],
+    tuning: Annotated[
+        Path | None, typer.Option("--loop", metavar="TUNING", help="tuning.toml: run its loop; else in open loop.")
+    ] = None,
+    target: Annotated[
+        str, typer.Option(metavar="NAMES", help="Parameters, with commas, * for any.", show_default="all free ones")
+    ] = "",
+    sample_time: Annotated[str, typer.Option(metavar="TIME", help="Of an open loop: 1ms.")] = "",
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SIGNAL=VALUE", help="Of what will be logged; as in the fit's logs if left out."),
+    ] = None,
+    start: Annotated[
+        list[str] | None, typer.Option(metavar="SIGNAL=VALUE", help="Rest from which a run begins.")
+    ] = None,
+    runs: Annotated[int, typer.Option(metavar="N", help="Runs that are planned together.")] = 1,
+    mean: Annotated[bool, typer.Option("--mean", help="Make the mean deviation small, not the joint region.")] = False,
+    budget: Annotated[float, typer.Option(metavar="SECONDS", help="CPU time of the search.")] = 60.0,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write what to play, CSV.")
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> None:
+    """Plan the run that shrinks the confidence intervals of a fit most, within limits."""
+    with _report_errors():
+        from pneuopt.cli.next_experiment import PlannedOptions, run_next_experiment
+        from pneuopt.cli.shared import Outputs
+
+        targets = tuple(filter(None, (n.strip() for n in target.split(","))))
+        lists = (tuple(limit), tuple(noise or ()), tuple(start or ()))
+        options = PlannedOptions(duration, sample_time, targets, *lists, runs, mean, budget)
+        raise typer.Exit(run_next_experiment(fit, tuning, options, Outputs(output, json, None), quiet))
 
 
 @app.command("keys")

@@ -161,6 +161,18 @@ def read_covariance(path: str | Path) -> "pd.DataFrame | None":
     return pd.DataFrame(matrix, list(rows), list(rows))
 
 
+def read_noise(path: str | Path) -> dict[str, float]:
+    """Of each channel of a fit.toml's logs the larger of noise and residuals, the median over the logs [SI]."""
+    found: dict[str, list[float]] = {}
+    for channels in read_toml(path).unwrap().get("agreement", {}).values():
+        for name, row in channels.items() if isinstance(channels, dict) else ():
+            levels = [
+                row[k] for k in ("noise", "rmse") if isinstance(row, dict) and isinstance(row.get(k), int | float)
+            ]
+            found.setdefault(str(name), []).extend([max(levels)] if levels else [])
+    return {n: float(np.median(levels)) for n, levels in found.items() if levels}
+
+
 def read_estimates(path: str | Path) -> "pd.DataFrame | None":
     """The estimates of a fit with what is uncertain about them; None for a file that no fit has written.
 

@@ -7,6 +7,7 @@ from pneuopt.evaluation.certificate import Certificate
 from pneuopt.evaluation.compensator_verdict import CompensatorVerdict
 from pneuopt.evaluation.dither_verdict import DitherVerdict
 from pneuopt.identification.compare_logs import LogComparison
+from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.select_model import ModelSelection
 from pneuopt.quantities.result_file import read_result
@@ -16,7 +17,7 @@ from pneuopt.tuning.validation import DesignValidation
 RESULT_KINDS: dict[str, type] = {
     kind.__name__: kind
     for kind in (
-        *(IdentificationResult, ModelSelection, LogComparison),
+        *(IdentificationResult, ModelSelection, LogComparison, ExperimentDesign),
         *(TuningResult, DesignValidation, Certificate, DitherVerdict, CompensatorVerdict),
     )
 }

@@ -13,6 +13,7 @@ from problems.identify import (
     bootstrap_bias,
     emps,
     foreign_rig,
+    next_experiment,
     real_logs,
     seal_friction,
     step_response,
@@ -130,6 +131,12 @@ def test_pareto(tmp_path: Path) -> None:
     for name, picture in pareto.figures(job).items():
         picture.savefig(tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+def test_next_experiment_plans_within_limits_and_compares_fits() -> None:
+    rows = next_experiment.main(duration=2.0, cpu_seconds=2.0).set_index("name")
+    assert rows["holds"][["b32.limits", "emps.limits"]].all()
+    assert rows["value"][[n for n in rows.index if ".narrower." in n]].notna().all()
 
 
 def test_batched_monte_carlo_agrees_with_the_certificate() -> None:

@@ -1,0 +1,232 @@
+"""`DesignSearch`: blocks of an excitation by exchange, then refined whole; what is best is an `ExperimentDesign`."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pneuopt.dynamics.system import names
+from pneuopt.identification.criteria import Criterion
+from pneuopt.identification.experiment_design import ExperimentDesign, tabulate_design
+from pneuopt.identification.planned_run import MIN_SUBSTEPS, NODE_NOISE, PREDICTED_NODE_NOISE, PlannedRun
+from pneuopt.identification.waveforms import CYCLES_A_SAMPLE, Block, join_blocks, library, vary
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import InputError, require
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.progress import ProgressReporter
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.quantities.units import write_value
+from pneuopt.shooting.budget import CpuBudget
+
+BLOCKS = 8  # of a run: more are refined longer, fewer make poorer mixtures
+MIN_BLOCK_SAMPLES = 50  # of a block: shorter ones hold no slow motion
+VARIATIONS = 12  # of a block at once, in SIMD lanes: more are better and take longer
+FIRST_SPREAD, LAST_SPREAD = 0.5, 0.05  # of a change [1]: as a search begins and where it ends
+QUIET_ROUNDS = 2  # rounds over all blocks without a gain of `MIN_GAIN`, after which a search has ended
+MIN_GAIN = 0.01  # of the criterion [1] over a round: less is not worth the time
+VAGUE = 10.0
+"""Relative standard deviation [1] of what nothing tells, which keeps covariances finite: less passes for knowledge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """The criterion of information matrices."""
+
+    criterion: Criterion
+    free: tuple[str, ...]
+    targets: tuple[str, ...]
+    parameters: ParameterSet
+    worst_case: bool
+
+    @cached_property
+    def sizes(self) -> Array:
+        """What each standard deviation is divided by: the value, or of an offset at zero its range or 1."""
+        return np.array([value_size(self.parameters, n) for n in self.free])
+
+    def covariance(self, information: Array) -> Array:
+        """The covariance of all free parameters, in units of their sizes."""
+        scaled = information * np.outer(self.sizes, self.sizes) + np.eye(len(self.free)) / VAGUE**2
+        return np.asarray(np.linalg.inv(scaled))
+
+    def deviation(self, information: Array) -> Array:
+        """The criterion's figure, over plants along the first axis; shape (plants, ..., k, k) -> (...)."""
+        chosen = [self.free.index(n) for n in self.targets]
+        figures = self.criterion.deviation(self.covariance(information)[..., chosen, :][..., :, chosen])
+        with np.errstate(divide="ignore"):
+            every = np.log(np.where(np.isnan(figures), np.inf, figures))
+        return np.asarray(np.exp(every.max(axis=0) if self.worst_case else every.mean(axis=0)))
+
+
+@dataclass(eq=False)
+class DesignSearch:
+    """The search for the blocks of all runs."""
+
+    run: PlannedRun
+    plants: tuple[ParameterSet, ...]
+    known: Array
+    judge: Judge
+    samples: int
+    runs: int
+    rng: np.random.Generator
+    budget: CpuBudget
+    progress: ProgressReporter
+    tried: int = 0
+    substeps: int = MIN_SUBSTEPS
+
+    def design(self) -> ExperimentDesign:
+        """Choose blocks, refine the runs, and predict what they tell."""
+        self.substeps = max(self.run.stable_substeps(p) for p in self.plants)
+        chosen = self._refine([self._fit_into_limits(blocks) for blocks in self._choose_blocks()])
+        signals = np.stack([self._signal(blocks) for blocks in chosen])
+        nominal, fine = self.plants[0], 2 * self.substeps
+        shown = self.run.simulate(signals, nominal, fine)
+        gained = self.run.information(shown, nominal, fine, PREDICTED_NODE_NOISE).sum(axis=0)
+        every = [self.run.violations(self.run.simulate(signals, p, self.substeps), p) for p in self.plants]
+        room = {n: float(max(np.max(v[n]) for v in every)) for n in every[0]}
+        channels = names(self.run.channels)
+        runs = tuple(Trajectory(self._grid, dict(zip(channels, r.T, strict=True))) for r in shown)
+        table = tabulate_design(nominal, self.run.free, self.judge.targets, self.known, gained)
+        origin = self.run.origin
+        steps = tuple(tuple(b.describe(self.run.excitation.unit) for b in blocks) for blocks in chosen)
+        units = {q.name: q.unit for q in self.run.channels}
+        before, after = (float(self.judge.deviation(f[None])) for f in (self.known, self.known + gained))
+        figures = {"before": before, "after": after, "tried": float(self.tried), "origin": origin}
+        figures |= {"plants": float(len(self.plants)), "cpu_seconds": self.budget.seconds}
+        return ExperimentDesign(
+            self.run.excitation.name,
+            runs,
+            steps,
+            table,
+            self.run.all_limits(nominal),
+            room,
+            repr(self.judge.criterion),
+            figures,
+            units,
+        )
+
+    @cached_property
+    def _grid(self) -> Array:
+        return np.asarray(np.arange(self.samples) * self.run.sample_time, dtype=np.float64)
+
+    @property
+    def _blocks(self) -> int:
+        return max(1, min(BLOCKS, self.samples // MIN_BLOCK_SAMPLES))
+
+    @cached_property
+    def _reach(self) -> tuple[float, float]:
+        """How far the excitation may go down and up from the start."""
+        low, high = self.run.excited_limits()
+        origin = self.run.origin
+        return low - origin, high - origin
+
+    @property
+    def _amplitude(self) -> float:
+        """The largest amplitude."""
+        return max(abs(v) for v in self._reach)
+
+    def _choose_blocks(self) -> list[list[Block]]:
+        """The blocks of all runs by exchange: their information adds up."""
+        t = self._grid[: self.samples // self._blocks]
+        waves = library(self._amplitude, float(t[-1]) or self.run.sample_time, self.run.sample_time)
+        gains, keeps = self._evaluate(np.stack([np.clip(b.samples(t), *self._reach) for b in waves]))
+        if not keeps.any():
+            raise self._infeasible(waves, t)
+        waves = [b for b, good in zip(waves, keeps, strict=True) if good]
+        gains = gains[:, keeps]
+        picked = list[int]()
+        total = np.repeat(self.known[None], len(self.plants), axis=0)
+        for _ in range(self._blocks * self.runs):
+            best = int(np.argmin(self.judge.deviation(total[:, None] + gains)))
+            picked.append(best)
+            total = total + gains[:, best]
+        for _ in range(QUIET_ROUNDS):
+            for k, old in enumerate(picked):
+                rest = total - gains[:, old]
+                picked[k] = int(np.argmin(self.judge.deviation(rest[:, None] + gains)))
+                total = rest + gains[:, picked[k]]
+        ordered = sorted(picked, key=lambda i: waves[i].amplitude)
+        return [[waves[i] for i in ordered[r :: self.runs]] for r in range(self.runs)]
+
+    def _fit_into_limits(self, blocks: list[Block]) -> list[Block]:
+        """The blocks in a row, all made smaller until the whole run keeps the limits."""
+        sizes = np.geomspace(1.0, 1e-3, 25)
+        rows = [[replace(b, amplitude=b.amplitude * size) for b in blocks] for size in sizes.tolist()]
+        _, keeps = self._evaluate(np.stack([self._signal(row) for row in rows]))
+        require(bool(keeps.any()), "the blocks of a run, one behind the other, keep no limits; plan a shorter duration")
+        return rows[int(np.argmax(keeps))]
+
+    def _refine(self, runs: list[list[Block]]) -> list[list[Block]]:
+        """Change block after block of each run by chance, and keep what is better within the limits."""
+        every = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
+        best = float(self.judge.deviation(self.known + every.sum(axis=1)))
+        spread, quiet, fastest = FIRST_SPREAD, 0, max(CYCLES_A_SAMPLE / self.run.sample_time, 2 / self._grid[-1])
+        ends = (1 / float(self._grid[-1]), fastest)
+        while quiet < QUIET_ROUNDS and not self.budget.is_spent:
+            before = best
+            for r, k in [(r, k) for k in range(self._blocks) for r in range(self.runs)]:
+                if self.budget.is_spent:
+                    break
+                others = self.known + every.sum(axis=1) - every[:, r]
+                tried = [list(runs[r]) for _ in range(VARIATIONS)]
+                for row in tried:
+                    row[k] = vary(row[k], self.rng, spread, self._amplitude, ends)
+                gains, keeps = self._evaluate(np.stack([self._signal(row) for row in tried]))
+                figures = np.where(keeps, self.judge.deviation(others[:, None] + gains), np.inf)
+                winner = int(np.argmin(figures))
+                if figures[winner] < best:
+                    best, runs[r] = float(figures[winner]), tried[winner]
+                    every[:, r] = gains[:, winner]
+            self.progress(f"relative standard deviation {best:.3g}, {self.tried} runs tried")
+            if best > (1 - MIN_GAIN) * before:
+                spread, quiet = max(spread / 2, LAST_SPREAD), quiet + (spread <= LAST_SPREAD)
+        return runs
+
+    def _evaluate(self, signals: Array) -> tuple[Array, Array]:
+        """Information of excitations, shape (plants, m, k, k), and whether all plants keep the limits under them."""
+        keeps = np.ones(len(signals), dtype=bool)
+        low, high = self._reach
+        keeps &= (signals.min(axis=1) >= low - 1e-12) & (signals.max(axis=1) <= high + 1e-12)
+        k = len(self.run.free)
+        gains = np.zeros((len(self.plants), len(signals), k, k))
+        self.tried += len(signals)
+        shown = {}
+        for i, plant in enumerate(self.plants):
+            rows = np.flatnonzero(keeps)
+            if not rows.size:
+                break
+            found = self.run.simulate(signals[rows], plant, self.substeps)
+            shown[i] = rows, found
+            for beyond in self.run.violations(found, plant).values():
+                keeps[rows] &= beyond <= 0
+        for i, (rows, found) in shown.items():
+            kept = keeps[rows]
+            gains[i, rows[kept]] = self.run.information(found[kept], self.plants[i], self.substeps, NODE_NOISE)
+        return gains, keeps
+
+    def _signal(self, blocks: Sequence[Block]) -> Array:
+        return np.clip(join_blocks(blocks, self._grid), *self._reach)
+
+    def _infeasible(self, waves: Sequence[Block], t: Array) -> InputError:
+        """Which limit even the gentlest excitation breaks, and what it would need."""
+        gentle = min(waves, key=lambda b: (b.amplitude, b.frequency))
+        signal = np.clip(gentle.samples(t), *self._reach)[None]
+        worst, name, low, high = -math.inf, "", 0.0, 0.0
+        for plant in self.plants:
+            shown = self.run.simulate(signal, plant, self.substeps)
+            for n, beyond in self.run.violations(shown, plant).items():
+                if beyond[0] > worst:
+                    values = shown[0, :, names(self.run.channels).index(n)]
+                    worst, name, low, high = float(beyond[0]), n, float(values.min()), float(values.max())
+        unit = next(q.unit for q in self.run.channels if q.name == name)
+        needs = f"it moves from {write_value(low, unit, 3)} to {write_value(high, unit, 3)}"
+        remedy = "widen that limit, start elsewhere (start=), or close a loop around a plant that runs away"
+        return InputError(f"limits: no excitation keeps {name!r}: under the gentlest one, {needs}; {remedy}")
+
+
+def value_size(parameters: ParameterSet, name: str) -> float:
+    """What a standard deviation of a parameter is compared with [its unit]."""
+    p = parameters[name]
+    width = p.upper - p.lower
+    return abs(p.value) or (width if math.isfinite(width) and width > 0 else 1.0)
