@@ -70,6 +70,7 @@ from .identification.assumptions import Assumption
 from .identification.checkup import Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs
 from .identification.criteria import AOptimal, DOptimal, Precision
+from .identification.design_outlook import DesignOutlook, predict_loss
 from .identification.examination import examine_logs
 from .identification.experiment_design import ExperimentDesign
 from .identification.identifiability import identifiability
@@ -80,6 +81,7 @@ from .identification.profiles import Profile, profile
 from .identification.propagation import PropagatedValue, propagate_error
 from .identification.result import ChosenWidth, ChosenWindow, IdentificationResult, Mark, Verdict
 from .identification.select_model import ModelSelection, select_model
+from .identification.tracking import Tracking, track
 from .logs.checks.findings import LogFinding, Severity
 from .logs.experiments import Experiment, differentiate, resample, split
 from .logs.read_log import read_log
@@ -120,6 +122,7 @@ from .plotting import (
     plot_residuals,
     plot_sensitivity,
     plot_steps,
+    plot_tracking,
     save_figure,
 )
 from .quantities.errors import ConvergenceError, InputError, PhysicsWarning, PneuoptError
@@ -175,6 +178,7 @@ __all__ = [
     "DOptimal",
     "DeadZoneInverse",
     "Defect",
+    "DesignOutlook",
     "DesignValidation",
     "Direction",
     "DiscreteSystem",
@@ -326,8 +330,10 @@ __all__ = [
     "plot_residuals",
     "plot_sensitivity",
     "plot_steps",
+    "plot_tracking",
     "plotting",
     "predict",
+    "predict_loss",
     "profile",
     "propagate_error",
     "proportional_band",
@@ -356,6 +362,7 @@ __all__ = [
     "to_series",
     "to_standard",
     "tolerances",
+    "track",
     "tune",
     "tune_without_dither",
     "validate",

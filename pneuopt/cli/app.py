@@ -289,6 +289,36 @@ def next_experiment_command(
         raise typer.Exit(run_next_experiment(fit, tuning, options, Outputs(output, json, None), quiet))
 
 
+@app.command("track")
+def track_command(
+    drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="drive.toml: what is `free` in it is tracked.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOGS", help="Four or more logs, each of another day.")],
+    tuned: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="tuned.toml: predict what its loop is worth.")
+    ] = None,
+    parameter: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Track this one alone; repeatable.")
+    ] = None,
+    dates: Annotated[
+        str, typer.Option(metavar="DATES", help="A date a log, with commas.", show_default="as stamps or names say")
+    ] = "",
+    drift: Annotated[float, typer.Option(metavar="PERCENT", help="A week, to say after how many logs it is seen.")] = 1,
+    horizon: Annotated[int, typer.Option(metavar="N", help="Logs for which 1 % of false alarms holds.")] = 52,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
+    json: Json = None,
+    plot: Plot = None,
+    quiet: Quiet = False,
+) -> None:
+    """Tell whether parameters drift over dated logs, and what that does to a tuned loop; status 1 if so."""
+    with _report_errors():
+        from pneuopt.cli.shared import Outputs
+        from pneuopt.cli.track import TrackOptions, run_track
+
+        require(drift > 0, f"--drift {drift:g}: give the percent a week that is to be seen")
+        options = TrackOptions(tuned, tuple(parameter or ()), dates, drift / 100, horizon)
+        raise typer.Exit(run_track(drive, _expand_patterns(logs), options, Outputs(output, json, plot), quiet))
+
+
 @app.command("keys")
 def keys_command(
     word: Annotated[

@@ -73,9 +73,9 @@ def run_identify(
     outputs.check(
         _input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS, *OTHER_CHECKS
     )
-    model, parameters = _read_free_drive(drive)
+    model, parameters = read_free_drive(drive)
     system = model.system()
-    experiments = _read_experiments(logs, system, parameters, accept)
+    experiments = read_experiments(logs, system, parameters, accept)
     found = check(system, experiments, parameters)
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
@@ -118,7 +118,7 @@ def run_select(
     remedy = "write the model that is chosen into [friction], and identify again without --select"
     require(outputs.output is None and outputs.plot is None, f"--select writes neither -o nor --plot; {remedy}")
     outputs.check(_input_files(drive, logs))
-    model, parameters = _read_free_drive(drive)
+    model, parameters = read_free_drive(drive)
     systems = _friction_systems(drive, model)
     free = [n for n in parameters.free_names if not n.startswith("friction.")]
     known = parameters.fixed("friction.*").select(
@@ -127,7 +127,7 @@ def run_select(
     with progress("selecting", quiet=quiet) as report_progress:
         chosen = select_model(
             systems,
-            _read_experiments(logs, model.system(), known, accept),
+            read_experiments(logs, model.system(), known, accept),
             known,
             free=[*free, *usual_unknowns()],
             window=window,
@@ -181,9 +181,10 @@ def _draw_refusal(outputs: Outputs) -> Iterator[None]:
         raise
 
 
-def _read_experiments(
+def read_experiments(
     logs: Sequence[Path], plant: System, parameters: ParameterSet, accept: Sequence[str]
 ) -> list[Experiment]:
+    """The logs of a drive; each accepts the named checks."""
     zero = ambient_pressure(parameters)
     return [read_log(path, plant=plant, ambient_pressure=zero).accepting(*accept) for path in logs]
 
@@ -192,7 +193,7 @@ def _input_files(drive: Path, logs: Sequence[Path]) -> list[Path]:
     return [drive, *logs, *(log.with_suffix(".toml") for log in logs)]
 
 
-def _read_free_drive(path: Path) -> tuple[Drive, ParameterSet]:
+def read_free_drive(path: Path) -> tuple[Drive, ParameterSet]:
     """A drive of which something is to be identified."""
     model, parameters = read_drive(path)
     remedy = 'mark what to identify, as in coulomb = { value = "40 N", free = true }'

@@ -17,6 +17,7 @@ from pneuopt.plotting.loop_diagram import plot_loop
 from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
 from pneuopt.plotting.sensitivities import plot_sensitivity
+from pneuopt.plotting.trackings import plot_tracking
 
 __all__ = [
     "BLUE",
@@ -42,5 +43,6 @@ __all__ = [
     "plot_residuals",
     "plot_sensitivity",
     "plot_steps",
+    "plot_tracking",
     "save_figure",
 ]

@@ -1,0 +1,244 @@
+"""`track`: estimates over dated logs of one drive, and whether they drift, with alarms that chance seldom raises."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pneuopt.identification.clusters import t_quantile
+from pneuopt.identification.drift import MIN_LOGS, DriftLine, fit_line, look_level, power
+from pneuopt.identification.result import IdentificationResult
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
+from pneuopt.quantities.shown import Shown
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WEEK = 604800.0  # [s]
+POWERS = (0.8, 0.9)
+"""Probabilities [1] with which the drift is seen after the logs that the power calculation names."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tracking(Shown):
+    """What became of a drive's parameters, log by log.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a parameter: value, that of the line at the last log, and the ends of its 95 % interval; unit;
+        percent_a_week, the line's slope over its value at the first log, and its ends; p, of the last look; scatter,
+        from log to log [unit]; alarm, the date of the first look at `look_level` or below (NaT: none); logs_80 and
+        logs_90, after how many logs the drift asked for is seen with these probabilities (NaN: not within the horizon).
+    history : DataFrame
+        A row a parameter and date: value, stderr, ci_low, ci_high (95 %), p of the look after it; line, line_low,
+        line_high: the last line and its band.
+    look_level : float
+        The p-value of a look at which an alarm is raised [1].
+    level : float
+        Share of histories without a drift that have an alarm [1], over all parameters.
+    horizon : int
+        Logs of a history for which this level holds.
+    asked : float
+        The drift of the power calculation [1/week].
+    """
+
+    table: "pd.DataFrame"
+    history: "pd.DataFrame"
+    look_level: float
+    level: float
+    horizon: int
+    asked: float
+
+    @property
+    def drifting(self) -> tuple[str, ...]:
+        """The parameters with an alarm."""
+        return tuple(str(n) for n in self.table.index[self.table["alarm"].notna()])
+
+    def summary(self) -> Report:
+        """Which parameters drift, since when, and how fast; then a row a parameter."""
+        calm = f"no parameter drifts: no look has p <= {self.look_level:.2g}"
+        head = [Line(f"drift of {', '.join(self.drifting)}: identify and tune again", Tone.DOUBTFUL)]
+        parts: list[Line | Table] = [*(head if self.drifting else [Line(calm, Tone.GOOD)])]
+        parts += [
+            Line(_describe_alarm(str(n), row), indent=2) for n, row in self.table.iterrows() if str(n) in self.drifting
+        ]
+        level = f"without a drift, {100 * self.level:.2g} % of histories of {self.horizon} logs have an alarm"
+        parts.append(Line(level, indent=2))
+        seen = f"logs until\n{100 * self.asked:.2g} % a week"
+        heads = ("value", "95 % interval", "% a week", "95 % interval", "p", "scatter", f"{seen}\nseen in 90 %")
+        rows = tuple(_row(str(n), row) for n, row in self.table.iterrows())
+        return Report(
+            (*parts, Table((*text_columns("parameter"), *number_columns(*heads), *text_columns("unit")), rows))
+        )
+
+
+def track(
+    fits: "Sequence[IdentificationResult | pd.DataFrame]",
+    dates: Sequence[str | date],
+    *,
+    parameters: Sequence[str] = (),
+    level: float = 0.01,
+    horizon: int = 52,
+    drift: float = 0.01,
+) -> Tracking:
+    """Tell whether a drive's parameters drift, from fits of dated logs, each log fitted alone.
+
+    Parameters
+    ----------
+    fits : sequence of IdentificationResult or DataFrame
+        Or their `estimates` with the columns value, stderr, dof and unit. What has no interval does not count.
+    dates : sequence of str, date or datetime
+        When each log was taken, as "2026-03-12" or "2026-03-12T10:00"; in any order.
+    parameters : sequence of str
+        Which to track; by default all with intervals in at least four fits.
+    level : float
+        Probability that a drive without a drift has an alarm within the horizon, over all its parameters [1].
+    horizon : int
+        Logs up to which the drive is watched. More allow for more looks, and see a drift a little later.
+    drift : float
+        What the power calculation is for: relative change of a parameter by week [1].
+
+    Returns
+    -------
+    Tracking
+
+    Raises
+    ------
+    InputError
+        If there are fewer than four dated fits, fits of one date, or a date or name is unknown.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> rows = [{"value": f, "stderr": 0.2, "dof": 90.0, "unit": "N"} for f in (30.1, 31.2, 31.8, 33.1, 33.9, 35.1)]
+    >>> fits = [pd.DataFrame([row], index=["friction.coulomb"]) for row in rows]
+    >>> track(fits, [f"2026-03-{day:02}" for day in (1, 6, 11, 16, 21, 26)], horizon=12).drifting
+    ('friction.coulomb',)
+    """
+    import pandas as pd
+
+    from pneuopt.quantities.frames import WideFrame
+
+    require(len(fits) == len(dates), f"{len(fits)} fits have {len(dates)} dates; give one each")
+    require(len(fits) >= MIN_LOGS, f"{len(fits)} logs show no drift; give {MIN_LOGS} at least")
+    require(0 < level < 1, f"level = {level:g}: give a probability, such as 0.01")
+    stamps = [_read_date(d) for d in dates]
+    order = sorted(range(len(fits)), key=lambda k: stamps[k])
+    stamps = [stamps[k] for k in order]
+    frames = [f.estimates if isinstance(f, IdentificationResult) else f for f in (fits[k] for k in order)]
+    chosen = _choose_parameters(frames, parameters)
+    weeks = np.array([(s - stamps[0]).total_seconds() / WEEK for s in stamps])
+    require(weeks[MIN_LOGS - 2] > 0, f"the first {MIN_LOGS - 1} logs are of one moment, {stamps[0]}; give their dates")
+    planned = _plan_times(weeks, horizon)
+    look = look_level(planned, level / len(chosen))
+    rows, histories = {}, {}
+    for name in chosen:
+        rows[name], histories[name] = _track_one(name, frames, stamps, weeks, planned, look, drift)
+    table = WideFrame(pd.DataFrame.from_dict(rows, orient="index").astype({"alarm": "datetime64[us]"}))
+    history = WideFrame(pd.concat(histories, names=["parameter", "date"]))
+    return Tracking(table, history, look, level, len(planned), drift)
+
+
+def _read_date(given: "str | date") -> datetime:
+    """A moment, without its zone."""
+    if isinstance(given, str):
+        try:
+            given = datetime.fromisoformat(given)
+        except ValueError:
+            raise InputError(f"{given!r} is no date; write it as 2026-03-12 or 2026-03-12T10:00") from None
+    moment = given if isinstance(given, datetime) else datetime(given.year, given.month, given.day)
+    return moment.replace(tzinfo=None)
+
+
+def _choose_parameters(frames: "Sequence[pd.DataFrame]", asked: Sequence[str]) -> list[str]:
+    """The parameters with enough intervals; an error where one that is asked for has not."""
+    known = list(dict.fromkeys(str(n) for frame in frames for n in frame.index))
+    check_names("parameter", asked, known, "the fits")
+    counts = {n: sum(np.isfinite(_estimate(frame, n)[1]) for frame in frames) for n in asked or known}
+    enough = [n for n, count in counts.items() if count >= MIN_LOGS]
+    missing = [n for n in asked if n not in enough]
+    remedy = f"{MIN_LOGS} logs with an interval are needed; log longer runs, or free fewer parameters"
+    require(not missing and bool(enough), f"{', '.join(missing or counts)} cannot be tracked: {remedy}")
+    return enough
+
+
+def _plan_times(weeks: Array, horizon: int) -> tuple[float, ...]:
+    """The times of the logs, and of those to come at their usual distance."""
+    usual = float(np.median(np.diff(weeks))) or float(weeks[-1]) / (len(weeks) - 1)
+    to_come = weeks[-1] + usual * np.arange(1, max(horizon - len(weeks), 0) + 1)
+    return tuple(float(w) for w in (*weeks, *to_come))
+
+
+def _estimate(frame: "pd.DataFrame", name: str) -> tuple[float, float]:
+    """Value and deviation of a normal distribution with the same interval; NaN where there is none."""
+    if name not in frame.index:
+        return math.nan, math.nan
+    value, stderr = (float(frame[column].to_dict()[name]) for column in ("value", "stderr"))
+    dof = float(frame["dof"].to_dict()[name]) if "dof" in frame.columns else math.inf
+    width = stderr * float(t_quantile(dof) / t_quantile(math.inf))
+    return (value, width) if math.isfinite(width) and width > 0 else (math.nan, math.nan)
+
+
+def _track_one(
+    name: str,
+    frames: "Sequence[pd.DataFrame]",
+    stamps: Sequence[datetime],
+    weeks: Array,
+    planned: tuple[float, ...],
+    look: float,
+    asked: float,
+) -> "tuple[dict[str, object], pd.DataFrame]":
+    """A parameter's row and its history."""
+    import pandas as pd
+
+    found = np.array([_estimate(frame, name) for frame in frames])
+    known = np.flatnonzero(np.isfinite(found[:, 1]))
+    p, line = np.full(len(frames), np.nan), None
+    for count in range(MIN_LOGS, len(known) + 1):
+        k = known[:count]
+        if np.ptp(weeks[k]) > 0:
+            line = fit_line(weeks[k], *found[k].T)
+            p[k[-1]] = line.p
+    require(line is not None, f"{name}: its logs with an interval are of one moment; give their dates")
+    assert line is not None  # for mypy
+    alarms = np.flatnonzero(p <= look)
+    (middle, half), half_width = line.at(weeks), t_quantile(math.inf) * found[:, 1]
+    columns = {"value": found[:, 0], "stderr": found[:, 1], "ci_low": found[:, 0] - half_width}
+    columns |= {"ci_high": found[:, 0] + half_width, "p": p}
+    columns |= {"line": middle, "line_low": middle - half, "line_high": middle + half}
+    row: dict[str, object] = {"value": middle[-1], "ci_low": middle[-1] - half[-1], "ci_high": middle[-1] + half[-1]}
+    units = [str(f.loc[name, "unit"]) for f in frames if name in f.index and "unit" in f.columns]
+    row |= {"unit": units[0] if units else "", **_percent_a_week(line), "p": line.p, "scatter": line.scatter}
+    row["alarm"] = stamps[alarms[0]] if len(alarms) else pd.NaT
+    error = math.hypot(line.scatter, float(np.sqrt(np.mean(found[known, 1] ** 2))))
+    seen = power(planned, asked * abs(line.at(weeks[:1])[0][0]) / error, look)
+    for wanted in POWERS:
+        row[f"logs_{100 * wanted:.0f}"] = float(np.argmax(seen >= wanted) + 1) if seen[-1] >= wanted else math.nan
+    return row, pd.DataFrame(columns, index=pd.DatetimeIndex(list(stamps), name="date"))
+
+
+def _percent_a_week(line: DriftLine) -> dict[str, float]:
+    """The slope over the line's value at the first date, and the ends of its interval."""
+    width = float(t_quantile(line.dof)) * line.slope_error
+    first = abs(float(line.at(np.zeros(1))[0][0]))
+    ends = zip(("", "_low", "_high"), (0.0, -width, width), strict=True)
+    return {f"percent_a_week{end}": 100 * (line.slope + d) / first for end, d in ends}
+
+
+def _describe_alarm(name: str, row: "pd.Series[Any]") -> str:
+    low, high = row["percent_a_week_low"], row["percent_a_week_high"]
+    since = f"{row['alarm']:%Y-%m-%d}"
+    return f"{name} changes by {row['percent_a_week']:.2g} % a week ({low:.2g} to {high:.2g}), seen since {since}"
+
+
+def _row(name: str, row: "pd.Series[Any]") -> tuple[str, ...]:
+    ends = f"{row['ci_low']:.4g} to {row['ci_high']:.4g}"
+    rate = f"{row['percent_a_week_low']:.2g} to {row['percent_a_week_high']:.2g}"
+    numbers = (format_number(float(row[n]), 2) for n in ("p", "scatter", "logs_90"))
+    return name, format_number(row["value"], 4), ends, f"{row['percent_a_week']:.2g}", rate, *numbers, str(row["unit"])
