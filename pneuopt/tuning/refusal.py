@@ -18,8 +18,10 @@ from pneuopt.tuning.result import TuningResult
 from pneuopt.tuning.search import Search, end_point
 
 
-def confirm_refusal(search: Search, refused: TuningResult) -> TuningResult:
+def confirm_refusal(search: Search, refused: TuningResult) -> tuple[TuningResult, bool]:
     """A design that the certificate lets through, or the refused one's result, which says that none was found.
+
+    The second tells whether a design stands whose improvement was interrupted.
 
     Parameters
     ----------
@@ -37,15 +39,15 @@ def confirm_refusal(search: Search, refused: TuningResult) -> TuningResult:
             held = search.certify_point(point)
             if held.status.converged:
                 words = f"the first search's design was refused ({refused.status.verdict}); better ones may exist"
-                best = _improve(search, longer, held)
-                return replace(best, status=best.status.with_details(words))
+                best, is_stopped = _improve(search, longer, held)
+                return replace(best, status=best.status.with_details(words)), is_stopped
     except KeyboardInterrupt:
         sentences = (f"nothing found so far: {refused.status.verdict}", "run again for an answer")
-        return replace(refused, status=Status(Code.INTERRUPTED, sentences))
+        return replace(refused, status=Status(Code.INTERRUPTED, sentences)), False
     failed = f"of {len(points)} designs that it finds none is certified" if points else "finds none that comes to rest"
     words = f"{describe_confirmation(count)}, {failed}, either"
     stats = {**refused.stats, "confirmation.simulations": float(count)}
-    return replace(refused, status=refused.status.with_details(words), stats=stats)
+    return replace(refused, status=refused.status.with_details(words), stats=stats), False
 
 
 def _excess(resting: Search, longer: Search, points: Array) -> Array:
@@ -63,12 +65,15 @@ def _excess_within(search: Search, points: Array) -> Array:
     return limit_excess(search.simulator.coarse(spec).values(points, spec), spec)
 
 
-def _improve(search: Search, longer: Search, held: TuningResult) -> TuningResult:
-    """A design that is certified, or a better one that a short search about it finds."""
+def _improve(search: Search, longer: Search, held: TuningResult) -> tuple[TuningResult, bool]:
+    """A design that is certified, or a better one that a short search about it finds; whether that was interrupted."""
     margin = search.method.margin
-    found = longer.find(margin, end_point(held, search.space), 1)
-    if not (found.is_complete and found.status.converged):
-        return held
-    better = search.certify_roundings(search.restate(found), margin)
+    try:
+        found = longer.find(margin, end_point(held, search.space), 1)
+        if not (found.is_complete and found.status.converged):
+            return held, found.status.code is Code.INTERRUPTED
+        better = search.certify_roundings(search.restate(found), margin)
+    except KeyboardInterrupt:
+        return held, True
     before, after = (certified_objective(search.spec, result) for result in (held, better))
-    return better if better.status.converged and after < before else held
+    return (better if better.status.converged and after < before else held), False

@@ -143,7 +143,8 @@ def tune(
     _warn_of_swing(task)
     search, result, is_stopped = _search(task, method, ProgressReporter(progress, "tune"))
     result = relax(search, result) if search.spec.limits and result.status.code in INFEASIBILITY_CODES else result
-    result = confirm_refusal(search, result) if result.status.code is Code.NOT_CERTIFIED else result
+    if result.status.code is Code.NOT_CERTIFIED:
+        result, is_stopped = confirm_refusal(search, result)
     tuned = search.space.names
     untuned = [n for n in task.space.names if n not in tuned]
     note = f"{', '.join(untuned)} left as given: without effect on a linear loop's average" if untuned else ""

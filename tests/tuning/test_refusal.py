@@ -132,6 +132,26 @@ def test_a_candidate_that_holds_is_improved_before_it_is_handed_out(monkeypatch:
         return result
 
     monkeypatch.setattr(Search, "certify_point", record)
-    found = confirm_refusal(search, refused)
+    found, is_stopped = confirm_refusal(search, refused)
+    assert not is_stopped
     assert found.status.converged
     assert found.certified.loc["IAE"].max() < 0.95 * held[-1]
+
+
+def test_a_candidate_whose_improvement_is_interrupted_stands_and_is_tried_on_no_plants(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop, given = problem()
+    run, certify = Search.run, Search.certify_roundings
+    monkeypatch.setattr(Search, "run", lambda search: refuse(run(search)))
+
+    def stop(search: Search, found: SearchResult, margin: float) -> TuningResult:
+        if any("certifying candidate" in text for text in told):
+            raise KeyboardInterrupt
+        return certify(search, found, margin)
+
+    told = list[str]()
+    monkeypatch.setattr(Search, "certify_roundings", stop)
+    found = tune(loop, STEP, given, progress=lambda text: told.append(str(text)), **asked())
+    assert (found.status.converged, found.validation) == (True, None)
+    assert "interrupted" in str(found.status)
