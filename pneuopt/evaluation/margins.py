@@ -65,7 +65,28 @@ class Margins:
     stable: bool
 
 
-def margins(open_loop: Linearisation) -> Margins:
+@dataclass(frozen=True, eq=False)
+class GridResponse:
+    """The response of an open loop on its `frequency_grid`, which margins and noise gain share: most of their time.
+
+    Attributes
+    ----------
+    omega : ndarray, shape (n,)
+        [rad/s]
+    L : ndarray of complex, shape (n,)
+    """
+
+    omega: Array
+    L: ComplexArray
+
+    @classmethod
+    def of(cls, open_loop: Linearisation) -> "GridResponse":
+        """Of an open loop with one input and one output."""
+        omega = frequency_grid(open_loop)
+        return cls(omega, frequency_response(open_loop, omega))
+
+
+def margins(open_loop: Linearisation, on_grid: GridResponse | None = None) -> Margins:
     """Robustness margins of ``L(s)`` under negative feedback (`open_loop`).
 
     Crossings are bracketed on `frequency_grid` and refined to machine precision.
@@ -74,6 +95,8 @@ def margins(open_loop: Linearisation) -> Margins:
     ----------
     open_loop : Linearisation
         One input, one output.
+    on_grid : GridResponse, optional
+        The loop's, where it is known.
 
     Returns
     -------
@@ -93,8 +116,8 @@ def margins(open_loop: Linearisation) -> Margins:
     def response(omega: float) -> complex:
         return complex(frequency_response(open_loop, [omega])[0])
 
-    omega = frequency_grid(open_loop)
-    L = frequency_response(open_loop, omega)
+    on_grid = on_grid or GridResponse.of(open_loop)
+    omega, L = on_grid.omega, on_grid.L
     with np.errstate(divide="ignore"):  # a controller without gains
         sizes = np.log(np.abs(L))
     gain = _crossing_frequencies(lambda w: float(np.log(abs(response(w)))), omega, sizes)
@@ -104,8 +127,8 @@ def margins(open_loop: Linearisation) -> Margins:
     gain_margin, phase_crossover = min(gains, key=lambda g: abs(np.log(g[0])), default=(inf, nan))
     phase_margin, gain_crossover = min(phases, key=lambda m: abs(m[0]), default=(inf, nan))
     D = float(open_loop.D[0, 0])
-    Ms, at = _response_peak(lambda w: 1 / (1 + frequency_response(open_loop, w)), omega, 1 / (1 + D))
-    Mt, _ = _response_peak(lambda w: 1 - 1 / (1 + frequency_response(open_loop, w)), omega, D / (1 + D))
+    Ms, at = _response_peak(lambda _, L: 1 / (1 + L), open_loop, on_grid, 1 / (1 + D))
+    Mt, _ = _response_peak(lambda _, L: 1 - 1 / (1 + L), open_loop, on_grid, D / (1 + D))
     stable = bool(are_stable(_loop_poles(open_loop)))
     return Margins(gain_margin, phase_margin, gain_crossover, phase_crossover, Ms, at, Mt, stable)
 
@@ -122,7 +145,10 @@ def lowest_noise_frequency(horizon: float) -> float:
 
 
 def noise_gain(
-    open_loop: Linearisation, gains: tuple[float, float, float, float], lowest_frequency: float = 0.0
+    open_loop: Linearisation,
+    gains: tuple[float, float, float, float],
+    lowest_frequency: float = 0.0,
+    on_grid: GridResponse | None = None,
 ) -> float:
     """``max |C(jw)/(1 + L(jw))|``: the largest gain from measurement noise to the command.
 
@@ -138,6 +164,8 @@ def noise_gain(
     lowest_frequency : float
         [rad/s]; what lies below does not count. An integral answers a constant error of a measured speed without bound
         where the plant cannot go on moving so, a piston whose chambers fill for example.
+    on_grid : GridResponse, optional
+        The loop's, where it is known.
 
     Returns
     -------
@@ -154,13 +182,16 @@ def noise_gain(
     """
     Kp, _, Kd, Tf = gains
 
-    def control_response(w: Array) -> ComplexArray:
+    def control_response(w: Array, L: ComplexArray) -> ComplexArray:
         a, b = controller_parts(gains, w)
-        return np.asarray((a + 1j * b) / (1 + frequency_response(open_loop, w)))
+        return np.asarray((a + 1j * b) / (1 + L))
 
-    omega = frequency_grid(open_loop)
-    omega = np.unique(np.append(omega[omega > lowest_frequency], max(lowest_frequency, omega[0])))
-    return _response_peak(control_response, omega, Kp + Kd / Tf)[0]
+    on_grid = on_grid or GridResponse.of(open_loop)
+    if lowest_frequency > on_grid.omega[0]:
+        counts, first = on_grid.omega > lowest_frequency, [lowest_frequency]
+        L = np.append(frequency_response(open_loop, first), on_grid.L[counts])
+        on_grid = GridResponse(np.append(first, on_grid.omega[counts]), L)
+    return _response_peak(control_response, open_loop, on_grid, Kp + Kd / Tf)[0]
 
 
 def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:
@@ -256,7 +287,9 @@ def sensitivity_terms(
 
 def batch_frequency_response(A: Array, B: Array, C: Array, w: Array) -> ComplexArray:
     """``C (jw I - A)^-1 B`` of m systems, shape (m, n), at frequencies of shape (n,), the same for all, or (m, n)."""
-    resolvent = 1j * w[..., None, None] * np.eye(A.shape[-1]) - A[:, None]
+    resolvent = np.broadcast_to(-A[:, None], (len(A), w.shape[-1], *A.shape[1:])).astype(complex)
+    each = np.arange(A.shape[-1])
+    resolvent[..., each, each] += 1j * w[..., None]
     x = np.linalg.solve(resolvent, np.broadcast_to(B[:, None, :, None], (*resolvent.shape[:3], 1)).astype(complex))
     return np.asarray((C[:, None, None] @ x)[..., 0, 0])
 
@@ -275,17 +308,26 @@ def _crossing_frequencies(function: Callable[[float], float], omega: Array, valu
     return sorted(exact + [float(brentq(function, omega[k], omega[k + 1], xtol=1e-14 * omega[k])) for k in brackets])
 
 
-def _response_peak(response: Callable[[Array], ComplexArray], omega: Array, limit: float) -> tuple[float, float]:
-    """Largest magnitude of a response and its frequency, refined from the grid; `limit` is its value at infinity."""
+def _response_peak(
+    response: Callable[[Array, ComplexArray], ComplexArray],
+    open_loop: Linearisation,
+    on_grid: GridResponse,
+    limit: float,
+) -> tuple[float, float]:
+    """Largest magnitude of a response and its frequency, refined from the grid; `limit` is its value at infinity.
+
+    The response is a function of frequencies and of the open loop's response there.
+    """
 
     def negative_magnitude(log_w: float) -> float:
-        return -float(abs(response(np.array([np.exp(log_w)]))[0]))
+        w = np.array([np.exp(log_w)])
+        return -float(abs(response(w, frequency_response(open_loop, w))[0]))
 
-    on_grid = np.abs(response(omega))
-    k = int(np.argmax(on_grid))
+    omega, sizes = on_grid.omega, np.abs(response(on_grid.omega, on_grid.L))
+    k = int(np.argmax(sizes))
     ends = np.log(omega[[max(k - 1, 0), min(k + 1, len(omega) - 1)]])
     best = minimize_scalar(negative_magnitude, bounds=tuple(ends), method="bounded", options={"xatol": 1e-12})
-    largest, at = max((-float(best.fun), float(np.exp(best.x))), (float(on_grid[k]), float(omega[k])))
+    largest, at = max((-float(best.fun), float(np.exp(best.x))), (float(sizes[k]), float(omega[k])))
     return (largest, at) if largest > abs(limit) else (abs(limit), inf)
 
 

@@ -31,7 +31,7 @@ from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.dither_ripple import remove_ripple
-from pneuopt.evaluation.margins import lowest_noise_frequency, margins, noise_gain
+from pneuopt.evaluation.margins import GridResponse, lowest_noise_frequency, margins, noise_gain
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.quantities.arrays import Array, Indices
@@ -209,13 +209,14 @@ def _find_points(
 
 def _margin_row(loop: ClosedLoop, parameters: ParameterSet, point: OperatingPoint, horizon: float) -> dict[str, Any]:
     linear, lowest = open_loop(loop, parameters, point.x, point.inputs), lowest_noise_frequency(horizon)
-    robust = margins(linear)
+    on_grid = GridResponse.of(linear)
+    robust = margins(linear, on_grid)
     found = {
         "MaxSensitivity": robust.max_sensitivity,
         "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
         "GainMargin": robust.gain_margin,
         "PhaseMargin": robust.phase_margin,
-        NOISE_GAIN: noise_gain(linear, operating_gains(loop, parameters, point.x, point.inputs), lowest),
+        NOISE_GAIN: noise_gain(linear, operating_gains(loop, parameters, point.x, point.inputs), lowest, on_grid),
     }
     if not robust.stable:
         found = {n: nan if n.endswith("Margin") else inf for n in found}
