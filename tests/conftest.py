@@ -85,7 +85,7 @@ def forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
 
 @pytest.fixture
 def count_calls(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[int]]:
-    """Patch a module's `compile_function` and `compile_rate`; the list grows by a 1 at each call of what they make."""
+    """Patch a module's `compile_function` and rates; the list grows by a 1 at each call of what they make."""
 
     def patch(module: ModuleType) -> list[int]:
         calls = list[int]()
@@ -99,8 +99,15 @@ def count_calls(monkeypatch: pytest.MonkeyPatch) -> Callable[[ModuleType], list[
 
             return run
 
+        def counted_under_held_inputs(compiled: Callable[[ca.Function], Any], function: ca.Function) -> Any:
+            hold = compiled(function)
+            return lambda *given: counted(lambda _: hold(*given), function)
+
         for name in ("compile_function", "compile_rate"):
             monkeypatch.setattr(module, name, partial(counted, getattr(module, name)))
+        if hasattr(module, "compile_held_rate"):
+            patched = partial(counted_under_held_inputs, module.compile_held_rate)
+            monkeypatch.setattr(module, "compile_held_rate", patched)
         return calls
 
     return patch

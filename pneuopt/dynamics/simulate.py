@@ -270,14 +270,12 @@ def _integrate(
         for at, end, row, rise, acts in zip(breaks, [*breaks[1:], np.inf], rows, rising, is_sample, strict=True):
             run.restart(at, update(at, x, row, p)[0] if acts and update is not None else x, row, rise)
             until = int(np.searchsorted(grid, end - slack))
-            for t in grid[done:until]:
-                watch.advance(run, t)
-                if continues and watch.contacts:
-                    return run, watch.contacts
-                run.record()
-            if until == len(grid):
+            is_last = until == len(grid)
+            instants = grid[done:until] if is_last else np.append(grid[done:until], end)
+            x = watch.follow(run, instants, until - done, stops=continues)
+            if is_last or (continues and watch.contacts):
                 break
-            x, done = watch.advance(run, end), until
+            done = until
     return run, watch.contacts
 
 

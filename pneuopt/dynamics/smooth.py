@@ -5,19 +5,20 @@
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any, NoReturn, Protocol
 
 import numpy as np
 from scipy import integrate
 
-from pneuopt.dynamics.compiled.functions import compile_function, compile_rate
+from pneuopt.dynamics.compiled.functions import compile_function, compile_held_rate, compile_rate, compile_rows
 from pneuopt.dynamics.hooks import Contact
 from pneuopt.dynamics.ramps import Ramp
 from pneuopt.dynamics.system import System, names
 from pneuopt.dynamics.work_arrays import WorkArrays
-from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ConvergenceError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -26,6 +27,8 @@ MAX_INTERNAL_STEPS = 200_000  # LSODA steps between two instants; below, stiff p
 # [s] between two checks of the validity limits. Above, a short contact with an end stop is missed; below, simulation is
 # slower.
 LIMIT_CHECK_PERIOD = 1e-3
+ROUNDING_STEP = 8  # units in the last place of the time by which instants are one: LSODA refuses such a step
+ODEINT_SUCCESS = "Integration successful."  # what SciPy says of an integration that reached all instants
 
 
 class Integration(Protocol):
@@ -57,6 +60,7 @@ def without_solver_warnings() -> Iterator[None]:
     """Mute LSODA while an integration is under way: why it stops is told by an error of ours."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
+        warnings.simplefilter("ignore", integrate.ODEintWarning)
         yield
 
 
@@ -104,6 +108,79 @@ class LimitMonitor:
         self.observe(t, x)
         return x
 
+    def follow(self, run: Integration, instants: Array, recorded: int, *, stops: bool) -> Array:
+        """Advance a run that was just restarted through instants, and record it at the first `recorded` of them.
+
+        Parameters
+        ----------
+        run : Integration
+        instants : ndarray, shape (n,)
+            [s]
+        recorded : int
+        stops : bool
+            Whether the run ends before the first instant to be recorded by which a limit was met.
+
+        Returns
+        -------
+        ndarray, shape (n_states,)
+            The state at the last instant, if the run does not end before.
+        """
+        t, places = self._with_checks(instants)
+        x = run.advance_along(t) if isinstance(run, SmoothIntegration) else None
+        if not isinstance(run, SmoothIntegration) or x is None:
+            return self._follow_stepwise(run, instants, recorded, stops=stops)
+        kept, met = places[:recorded], self._first_crossing(x) if stops else None
+        if met is not None:
+            kept = kept[kept < met]
+            places = places[: len(kept) + 1]
+        self._observe_along(t[: places[-1] + 1], x[: places[-1] + 1])
+        run.record_along(t[kept], x[kept])
+        return np.array(x[-1])
+
+    def _follow_stepwise(self, run: Integration, instants: Array, recorded: int, *, stops: bool) -> Array:
+        """`follow` with an integration that reaches one instant after the other, or fails on the way."""
+        x = np.empty(0)
+        for k, t in enumerate(instants.tolist()):
+            x = self.advance(run, t)
+            if k < recorded:
+                if stops and self._contacts:
+                    break
+                run.record()
+        return x
+
+    def _with_checks(self, instants: Array) -> tuple[Array, Indices]:
+        """The instants and those between them at which the limits are checked, and the places of the former."""
+        if len(self._contacts) == len(self._limited):
+            return instants, np.arange(len(instants))
+        begins = np.concatenate([[self._t], instants[:-1]])
+        more = np.maximum(np.ceil((instants - begins) / LIMIT_CHECK_PERIOD).astype(int) - 1, 0)
+        places = np.cumsum(more + 1) - 1
+        back = places.repeat(more + 1) - np.arange(places[-1] + 1)  # checks up to the next instant
+        t = begins.repeat(more + 1) + (more.repeat(more + 1) + 1 - back) * LIMIT_CHECK_PERIOD
+        t[places] = instants
+        return t, places
+
+    def _first_crossing(self, x: Array) -> int | None:
+        """The first of the next states, shape (n, n_states), by which a limit was met, now or before."""
+        if self._contacts:
+            return 0
+        crossed = self._crossings(x)[1].any(axis=1)
+        return int(crossed.argmax()) if crossed.any() else None
+
+    def _observe_along(self, t: Array, x: Array) -> None:
+        """`observe` for each of the next states, shape (n, n_states)."""
+        room, crossed = self._crossings(x)
+        for k in np.flatnonzero(crossed.any(axis=1)).tolist():
+            if k:
+                self._t, self._values, self._room = t[k - 1], x[k - 1, self._indices], room[k - 1]
+            self.observe(t[k], x[k])
+        self._t, self._values, self._room = t[-1], x[-1, self._indices], room[-1]
+
+    def _crossings(self, x: Array) -> tuple[Array, Mask]:
+        """The room up to each limit at the next states, shape (n, n_limits), and which limits they cross."""
+        room = self._sides * (self._limits - x[:, self._indices])
+        return room, (np.vstack([self._room, room[:-1]]) > 0) & (room <= 0)
+
     def observe(self, t: float, x: Array) -> None:
         """Note each limit that was crossed since the last call."""
         before, values, room_before = self._values, x[self._indices], self._room
@@ -120,18 +197,21 @@ class Recorder:
     """Collects states, outputs and flags, a row for each instant of the grid."""
 
     def __init__(self, system: System, grid: Array, flags: Sequence[str] = ()) -> None:
-        self._system, self._grid, self._rows = system, grid, list[Array]()
+        self._system, self._grid, self._blocks = system, grid, list[Array]()
         self._columns = (*names(system.states), *names(system.outputs), *flags)
 
     def add(self, x: Array, y: Array, *flags: float) -> None:
         """Append a row."""
-        self._rows.append(np.concatenate([x, y, flags]))
+        self._blocks.append(np.concatenate([x, y, flags])[None])
+
+    def add_rows(self, x: Array, y: Array) -> None:
+        """Append rows, from states and outputs of shapes (n, n_states) and (n, n_outputs)."""
+        self._blocks.append(np.hstack([x, y]))
 
     def trajectory(self) -> Trajectory:
         """The rows so far."""
-        n = len(self._rows)
-        columns = np.reshape(self._rows, (n, len(self._columns))).T
-        return Trajectory(self._grid[:n], dict(zip(self._columns, columns, strict=True)))
+        rows = np.concatenate([np.empty((0, len(self._columns))), *self._blocks])
+        return Trajectory(self._grid[: len(rows)], dict(zip(self._columns, rows.T, strict=True)))
 
     def fail(self, t: float, x: Array) -> NoReturn:
         """Raise `ConvergenceError`: the integration stopped at t in state x."""
@@ -139,7 +219,7 @@ class Recorder:
         raise ConvergenceError(
             f"the simulation stopped after t = {t:.9g} s, where {state}: the model is not defined there, escapes to "
             "infinity or is too stiff; check the parameters, or loosen rtol",
-            self.trajectory() if self._rows else None,
+            self.trajectory() if self._blocks else None,
         )
 
 
@@ -152,10 +232,20 @@ class SmoothIntegration:
         self._origin = grid[0]  # a log may begin at 1.7e9 s, where time itself is coarse
         self._inputs = Ramp(0.0, np.zeros(len(system.inputs)))
         self._record = Recorder(system, grid)
-        scale = np.array([q.nominal for q in system.states])
-        options: dict[str, Any] = {"name": "lsoda", "rtol": rtol, "atol": atol * scale, "nsteps": MAX_INTERNAL_STEPS}
+        atols = atol * np.array([q.nominal for q in system.states])
+        self._tolerances: dict[str, Any] = {"rtol": rtol, "atol": atols}
+        options: dict[str, Any] = {"name": "lsoda", "nsteps": MAX_INTERNAL_STEPS, **self._tolerances}
         self._integrator: Any = integrate.ode(self._rate).set_integrator(**options)
+        self._begin: tuple[float, Array] | None = None  # of a restart from which nothing was advanced
         self._work = WorkArrays()
+
+    @cached_property
+    def _hold(self) -> Callable[[float, Array, Array], Callable[[float, Array], Array]]:
+        return compile_held_rate(self._system.ode)
+
+    @cached_property
+    def _ode_rows(self) -> Callable[..., tuple[Array, ...]]:
+        return compile_rows(self._system.ode)
 
     def _rate(self, t: float, x: Array) -> Array:
         return self._state_rate(self._origin + t, x, self._inputs.at(t), self._p)
@@ -163,29 +253,72 @@ class SmoothIntegration:
     def restart(self, t: float, x: Array, u: Array, slope: Array | None = None) -> None:
         """See `Integration`."""
         self._inputs = Ramp(t - self._origin, u, slope)
-        self._integrator.set_initial_value(x, t - self._origin)
-        if self._system.states:  # without any SciPy takes another integrator, which is never run
-            self._work.give_to(self._integrator._integrator)
+        self._begin = t - self._origin, x
 
     def advance(self, t: float) -> Array:
         """See `Integration`."""
+        self._start()
         before, start = self._integrator.t, np.array(self._integrator.y)
-        if t - self._origin - before <= 8 * np.spacing(abs(t)) or not self._system.states:
-            return start  # LSODA refuses a step of rounding's size
+        if t - self._origin - before <= ROUNDING_STEP * np.spacing(abs(t)) or not self._system.states:
+            return start
         x = np.array(self._integrator.integrate(t - self._origin))
         if not (self._integrator.successful() and np.all(np.isfinite(x))):
             self._record.fail(self._origin + before, start)
         return x
 
+    def advance_along(self, t: Array) -> Array | None:
+        """The states at instants after a restart, shape (n, n_states): what `advance` says, in one call of LSODA.
+
+        The integration stays at the restart. None where it fails on the way, or two instants are one but for rounding.
+        """
+        assert self._begin is not None
+        (begin, x), until = self._begin, t - self._origin
+        is_same = np.diff(until, prepend=begin) <= ROUNDING_STEP * np.spacing(np.abs(t))
+        if is_same[1:].any():
+            return None
+        later = until[int(is_same[0]) :]
+        if not (len(later) and self._system.states):
+            return np.tile(x, (len(t), 1))
+        is_held = self._inputs.slope is None
+        rows, told = integrate.odeint(
+            self._hold(self._origin, self._inputs.u, self._p) if is_held else self._rate,
+            x,
+            np.append(begin, later),
+            tfirst=True,
+            full_output=True,
+            mxstep=MAX_INTERNAL_STEPS,
+            **self._tolerances,
+        )
+        good = told["message"] == ODEINT_SUCCESS and np.all(np.isfinite(rows))
+        return np.asarray(rows[len(rows) - len(t) :]) if good else None
+
     def outputs(self) -> Array:
         """See `Integration`."""
+        self._start()
         t = self._integrator.t
         return self._ode(self._origin + t, self._integrator.y, self._inputs.at(t), self._p)[1]
 
     def record(self) -> None:
         """See `Integration`."""
-        self._record.add(np.array(self._integrator.y), self.outputs())
+        y = self.outputs()
+        self._record.add(np.array(self._integrator.y), y)
+
+    def record_along(self, t: Array, x: Array) -> None:
+        """Keep states of `advance_along`, shape (n, n_states), and the outputs there."""
+        if len(t):
+            u = self._inputs.at((t - self._origin)[:, None])
+            self._record.add_rows(x, self._ode_rows(t[:, None], x, u, self._p)[1])
 
     def trajectory(self) -> Trajectory:
         """See `Integration`."""
         return self._record.trajectory()
+
+    def _start(self) -> None:
+        """Give LSODA the state of the last restart."""
+        if self._begin is None:
+            return
+        begin, x = self._begin
+        self._integrator.set_initial_value(x, begin)
+        self._begin = None
+        if self._system.states:  # without any SciPy takes another integrator, which is never run
+            self._work.give_to(self._integrator._integrator)

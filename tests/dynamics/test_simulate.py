@@ -1,3 +1,4 @@
+import warnings
 from collections.abc import Callable
 from math import pi
 from types import ModuleType
@@ -18,10 +19,12 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import System, define
 from pneuopt.evaluation.metrics import step_metrics
 from pneuopt.models.drive import ForceDrive
-from pneuopt.models.friction import Coulomb, Stribeck
+from pneuopt.models.friction import Coulomb, Stribeck, Viscous
 from pneuopt.models.linear import FirstOrder, SecondOrder
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
-from pneuopt.quantities.errors import ConvergenceError, InputError, UnknownNameError
+from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, UnknownNameError
+from pneuopt.quantities.intersample import Intersample
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.trajectories import Trajectory
 from problems.shared.paper2015 import paper_plant
@@ -153,6 +156,44 @@ def test_a_sampled_loop_with_stiff_friction_takes_few_evaluations(
     run = simulate(loop, inputs, p)
     assert sum(calls) < 40_000  # 20,797 when this was written
     assert run["speed"][-1] == pytest.approx(0.1, rel=0.01)
+
+
+def stepped_simulations() -> dict[str, Trajectory]:
+    """Runs with a held and with a rising input, of a sampled loop, and into both end stops with a coarse grid."""
+    force = ForceDrive(Stribeck()).system()
+    held = Trajectory([0.0, 0.03, 0.1], {"force": [60.0, 20.0, 0.0]})
+    loop = ClosedLoop(force, PID(sample_time=1e-3))
+    gains = loop.parameters.with_values({"pid.Kp": 500.0, "pid.Ki": 3000.0})
+    step = Step(0.1, horizon=0.05).trajectory(1e-3)
+    step = step.with_columns({q.name: np.zeros(len(step)) for q in loop.inputs if q.name != "reference"})
+    drive = PneumaticDrive(friction=Viscous()).system()
+    swing = Trajectory([0.0, 0.7, 1.5], {"valve_voltage": [5.0, -5.0, 0.0]})
+    grid = np.linspace(0.0, 0.1, 57)
+    return {
+        "held": simulate(force, held, force.parameters, t_out=grid),
+        "rising": simulate(force, held, force.parameters, t_out=grid, intersample={"force": Intersample.LINEAR}),
+        "sampled": simulate(loop, step, gains, t_out=np.linspace(0.0, 0.05, 501)),
+        "stops": simulate(drive, swing, drive.parameters, t_out=np.linspace(0.0, 1.5, 151)),
+    }
+
+
+def test_a_run_in_one_call_of_the_integrator_is_that_of_a_call_an_instant_to_the_bit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = list[tuple[dict[str, Trajectory], list[str]]]()
+    for stepwise in (False, True):
+        if stepwise:
+            monkeypatch.setattr(smooth.SmoothIntegration, "advance_along", lambda *_: None)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            runs = stepped_simulations()
+        found.append((runs, [str(w.message) for w in said if issubclass(w.category, PhysicsWarning)]))
+    (runs, contacts), (wanted, told) = found
+    assert contacts == told
+    assert len(contacts) == 2
+    for name, run in runs.items():
+        for column in run.names:
+            assert np.array_equal(run[column], wanted[name][column]), (name, column)
 
 
 def runaway() -> System:
