@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.compiled.functions import compile_rows
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.requirements import METRICS
 from pneuopt.evaluation.step_record import StepRecord, without_slopes
@@ -91,9 +92,8 @@ def meter_metrics(loop: ClosedLoop, parameters: ParameterSet, response: Trajecto
         return {}
     p = loop.parameter_vector(parameters)[[list(loop.parameters).index(n) for n in plant.parameters]]
     given = {q.name: response[q.name] if q.name in response else np.zeros(len(response)) for q in plant.inputs}
-    inputs = np.array([*(given | {loop.command.name: response["control"]}).values()])
-    states = response.matrix(names(plant.states)).T
-    rows = dict(zip(shown, plant.meter.map(len(response)).call([0, states, inputs, p]), strict=True))
-    record = meter_record(response.t, {n: np.array(row) for n, row in rows.items()}, start)
+    inputs = np.column_stack([*(given | {loop.command.name: response["control"]}).values()])
+    rows = compile_rows(plant.meter)([0.0], response.matrix(names(plant.states)), inputs, p)
+    record = meter_record(response.t, {n: row.T for n, row in zip(shown, rows, strict=True)}, start)
     readable = (m for m in METRICS.values() if m.channels and set(m.channels) <= set(shown))
     return {metric.name: float(metric.largest(record)[0]) for metric in readable}
