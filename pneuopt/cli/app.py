@@ -31,6 +31,10 @@ app = typer.Typer(
 )
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all figures as JSON.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw: .png, .pdf or .svg.")]
+ReportFile = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE", help="Write one page of HTML: verdict first, tables, figures, hashes."),
+]
 Window = Annotated[
     float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
 ]
@@ -121,6 +125,7 @@ def identify_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write fit.toml.")] = None,
     json: Json = None,
     plot: Plot = None,
+    report: ReportFile = None,
     window: Window = None,
     accept: Accept = None,
     select: Annotated[
@@ -149,7 +154,7 @@ def identify_command(
         from pneuopt.cli.identify import run_identify, run_select
         from pneuopt.cli.shared import Outputs
 
-        given = drive, _expand_patterns(logs), Outputs(output, json, plot), window, quiet, accept or ()
+        given = drive, _expand_patterns(logs), Outputs(output, json, plot, report), window, quiet, accept or ()
         require(budget > 0, f"--budget {budget:g}: give the CPU seconds that the search may take")
         require(budget == inf or not select, "--budget limits one fit: leave it out with --select")
         require(draws == 0 or draws >= 2, f"--bootstrap {draws}: a spread takes two sets of logs at least")
@@ -172,6 +177,7 @@ def tune_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write tuned.toml.")] = None,
     json: Json = None,
     plot: Plot = None,
+    report: ReportFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Tune PID and dither together, and certify them."""
@@ -179,7 +185,7 @@ def tune_command(
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.tune import run_tune
 
-        raise typer.Exit(run_tune(fit, tuning, rig, Outputs(output, json, plot), quiet))
+        raise typer.Exit(run_tune(fit, tuning, rig, Outputs(output, json, plot, report), quiet))
 
 
 @app.command("simulate")
@@ -193,6 +199,7 @@ def simulate_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
     plot: Plot = None,
+    report: ReportFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a closed loop, or predict a log."""
@@ -202,7 +209,7 @@ def simulate_command(
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.tune import run_simulate
 
-        outputs = Outputs(output, json, plot)
+        outputs = Outputs(output, json, plot, report)
         require(window is None or log is not None, "--window cuts a log: give it with --log")
         if tuning is not None:
             raise typer.Exit(run_simulate(fit, tuning, outputs))
@@ -218,6 +225,7 @@ def study_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
     plot: Plot = None,
+    report: ReportFile = None,
     executor: Annotated[
         str,
         typer.Option(
@@ -244,7 +252,7 @@ def study_command(
         from pneuopt.cli.study import Computing, run_study
 
         computing = Computing(executor, time_limit, memory_limit, resume)
-        raise typer.Exit(run_study(file, Outputs(output, json, plot), quiet, computing))
+        raise typer.Exit(run_study(file, Outputs(output, json, plot, report), quiet, computing))
 
 
 @app.command("next-experiment")

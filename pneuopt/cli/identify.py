@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.cli.shared import (
     Outputs,
     Writers,
+    describe_status,
     file_hashes,
     finish,
     stats_and_provenance,
@@ -49,6 +50,7 @@ from pneuopt.quantities.output import records
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.report.fit_page import Source, fit_page, prediction_page, refusal_page
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.bootstrap import bootstrap
 
@@ -80,7 +82,12 @@ def run_identify(
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
     warnings.filterwarnings("ignore", message="before the search")  # the check has said it
-    with _draw_refusal(outputs), progress("identifying", quiet=quiet) as report_progress:
+    source = Source(
+        f"Identification of {drive.name} from {_log_names(logs)}",
+        file_hashes(drive),
+        tuple(f"before the fit: {sentence}" for sentence in found.warnings),
+    )
+    with _report_refusal(outputs, source, experiments), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
         result = identify(
             system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
@@ -92,14 +99,15 @@ def run_identify(
         "widths": [asdict(width) for width in result.widths],
         "window": asdict(result.window) if result.window else None,
     }
-    report = result.summary()
+    report, trial = result.summary(), None
     if draws and result.status.converged:
         # a log that the smooth model explains to its noise is of an axis that creeps, and not one that sticks
         rig = stick_slip_drive(model) if (result.estimates["mark"] == Mark.BIAS_POSSIBLE).any() else model
         what = "the drive as fitted" if rig == model else "a drive that truly sticks, as the fit misses the logs"
         with progress("simulating and identifying", quiet=quiet) as report_progress:
             tried = bootstrap(system, experiments, result, rig=rig, count=draws, progress=report_progress)
-        report += Report((Line(f"simulated with {what}"),)) + tried.summary()
+        trial = Report((Line(f"simulated with {what}"),)) + tried.summary()
+        report += trial
         tables["bootstrap"] = records(tried.table)
     return finish(
         outputs,
@@ -108,6 +116,7 @@ def run_identify(
         result.status,
         figures=partial(_fit_figures, system, result, experiments, found.findings),
         report=report,
+        page=lambda: fit_page(source, result, experiments, system, findings=found.findings, trial=trial),
     )
 
 
@@ -116,7 +125,8 @@ def run_select(
 ) -> int:
     """Choose a friction model by the logs; returns the exit status."""
     remedy = "write the model that is chosen into [friction], and identify again without --select"
-    require(outputs.output is None and outputs.plot is None, f"--select writes neither -o nor --plot; {remedy}")
+    wanted = (outputs.output, outputs.plot, outputs.report)
+    require(wanted == (None, None, None), f"--select writes neither -o nor --plot nor --report; {remedy}")
     outputs.check(_input_files(drive, logs))
     model, parameters = read_free_drive(drive)
     systems = _friction_systems(drive, model)
@@ -148,7 +158,7 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
     with progress("predicting", quiet=quiet) as report_progress:
         table = validate(system, [experiment], parameters, window=window, progress=report_progress)
     runs = list[Trajectory]()
-    if outputs.output is not None or outputs.plot is not None:
+    if (outputs.output, outputs.plot, outputs.report) != (None, None, None):
         with progress("simulating", quiet=quiet) as report_progress:
             runs.append(predict(system, experiment, parameters, window=window, progress=report_progress))
     writers: Writers = {}
@@ -159,25 +169,35 @@ def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, qu
     hashes = file_hashes(fit) | {f"sha256[{log.name}]": experiment.sha256}
     tables = {"fit": records(table), "provenance": hashes}
     figures = partial(_prediction_figures, runs, experiment)
-    return finish(outputs, writers, tables, None, figures=figures, report=report_agreement(table))
+    source = Source(f"Prediction of {log.name} by {fit.name}", file_hashes(fit), describe_status(fit))
+    page = partial(prediction_page, source, table, runs, [experiment])
+    return finish(outputs, writers, tables, None, figures=figures, report=report_agreement(table), page=page)
 
 
 def _prediction_figures(runs: Sequence[Trajectory], experiment: Experiment) -> dict[str, "Figure"]:
     return {"": plot_prediction(runs, [experiment], label="predicted")}
 
 
+def _log_names(logs: Sequence[Path]) -> str:
+    """The first three logs, and how many more there are."""
+    shown = ", ".join(log.name for log in logs[:3])
+    return shown if len(logs) <= 3 else f"{shown} and {len(logs) - 3} more"
+
+
 @contextmanager
-def _draw_refusal(outputs: Outputs) -> Iterator[None]:
+def _report_refusal(outputs: Outputs, source: Source, experiments: Sequence[Experiment]) -> Iterator[None]:
     """Draw what a log is refused for, where figures are wanted; otherwise the message says how to have it drawn."""
     try:
         yield
     except LogError as error:
+        page = partial(refusal_page, source, str(error), experiments, error.finding)
+        finish(Outputs(None, None, None, outputs.report), {}, {}, None, page=page)
         if error.finding is None or error.finding.evidence is None:
             raise
         if outputs.plot is None:
             raise LogError(f"{error}; --plot refusal.png draws it", error.finding) from None
         figures = {REFUSAL_FIGURE: plot_finding(error.finding)}
-        finish(replace(outputs, json=None), {}, {}, None, figures=lambda: figures)
+        finish(Outputs(None, None, outputs.plot), {}, {}, None, figures=lambda: figures)
         raise
 
 

@@ -17,13 +17,14 @@ from pneuopt.files.drive import read_drive, read_marks, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.plotting import check_figure_path, save_figure
-from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.output import check_output_paths, write_json, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Report
 from pneuopt.quantities.source import read_toml_source
 from pneuopt.quantities.status import Code, Status
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.report.page import Page, write_page
 from pneuopt.tuning.tune import TuningResult
 
 if TYPE_CHECKING:
@@ -44,20 +45,24 @@ class Outputs:
 
     Attributes
     ----------
-    output, json, plot : Path or None
+    output, json, plot, report : Path or None
     """
 
     output: Path | None
     json: Path | None
     plot: Path | None
+    report: Path | None = None
 
     def check(self, inputs: Sequence[Path], *others: str) -> None:
         """Raise `InputError` for a file that cannot be written, or is an input; `others` name further figures."""
+        suffix = "" if self.report is None else self.report.suffix.lower()
+        remedy = "a report is a page of HTML; name it so, report.html"
+        require(self.report is None or suffix in (".html", ".htm"), f"{self.report}: {remedy}")
         figures: list[Path] = []
         if self.plot is not None:
             check_figure_path(self.plot)
             figures = [self.plot, *(add_to_stem(self.plot, name) for name in others)]
-        check_output_paths([self.output, self.json, *figures], inputs)
+        check_output_paths([self.output, self.json, self.report, *figures], inputs)
 
 
 def finish(
@@ -68,6 +73,7 @@ def finish(
     *,
     figures: Figures | None = None,
     report: Report | None = None,
+    page: Callable[[], Page] | None = None,
 ) -> int:
     """Write all files, then show the result and say which are written; returns the exit status.
 
@@ -86,6 +92,8 @@ def finish(
         Draws the figures, by the name that is added to the path of the first, which has none.
     report : Report, optional
         What is shown of the result.
+    page : callable, optional
+        Makes the page that --report writes; of an interrupted command without figures.
 
     Raises
     ------
@@ -100,6 +108,9 @@ def finish(
     if figures is not None and outputs.plot is not None and not interrupted:
         drawn, missed = _draw(outputs.plot, figures)
         written, failures = written + drawn, failures + missed
+    if page is not None and outputs.report is not None:
+        paged, missed = write_files({outputs.report: partial(_write_page, page, not interrupted)}, beside=interrupted)
+        written, failures = written + paged, failures + missed
     if report is not None:
         show_report(make_console(), report)
     show_output_files(make_console(), written)
@@ -131,6 +142,10 @@ def write_files(writers: Writers, *, beside: bool = False) -> tuple[list[Path], 
     return written, failures
 
 
+def _write_page(make: Callable[[], Page], draws: bool, path: Path) -> None:
+    write_page(path, make(), draws=draws)
+
+
 def _draw(path: Path, figures: Figures) -> tuple[list[Path], list[InputError]]:
     """Draw and write the figures; Ctrl-C leaves out those that are not drawn yet."""
     try:
@@ -148,13 +163,20 @@ def read_fit_and_tuning(fit: Path, tuning: Path) -> tuple[Tuning, ParameterSet]:
 
 
 def warn_of_status(path: Path, what: str = "fit") -> None:
-    """Say on standard error if what wrote a file did not converge, or which of its estimates may be biased."""
-    status = read_status(path)
+    """Say on standard error what `describe_status` finds."""
+    for sentence in describe_status(path, what):
+        warn(sentence)
+
+
+def describe_status(path: Path, what: str = "fit") -> tuple[str, ...]:
+    """Whether what wrote a file did not converge, and which of its estimates may be biased, a sentence each."""
+    status, said = read_status(path), list[str]()
     if status is not None and status.code is not Code.CONVERGED:
-        warn(f"{path}: its {what} is {status}")
+        said.append(f"{path}: its {what} is {status}")
     biased = [n for n, mark in read_marks(path).items() if mark is Mark.BIAS_POSSIBLE]
     if biased and (status is None or status.converged):
-        warn(f"{path}: estimates that may be biased by a model error: {', '.join(biased)}")
+        said.append(f"{path}: estimates that may be biased by a model error: {', '.join(biased)}")
+    return tuple(said)
 
 
 def warn(message: str) -> None:

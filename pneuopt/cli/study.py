@@ -20,6 +20,7 @@ from pneuopt.cli.shared import (
     warn_of_status,
 )
 from pneuopt.cli.show_studies import report_cases, report_front
+from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page, front_page
 from pneuopt.cli.terminal import progress
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate
@@ -114,7 +115,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     file, count = study.path, len(study.axes)
     require(outputs.plot is None or not study.cases, f"{file}: --plot draws a grid of one or two [axes]; leave it out")
     many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
-    require(outputs.plot is None or count <= 2, many)
+    require(outputs.plot is None or count <= MAX_MAP_AXES, many)
     task, parameters = read_fit_and_tuning(study.drive, study.tuning)
     warn_of_status(study.tuning, "tuning")
     (cases, axes), units = _read_cases(study, parameters), metric_units(task.loop)
@@ -139,7 +140,9 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
         writers[outputs.output] = partial(write_text, text=text)
     tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": plot_map(seen, written, metrics)}, report=report)
+    drawn = partial(plot_map, seen, written, metrics)
+    page = partial(case_page, study, report, drawn, written, metrics)
+    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
     if journal is not None and stopped is None:
         journal.path.unlink(missing_ok=True)
     return status
@@ -271,7 +274,9 @@ def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
     hashes = file_hashes(study.path, study.drive, study.tuning)
     tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": plot_front(front, pair)}, report=report)
+    drawn = partial(plot_front, front, pair)
+    page = partial(front_page, study, report, drawn, pair)
+    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
     return status
 
 

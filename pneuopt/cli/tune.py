@@ -14,6 +14,7 @@ from pneuopt.cli.shared import (
     Outputs,
     Writers,
     add_to_stem,
+    describe_status,
     file_hashes,
     finish,
     read_fit_and_tuning,
@@ -22,32 +23,33 @@ from pneuopt.cli.shared import (
     write_files,
 )
 from pneuopt.cli.terminal import make_console, progress, show_output_files, show_report, show_sentence
-from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
-from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.dither_verdict import judge_dither
-from pneuopt.evaluation.evaluate import evaluate, respond
+from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.expected_plants import expected_plants
-from pneuopt.evaluation.operating_points import worst_open_loop
 from pneuopt.evaluation.report import metric_limits, relevant_units, report_metrics
 from pneuopt.files.drive import read_covariance, read_drive, read_estimates
 from pneuopt.files.rig import read_rig
 from pneuopt.files.tuning import Tuning, write_tuned
-from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_steps
+from pneuopt.plotting import Response
 from pneuopt.quantities.errors import ConvergenceError, InputError, require
 from pneuopt.quantities.output import check_output_paths, records
 from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.report.fit_page import Source
+from pneuopt.report.loop_figures import simulate_responses
+from pneuopt.report.page import Page
+from pneuopt.report.tuning_page import LoopView, simulation_page, tuning_page
 from pneuopt.tuning.report import report_tuning
 from pneuopt.tuning.tune import TuningResult, tune
 from pneuopt.tuning.without_dither import tune_without_dither
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
     from rich.console import Console
 
 
@@ -70,13 +72,16 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     console, shown = make_console(), _design_tables(result)
     was = _initial_metrics(task, parameters) if result.status.converged and result.on_rig is None else None
     show_report(console, report_tuning(result, was=was, source=f"the gains of {tuning}"))
+    dither = Report()
     with suppress(KeyboardInterrupt):
-        shown |= _compare_dither(console, task, parameters, result, quiet)
+        compared, dither = _compare_dither(console, task, parameters, result, quiet)
+        shown |= compared
     show_output_files(console, saved)
-    before_gains = parameters if result.status.converged else None
-    figures = partial(_loop_figures, task, result.parameters, before_gains)
+    view = _view(task, result.parameters, parameters if result.status.converged else None)
+    source = Source(f"Tuning of {fit.name} by {tuning.name}", warnings=describe_status(fit))
+    page = partial(tuning_page, source, result, view, stands=f"the gains of {tuning}", was=was, dither=dither)
     tables = _tuning_tables(result) | shown | stats_and_provenance(result)
-    status = finish(outputs, {}, tables, result.status, figures=figures)
+    status = finish(outputs, {}, tables, result.status, figures=view.figures, page=page)
     if failures:
         raise failures[0]
     return status
@@ -121,16 +126,37 @@ def run_simulate(fit: Path, tuning: Path, outputs: Outputs) -> int:
     )
     writers: Writers = {}
     if outputs.output is not None:
-        runs = [_as_logged(r, task.centre) for r in _simulate_responses(task, parameters)]
+        runs = [_as_logged(r, task.centre) for r in simulate_responses(task.loop, task.references, parameters)]
         paths = number_paths(outputs.output, len(runs))
         check_output_paths(paths, [fit, tuning])
         columns = _loop_columns(task.loop)
         writers |= {p: partial(write_csv, run=run, columns=columns) for p, run in zip(paths, runs, strict=True)}
     tables = {"certified": records(metrics.T), "provenance": file_hashes(fit, tuning)}
-    figures = partial(_loop_figures, task, parameters, None)
-    limits = metric_limits(task.specification.limits)
+    view, limits = _view(task, parameters), metric_limits(task.specification.limits)
     report = report_metrics(metrics, relevant_units(task.loop), limits=limits)
-    return finish(outputs, writers, tables, None, figures=figures, report=report)
+    page = partial(_simulation_page, fit, tuning, task, view, parameters)
+    return finish(outputs, writers, tables, None, figures=view.figures, report=report, page=page)
+
+
+def _view(task: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> LoopView:
+    """What figures of a tuning's loop are drawn from."""
+    complete = task.loop.complete
+    earlier = None if before is None else complete(before)
+    return LoopView(task.loop, task.references, complete(parameters), earlier, task.specification.band)
+
+
+def _simulation_page(fit: Path, tuning: Path, task: Tuning, view: LoopView, parameters: ParameterSet) -> Page:
+    """The page of a simulated loop, which looks for defects beyond the horizon, too."""
+    found = certificate(
+        task.loop,
+        task.references,
+        parameters,
+        scenarios=task.scenarios(parameters),
+        band=task.specification.band,
+        envelope=task.specification.envelope,
+    )
+    source = Source(f"Simulation of {fit.name} with {tuning.name}", file_hashes(fit, tuning), describe_status(fit))
+    return simulation_page(source, found, view, metric_limits(task.specification.limits))
 
 
 def _design_tables(result: TuningResult) -> dict[str, Any]:
@@ -143,21 +169,24 @@ def _design_tables(result: TuningResult) -> dict[str, Any]:
 
 def _compare_dither(
     console: "Console", task: Tuning, before: ParameterSet, result: TuningResult, quiet: bool
-) -> dict[str, Any]:
-    """Show whether a certified design's dither is worth its price; returns the table of that.
+) -> tuple[dict[str, Any], Report]:
+    """Show whether a certified design's dither is worth its price; returns the table of that, and what was shown.
 
     An interrupted command computes nothing more.
     """
+    nothing = dict[str, Any](), Report()
     if not result.status.converged or interruption_status() is not None:
-        return {}
+        return nothing
     if task.loop.dither_period(result.parameters) is not None:
         rival = tune_rival(console, task, before, quiet)
         if interruption_status() is not None:
-            return {}
+            return nothing
         return _show_dither_verdict(console, task, result.parameters, rival)
     if DITHER_AMPLITUDE in result.parameters.free_names:
-        show_sentence(console, "the dither's amplitude is 0: the tuning found no use for it")
-    return {}
+        useless = Report((Line("the dither's amplitude is 0: the tuning found no use for it"),))
+        show_report(console, useless)
+        return {}, useless
+    return nothing
 
 
 def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet: bool) -> ParameterSet | None:
@@ -190,16 +219,18 @@ def tune_rival(console: "Console", task: Tuning, parameters: ParameterSet, quiet
 
 def _show_dither_verdict(
     console: "Console", task: Tuning, parameters: ParameterSet, rival: ParameterSet | None
-) -> dict[str, Any]:
-    """Show the dither's verdict; returns nothing where the loop cannot be simulated without dither."""
+) -> tuple[dict[str, Any], Report]:
+    """Show the dither's verdict; returns no table where the loop cannot be simulated without dither."""
     try:
         verdict = judge_dither(task.loop, task.references, parameters, without=rival, band=task.specification.band)
     except ConvergenceError as error:
-        show_sentence(console, f"no verdict on the dither: {error}")
-        return {}
+        unknown = Report((Line(f"no verdict on the dither: {error}"),))
+        show_report(console, unknown)
+        return {}, unknown
     show_report(console, verdict.summary())
     gains = None if rival is None else {n: rival.value(n) for n in rival.free_names}
-    return {"dither": {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": gains}}
+    found = {"usefulness": verdict.usefulness.value, "reasons": list(verdict.reasons), "rival": gains}
+    return {"dither": found}, verdict.summary()
 
 
 def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | None":
@@ -218,50 +249,6 @@ def _initial_metrics(task: Tuning, parameters: ParameterSet) -> "pd.DataFrame | 
         )
     except (ConvergenceError, InputError, KeyboardInterrupt):
         return None
-
-
-def _simulate_responses(task: Tuning, parameters: ParameterSet, before: ParameterSet | None = None) -> list[Response]:
-    loop, units = task.loop, (task.loop.feedback.unit, task.loop.command.unit)
-    found = []
-    for reference in task.references:
-        run = _simulate_response(loop, reference, parameters)
-        earlier = None if before is None else _simulate_initial_response(loop, reference, before)
-        period, push = loop.dither_period(parameters), loop.plant.axis.force if loop.plant.axis else "N"
-        found.append(Response(run, reference, loop.feedback.name, units, earlier, period, push))
-    return found
-
-
-def _simulate_response(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory:
-    """The response, with the friction force where the plant has one."""
-    run, plant = respond(loop, reference, parameters), loop.plant
-    if not plant.states or not has_friction_map(plant):
-        return run
-    others = {q.name: np.zeros(len(run)) for q in plant.inputs if q.name not in run}
-    whole = run.with_columns({**others, loop.command.name: run["control"]})
-    return run.with_columns({"friction.force": friction_force(plant, whole, parameters)})
-
-
-def _simulate_initial_response(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
-    try:
-        return _simulate_response(loop, reference, parameters)
-    except (ConvergenceError, InputError):
-        return None
-
-
-def _loop_figures(task: Tuning, parameters: ParameterSet, before: ParameterSet | None) -> dict[str, "Figure"]:
-    """The steps, and the Bode plot at the first one's operating point with the largest sensitivity, before likewise."""
-    responses = _simulate_responses(task, parameters, before)
-    first = responses[0]
-    step, earlier = first.reference, None
-    if first.before is not None and before is not None:
-        earlier = _open_loop(task.loop, before, step, first.before)
-    bode = plot_bode(_open_loop(task.loop, parameters, step, first.run), earlier)
-    return {"": plot_steps(responses, band=task.specification.band), "bode": bode}
-
-
-def _open_loop(loop: ClosedLoop, parameters: ParameterSet, reference: Step, run: Trajectory) -> Linearisation:
-    disturbed = add_disturbances(loop, [reference])
-    return worst_open_loop(disturbed, loop.complete(parameters), reference, run)[1]
 
 
 def number_paths(path: Path, count: int) -> list[Path]:

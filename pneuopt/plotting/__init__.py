@@ -17,6 +17,7 @@ from pneuopt.plotting.loop_diagram import plot_loop
 from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
 from pneuopt.plotting.sensitivities import plot_sensitivity
+from pneuopt.plotting.svg import replace_unprintable, to_svg
 from pneuopt.plotting.trackings import plot_tracking
 
 __all__ = [
@@ -44,5 +45,7 @@ __all__ = [
     "plot_sensitivity",
     "plot_steps",
     "plot_tracking",
+    "replace_unprintable",
     "save_figure",
+    "to_svg",
 ]

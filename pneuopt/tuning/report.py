@@ -37,7 +37,7 @@ def report_tuning(
         What stands where the tuning failed.
     """
     head = report_status(result.status)
-    return head + (_report_design(result, was) if result.status.converged else _report_refusal(result, source))
+    return head + (_report_design(result, was) if result.status.converged else report_refusal(result, source))
 
 
 def report_gains(given: Mapping[str, float], tuned: ParameterSet) -> Report:
@@ -135,8 +135,15 @@ def _report_design(result: "TuningResult", was: "pd.DataFrame | None") -> Report
     return found + report_validation(tried) if tried else found
 
 
-def _report_refusal(result: "TuningResult", source: str) -> Report:
-    """The gains that stand, and what was refused, or is the best so far, with its figures."""
+def report_refusal(result: "TuningResult", source: str) -> Report:
+    """The gains that stand, and what was refused, or is the best so far, with its figures.
+
+    Parameters
+    ----------
+    result : TuningResult
+    source : str
+        What stands.
+    """
     word = "best so far" if result.status.code is Code.INTERRUPTED else "rejected"
     found = {n.removeprefix("rejected."): v for n, v in result.stats.items() if n.startswith("rejected.")}
     units = {n: result.parameters[n].unit for n in found}

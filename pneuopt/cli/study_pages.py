@@ -1,0 +1,45 @@
+"""The pages that `pneuopt study --report` writes: of cases, and of a Pareto front."""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from pneuopt.cli.shared import describe_status, file_hashes
+from pneuopt.files.study import Study
+from pneuopt.quantities.report import Report
+from pneuopt.report.fit_page import Source
+from pneuopt.report.page import Page
+from pneuopt.report.study_page import study_page
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MAX_MAP_AXES = 2
+"""Axes up to which a study has a map: of more no figure can be read."""
+
+
+def case_page(
+    study: Study,
+    report: Report,
+    draw: Callable[[], "Figure"],
+    axes: Mapping[str, str],
+    metrics: Mapping[str, str],
+) -> Page:
+    """The page of a study's cases; a map of one or two axes."""
+    alt = f"{', '.join(metrics)} over {' and '.join(axes)}, a cell or a point a case; what failed is marked."
+    drawn = draw if len(axes) <= MAX_MAP_AXES and not study.cases else None
+    return study_page(_page_source(study), report, drawn, what="Cases", alt=alt)
+
+
+def front_page(study: Study, report: Report, draw: Callable[[], "Figure"], pair: Mapping[str, str]) -> Page:
+    """The page of a Pareto front."""
+    first, second = pair
+    alt = f"{first} of certified designs over {second}; limits at which none was certified are marked."
+    return study_page(_page_source(study), report, draw, what="Pareto front", alt=alt)
+
+
+def _page_source(study: Study) -> Source:
+    """The title of a study's page, its hashes and warnings."""
+    files = (study.path, study.drive, study.tuning)
+    warnings = (*describe_status(study.drive), *describe_status(study.tuning, "tuning"))
+    title = f"Study of {study.drive.name} with {study.tuning.name}"
+    return Source(title, file_hashes(*files), warnings)

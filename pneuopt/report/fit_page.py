@@ -1,0 +1,240 @@
+"""The pages of a fit, of a log that was refused, and of a prediction of logs that no fit has seen."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.dynamics.runnable import HasSystem, as_runnable
+from pneuopt.dynamics.system import System
+from pneuopt.identification.identify import predict, validate
+from pneuopt.identification.marks import Mark
+from pneuopt.identification.report import report_agreement, report_estimates
+from pneuopt.identification.result import IdentificationResult, join_names
+from pneuopt.logs.checks.findings import LogFinding
+from pneuopt.logs.experiments import Experiment
+from pneuopt.plotting import (
+    has_friction_map,
+    plot_correlation,
+    plot_finding,
+    plot_friction,
+    plot_logs,
+    plot_prediction,
+    plot_residuals,
+)
+from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.status import report_status
+from pneuopt.quantities.trajectories import Trajectory
+from pneuopt.report.data import data_section, provenance_section
+from pneuopt.report.page import Page, Picture, Section
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MIN_CORRELATED = 2
+"""Estimates with a standard deviation from which their correlation is drawn: of one there is none."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a page says beside its result.
+
+    Attributes
+    ----------
+    title : str
+    hashes : mapping of str to str
+        Of the files that the provenance does not name, "sha256[drive.toml]".
+    warnings : tuple of str
+        What was said before or beside the result.
+    """
+
+    title: str
+    hashes: Mapping[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+def fit_page(
+    source: Source,
+    result: IdentificationResult,
+    experiments: Sequence[Experiment] = (),
+    model: HasSystem | ClosedLoop | None = None,
+    *,
+    held_out: Sequence[Experiment] = (),
+    findings: Sequence[LogFinding] = (),
+    trial: Report | None = None,
+) -> Page:
+    """The page of a fit.
+
+    Parameters
+    ----------
+    source : Source
+    result : IdentificationResult
+    experiments : sequence of Experiment
+        Those that it was made from; figures are drawn where they are given.
+    model : drive, System or ClosedLoop, optional
+        For the friction map and held-out logs.
+    held_out : sequence of Experiment
+        Logs that the fit has not seen, to be predicted; needs the model.
+    findings : sequence of LogFinding
+        What the log doctor found.
+    trial : Report, optional
+        What became of it when logs were simulated with it and fitted again.
+    """
+    system = None if model is None else as_runnable(model)
+    marks = result.estimates["mark"]
+    biased = [str(n) for n, mark in marks.items() if mark == Mark.BIAS_POSSIBLE]
+    doubts = [f"a model error may bias {join_names(biased)}: the intervals do not hold it"] if biased else []
+    unknown = result.verdict.sentences if result.verdict else ()
+    sections = (
+        _estimate_section(result),
+        _agreement_section(result, experiments),
+        _held_out_section(result, system, held_out),
+        _friction_section(result, system, experiments),
+        _residual_section(result, experiments),
+        Section("Simulated and fitted again", () if trial is None else (trial,)),
+        _finding_section(findings),
+        data_section((*experiments, *held_out), noise=_counted_noise(result)),
+        provenance_section(result.provenance, {**source.hashes, **_hashes(held_out)}),
+    )
+    warnings = tuple(dict.fromkeys((*unknown, *doubts, *source.warnings)))
+    return Page(source.title, report_status(result.status), sections, warnings)
+
+
+def refusal_page(
+    source: Source, reason: str, experiments: Sequence[Experiment], finding: LogFinding | None = None
+) -> Page:
+    """The page of logs that no fit takes: why, what shows it, and the logs as they were read."""
+    pictures = []
+    if finding is not None and finding.evidence is not None:
+        pictures.append(_finding_picture(finding))
+    if experiments:
+        pictures.append(
+            Picture(partial(plot_logs, experiments), f"Every channel of {_names(experiments)} over time.", "The logs.")
+        )
+    verdict = Report((Line("refused: nothing was identified", Tone.BAD), Line(reason, indent=2)))
+    sections = (
+        Section("What shows it", tuple(pictures)),
+        data_section(experiments),
+        provenance_section({}, {**_hashes(experiments), **source.hashes}),
+    )
+    return Page(source.title, verdict, sections, source.warnings)
+
+
+def prediction_page(
+    source: Source, table: "pd.DataFrame", runs: Sequence[Trajectory], experiments: Sequence[Experiment]
+) -> Page:
+    """The page of logs that are predicted in open loop.
+
+    Parameters
+    ----------
+    source : Source
+    table : DataFrame
+        Of `validate`.
+    runs : sequence of Trajectory
+        The prediction of each log.
+    experiments : sequence of Experiment
+    """
+    verdict = Line("the prediction diverges, or there is nothing to compare it with", Tone.BAD)
+    if len(table) and table["nrmse"].notna().all():
+        worst = table.reset_index().sort_values("nrmse").iloc[-1]
+        place = f"{worst['channel']} of {worst['log']}"
+        verdict = Line(f"predicted in open loop: NRMSE at most {100 * worst['nrmse']:.3g} %, {place}")
+    sections = (
+        Section("Agreement with the logs", (report_agreement(table), _comparison(runs, experiments, "predicted"))),
+        Section("Residuals", (_residual_picture(runs, experiments),)),
+        data_section(experiments),
+        provenance_section({}, {**_hashes(experiments), **source.hashes}),
+    )
+    return Page(source.title, Report((verdict,)), sections, source.warnings)
+
+
+def _estimate_section(result: IdentificationResult) -> Section:
+    notes = result.estimates["note"].to_dict()
+    said = tuple(Line(f"{n}: {note}") for n, note in notes.items() if isinstance(note, str) and note)
+    parts: list[Report | Picture] = [report_estimates(result.estimates, result.widths), Report(said)]
+    if result.window is not None:
+        parts.append(Report((Line(str(result.window)),)))
+    if int(result.estimates["stderr"].notna().sum()) >= MIN_CORRELATED:
+        alt = "A cell for each pair of estimates with their correlation, from -1 to 1."
+        caption = "Correlation of the estimates; near 1 or -1 the logs tell little more than a combination of two."
+        parts.append(Picture(partial(plot_correlation, result), alt, caption))
+    return Section("Estimates", tuple(parts))
+
+
+def _agreement_section(result: IdentificationResult, experiments: Sequence[Experiment]) -> Section:
+    runs = list(result.trajectories.values())
+    pictures = (_comparison(runs, experiments, "fitted"),) if experiments and runs else ()
+    return Section("Agreement with the logs", (report_agreement(result.fit), *pictures))
+
+
+def _held_out_section(
+    result: IdentificationResult, system: System | ClosedLoop | None, held_out: Sequence[Experiment]
+) -> Section:
+    if system is None or not held_out:
+        return Section("Held-out runs", ())
+    table = validate(system, held_out, result.parameters)
+    runs = [predict(system, e, result.parameters) for e in held_out]
+    lead = Report((Line("logs that the fit has not seen, predicted from their first sample on"),))
+    parts = (lead, report_agreement(table), _comparison(runs, held_out, "predicted"))
+    return Section("Held-out runs", parts)
+
+
+def _friction_section(
+    result: IdentificationResult, system: System | ClosedLoop | None, experiments: Sequence[Experiment]
+) -> Section:
+    if not isinstance(system, System) or not experiments or not result.trajectories or not has_friction_map(system):
+        return Section("Friction", ())
+    alt = "Friction force over speed: points that the logs imply, the fitted curve through them and its 95 % band."
+    caption = "Friction over speed: what the logs imply (points), the fitted curve and its 95 % band."
+    return Section("Friction", (Picture(partial(plot_friction, system, result, experiments), alt, caption),))
+
+
+def _residual_section(result: IdentificationResult, experiments: Sequence[Experiment]) -> Section:
+    runs = list(result.trajectories.values())
+    return Section("Residuals", (_residual_picture(runs, experiments),) if experiments and runs else ())
+
+
+def _residual_picture(runs: Sequence[Trajectory], experiments: Sequence[Experiment]) -> Picture:
+    alt = (
+        "For each channel four plots: residuals over time, their autocorrelation, their correlation with the inputs, "
+        "and their distribution beside the normal one."
+    )
+    caption = (
+        "Residuals over time, their autocorrelation and correlation with the inputs (grey: what 95 % of white "
+        "residuals stay in), and their distribution beside the normal one."
+    )
+    return Picture(partial(plot_residuals, list(runs), list(experiments)), alt, caption)
+
+
+def _comparison(runs: Sequence[Trajectory], experiments: Sequence[Experiment], label: str) -> Picture:
+    alt = f"Measured and {label} signals of {_names(experiments)} over time, and below each what remains between them."
+    caption = f"Measured and {label}, and what remains between them."
+    return Picture(partial(plot_prediction, list(runs), list(experiments), label=label), alt, caption)
+
+
+def _finding_section(findings: Sequence[LogFinding]) -> Section:
+    parts: list[Report | Picture] = []
+    for finding in findings:
+        place = f"{finding.log}: " if finding.log else ""
+        parts.append(Report((Line(f"{place}{finding.message}"),)))
+        parts += [_finding_picture(finding)] if finding.evidence is not None else []
+    return Section("Found in the logs", tuple(parts))
+
+
+def _finding_picture(finding: LogFinding) -> Picture:
+    alt = f"The signals of {finding.log or 'the log'} that show it: {finding.message}"
+    return Picture(partial(plot_finding, finding), alt, f"What shows it: {finding.message}.")
+
+
+def _counted_noise(result: IdentificationResult) -> dict[tuple[str, str], float]:
+    rows = result.fit.reset_index().to_dict(orient="records")
+    return {(str(row["log"]), str(row["channel"])): float(row["noise"]) for row in rows}
+
+
+def _hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
+    return {f"sha256[{e.name}]": e.sha256 for e in experiments}
+
+
+def _names(experiments: Sequence[Experiment]) -> str:
+    return join_names([e.name or "log" for e in experiments])

@@ -1,0 +1,68 @@
+"""`report_forms`: a loop's gains in every form that controllers take, and its settings that are not tuned."""
+
+import math
+
+from pneuopt.control.forms import ParallelForm, to_series, to_standard
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.report import TIED, Line, Report, Table, text_columns
+from pneuopt.quantities.unit_algebra import unit_ratio
+from pneuopt.quantities.units import write_value
+
+GAIN_DIGITS = 6
+"""Significant digits of converted gains: fewer change the loop that was certified, more are of no controller."""
+LAWS = {
+    "parallel": "Kp~(b~r~−~y) + Ki~e/s + Kd~s/(Tf~s~+~1)~(c~r~−~y)",
+    "standard (ISA)": "Kp~((b~r~−~y) + e/(Ti~s) + Td~s/(1~+~s~Td/N)~(c~r~−~y))",
+    "series": "K (1~+~1/(Ti~s)) (1~+~Td~s/(Tf~s~+~1))~e",
+}
+"""The forms and their laws; no line ends at a tilde."""
+N_NOTE = "N of the standard form is ISA's ratio Td/Tf. Simulink's N is the filter's pole in rad/s, 1/Tf."
+
+
+def report_forms(loop: ClosedLoop, parameters: ParameterSet) -> Report:
+    """The gains in the parallel, the standard and the series form; why one of them has none.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    parameters : ParameterSet
+        Every parameter of the loop.
+    """
+    parallel = loop.parallel_form(parameters)
+    unit = unit_ratio(loop.command.unit, loop.feedback.unit)
+    units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
+    rows, refused = [], []
+    for (name, law), convert in zip(LAWS.items(), (_as_given, to_standard, to_series), strict=True):
+        try:
+            gains = vars(convert(parallel))
+        except InputError as error:
+            refused.append(Line(str(error)))
+            continue
+        if gains.get("Td") == 0:
+            gains = {**gains, "N": math.nan} if "N" in gains else gains  # of no derivative there is no ratio
+        rows.append((name, *(_cell(n, value, units.get(n, "s")) for n, value in gains.items()), law.replace("~", TIED)))
+    return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))
+
+
+def report_settings(loop: ClosedLoop, parameters: ParameterSet) -> Report:
+    """What else a controller is set to, the numbers that are not tuned, and how it computes."""
+    own = [n for n in loop.parameters if n not in loop.plant.parameters]
+    full = loop.complete(parameters)
+    rows = tuple((n, write_value(full.value(n), full[n].unit)) for n in own if not full[n].free)
+    pid, lines = loop.pid, []
+    if pid.sample_time is None:
+        lines.append("a continuous controller")
+    else:
+        late = f", its command acts {pid.delay} sample late" if pid.delay else ""
+        lines.append(f"computes every {write_value(pid.sample_time, 's')} by backward Euler{late}")
+    return Report((Line("; ".join(lines)), *([Table(text_columns("setting", "value"), rows)] if rows else [])))
+
+
+def _cell(name: str, value: float, unit: str) -> str:
+    return f"{name} -" if math.isnan(value) else f"{name} {write_value(value, unit, GAIN_DIGITS)}"
+
+
+def _as_given(gains: ParallelForm) -> ParallelForm:
+    return gains

@@ -1,0 +1,37 @@
+"""The page of a study: a map over its cases, or a Pareto front."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from pneuopt.quantities.report import Report
+from pneuopt.report.data import provenance_section
+from pneuopt.report.fit_page import Source
+from pneuopt.report.page import Page, Picture, Section
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def study_page(source: Source, report: Report, draw: "Callable[[], Figure] | None", *, what: str, alt: str) -> Page:
+    """The page of a study.
+
+    Parameters
+    ----------
+    source : Source
+    report : Report
+        How many cases hold, in its first line; then the cases, or the designs of a front.
+    draw : callable, optional
+        Makes the map or the front; None where there are too many axes for one.
+    what : str
+        Heading: "Pareto front".
+    alt : str
+        What the figure shows, for those who see it and those who do not.
+    """
+    verdict, table = Report(report.parts[:1]), Report(report.parts[1:])
+    pictures = () if draw is None else (Picture(draw, alt, alt),)
+    return Page(
+        source.title,
+        verdict,
+        (Section(what, (*pictures, table)), provenance_section({}, source.hashes)),
+        source.warnings,
+    )
