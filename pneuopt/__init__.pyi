@@ -132,6 +132,7 @@ from .quantities.progress import Progress
 from .quantities.report import Report
 from .quantities.status import Code, Status
 from .quantities.trajectories import Trajectory
+from .report.write_report import write_report
 from .shooting.full_space import FullSpace
 from .shooting.least_squares import LeastSquares
 from .studies.batch import BatchEvaluation, evaluate_batch
@@ -369,5 +370,6 @@ __all__ = [
     "validate_design",
     "with_sensors",
     "write_fit",
+    "write_report",
     "write_tuned",
 ]

@@ -232,6 +232,7 @@ PUBLIC_NAMES = [
     "Waveform",
     "with_sensors",
     "write_fit",
+    "write_report",
     "write_tuned",
 ]
 PUBLIC_MODULES = ("catalog", "plotting")
