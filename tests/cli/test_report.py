@@ -20,6 +20,7 @@ from pneuopt.quantities.errors import LogError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code, Status
 from pneuopt.tuning.result import TuningResult
+from pneuopt.tuning.tune import tune
 from tests.report.reading import Read, read_page
 
 
@@ -153,7 +154,6 @@ def test_a_study_has_its_page(folder: Path) -> None:
 
 def test_an_interrupted_tuning_has_a_page_without_figures(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("page.html").write_text("mine", "utf-8")
-    tune = tune_module.tune
 
     def stop(*args: object, **keywords: object) -> object:
         def interrupt(_: str) -> None:

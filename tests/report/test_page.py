@@ -1,5 +1,6 @@
 """A page of its own parts: order, escape, figures that fail, whole or not at all."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -57,7 +58,7 @@ def test_hostile_names_are_text_everywhere() -> None:
 
 
 def test_a_formula_becomes_paths_and_a_broken_one_stays_text() -> None:
-    good, broken = (Picture(lambda t=t: figure(t), "a figure with a formula", "It.") for t in ("$K_p$", "$\\frac$"))
+    good, broken = (Picture(partial(figure, t), "a figure with a formula", "It.") for t in ("$K_p$", "$\\frac$"))
     read = read_page(render_page(Page("p", Report(), (Section("s", (good,)),))))
     assert not read.named("text")
     read = read_page(render_page(Page("p", Report(), (Section("s", (broken,)),))))
