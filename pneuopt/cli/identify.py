@@ -82,23 +82,13 @@ def run_identify(
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
     warnings.filterwarnings("ignore", message="before the search")  # the check has said it
-    source = Source(
-        f"Identification of {drive.name} from {_log_names(logs)}",
-        file_hashes(drive),
-        tuple(f"before the fit: {sentence}" for sentence in found.warnings),
-    )
+    source = _page_source(drive, logs, found.warnings)
     with _report_refusal(outputs, source, experiments), progress("identifying", quiet=quiet) as report_progress:
         method = LeastSquares(progress=report_progress)
         result = identify(
             system, experiments, parameters, method=method, window=window, cpu_seconds=budget, throw=False
         )
-    tables = {
-        "estimates": records(result.estimates),
-        "fit": records(result.fit),
-        "verdict": _verdict_record(result.verdict),
-        "widths": [asdict(width) for width in result.widths],
-        "window": asdict(result.window) if result.window else None,
-    }
+    tables = _fit_tables(result)
     report, trial = result.summary(), None
     if draws and result.status.converged:
         # a log that the smooth model explains to its noise is of an axis that creeps, and not one that sticks
@@ -118,6 +108,23 @@ def run_identify(
         report=report,
         page=lambda: fit_page(source, result, experiments, system, findings=found.findings, trial=trial),
     )
+
+
+def _fit_tables(result: IdentificationResult) -> dict[str, Any]:
+    """What a JSON file holds of a fit."""
+    return {
+        "estimates": records(result.estimates),
+        "fit": records(result.fit),
+        "verdict": _verdict_record(result.verdict),
+        "widths": [asdict(width) for width in result.widths],
+        "window": asdict(result.window) if result.window else None,
+    }
+
+
+def _page_source(drive: Path, logs: Sequence[Path], warned: Sequence[str]) -> Source:
+    """The title of a fit's page, the drive's hash, and what was said before the fit."""
+    title = f"Identification of {drive.name} from {_log_names(logs)}"
+    return Source(title, file_hashes(drive), tuple(f"before the fit: {sentence}" for sentence in warned))
 
 
 def run_select(
