@@ -12,7 +12,7 @@ from pneuopt.quantities.units import write_value
 
 GAIN_DIGITS = 6
 """Significant digits of converted gains: fewer change the loop that was certified, more are of no controller."""
-LAWS = {
+LAW_TEXTS = {
     "parallel": "Kp~(b~r~−~y) + Ki~e/s + Kd~s/(Tf~s~+~1)~(c~r~−~y)",
     "standard (ISA)": "Kp~((b~r~−~y) + e/(Ti~s) + Td~s/(1~+~s~Td/N)~(c~r~−~y))",
     "series": "K (1~+~1/(Ti~s)) (1~+~Td~s/(Tf~s~+~1))~e",
@@ -34,7 +34,7 @@ def report_forms(loop: ClosedLoop, parameters: ParameterSet) -> Report:
     unit = unit_ratio(loop.command.unit, loop.feedback.unit)
     units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
     rows, refused = [], []
-    for (name, law), convert in zip(LAWS.items(), (_as_given, to_standard, to_series), strict=True):
+    for (name, law), convert in zip(LAW_TEXTS.items(), (_as_given, to_standard, to_series), strict=True):
         try:
             gains = vars(convert(parallel))
         except InputError as error:
