@@ -58,13 +58,22 @@ def added_command(
     added : casadi.SX
         [the command's unit]
     """
-    moved, added = _feedforward_terms(parts, x, u, p)
+    moved, terms = added_terms(parts, t, x, u, measured, p)
+    return moved, terms["dither"] + (terms["feedforward"] + terms["compensation"])
+
+
+def added_terms(
+    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, p: Symbols
+) -> tuple[Signals, Signals]:
+    """The terms of `added_command`, "feedforward", "compensation" and "dither", in place of their sum."""
+    moved, lead = _feedforward_terms(parts, x, u, p)
+    bent = ca.SX(0)
     if parts.compensators:
         v = parts.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
-        seen = Instant(t, u["reference"], measured, v + added, parts.pid.sample_time)
-        own, more = compensate(parts.compensators, seen, x, p)
-        moved, added = moved | own, added + more
-    return moved, _dither_command(parts, t, p) + added
+        seen = Instant(t, u["reference"], measured, v + lead, parts.pid.sample_time)
+        own, bent = compensate(parts.compensators, seen, x, p)
+        moved = moved | own
+    return moved, {"feedforward": lead, "compensation": bent, "dither": _dither_command(parts, t, p)}
 
 
 def _dither_command(parts: CommandParts, t: ca.SX, p: Symbols) -> ca.SX:

@@ -27,6 +27,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
 from pneuopt.control.pid import PID
 from pneuopt.control.rest import find_rest, set_sliding_direction
+from pneuopt.control.sampled import controller_update
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.control.wiring import Signals, check_algebraic_loop, check_initial_command, evaluate_plant, select_signal
 from pneuopt.dynamics.runnable import PlantField
@@ -89,7 +90,7 @@ class ClosedLoop:
 
     def __post_init__(self) -> None:
         if self.sensor is not None:
-            self.sensor.check(self._sensor_feedback)
+            self.sensor.check(self.sensed_signal)
         if not isinstance(self.sensor, SensorLag):
             check_algebraic_loop(
                 self.plant, self.command.name, self.feedback.name if self.sensor is None else self.sensor.position
@@ -99,7 +100,7 @@ class ClosedLoop:
             require(name not in taken, f"the plant has a signal {name!r} of its own; rename it", ModelError)
         doubled = isinstance(self.sensor, SensorLag) and "sensor.lag" in self.plant.parameters
         require(not doubled, "the plant has a sensor.lag of its own; leave sensor= out", ModelError)
-        check_compensators(self.compensators, self._sensor_feedback, self.plant.axis)
+        check_compensators(self.compensators, self.sensed_signal, self.plant.axis)
         _ = self.parameters
 
     def __repr__(self) -> str:
@@ -128,9 +129,9 @@ class ClosedLoop:
         parts = {
             "pid": self.pid.parameters(measured, unit),
             "dither": self.dither.parameters(unit, h) if self.dither else ParameterSet(),
-            "sensor": self.sensor.parameters(self._sensor_feedback) if self.sensor else ParameterSet(),
+            "sensor": self.sensor.parameters(self.sensed_signal) if self.sensor else ParameterSet(),
             "feedforward": self.feedforward.parameters(measured, unit) if self.feedforward else ParameterSet(),
-            **{c.section: c.parameters(self._sensor_feedback, unit) for c in self.compensators},
+            **{c.section: c.parameters(self.sensed_signal, unit) for c in self.compensators},
         }
         return reduce(or_, (own.with_prefix(name) for name, own in parts.items()), self.plant.parameters)
 
@@ -138,7 +139,7 @@ class ClosedLoop:
     def states(self) -> tuple[Quantity, ...]:
         """The plant's, the sensor's ("sensor.reading"), the controller's ("pid.*", "feedforward.filter") and so on."""
         parts = {
-            "sensor": self.sensor.states(self._sensor_feedback) if self.sensor else (),
+            "sensor": self.sensor.states(self.sensed_signal) if self.sensor else (),
             "pid": self.pid.states(self.feedback, self.command),
             "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
             **{c.section: c.states(self.command) for c in self.compensators},
@@ -192,21 +193,8 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        seen, y = Signals(), self._plant_rates(t, x, u, p, ca.SX(0))[1]
-        if self.sensor:
-            seen = self.sensor.update(
-                without_prefix(x, "sensor"), y, self._sensor_feedback, without_prefix(p, "sensor")
-            )
-        measured = seen.get("reading", y[self.feedback.name])
-        moved, added = added_command(self, t, x, u, measured, p)
-        own = self.pid.update(
-            without_prefix(x, "pid"),
-            u["reference"],
-            measured,
-            added,
-            without_prefix(p, "pid"),
-        )
-        after = stack({**x, **with_prefix(seen, "sensor"), **with_prefix(own, "pid"), **moved})
+        y = self._plant_rates(t, x, u, p, ca.SX(0))[1]
+        after = stack({**x, **controller_update(self, t, x, u, y, p).states})
         return ca.Function("update", [t, *map(stack, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
 
     def discrete(self, substeps: int = 1) -> DiscreteSystem:
@@ -279,14 +267,14 @@ class ClosedLoop:
     def sensor_lag(self, p: Array) -> Any:
         """The sensor's time constant in the loop linearised [s]; p of shape (n_parameters,) or (n_parameters, m)."""
         value = without_prefix(dict(zip(self.parameters, p, strict=True)), "sensor")
-        return self.sensor.time_constant(self._sensor_feedback, value) if self.sensor else 0.0
+        return self.sensor.time_constant(self.sensed_signal, value) if self.sensor else 0.0
 
     def count_size(self, parameters: ParameterSet) -> float:
         """What one count of the sensor changes its reading by [measured unit]; 0 of a sensor without counts."""
         if self.sensor is None:
             return 0.0
         value = dict(zip(self.parameters, self.parameter_vector(parameters).tolist(), strict=True))
-        return self.sensor.count_size(self._sensor_feedback, without_prefix(value, "sensor"))
+        return self.sensor.count_size(self.sensed_signal, without_prefix(value, "sensor"))
 
     @property
     def dead_time(self) -> float:
@@ -349,7 +337,7 @@ class ClosedLoop:
         check_initial_command(command, value, self.command.unit)
         shown = self.plant.ode(0, x, np.zeros(len(self.plant.inputs)), [value[n] for n in self.plant.parameters])[1]
         y = dict(zip(names(self.plant.outputs), shown.full().ravel().tolist(), strict=True))
-        sensor = self.sensor.start(y, self._sensor_feedback, without_prefix(value, "sensor")) if self.sensor else []
+        sensor = self.sensor.start(y, self.sensed_signal, without_prefix(value, "sensor")) if self.sensor else []
         seen = sensor[0] if sensor else y[self.feedback.name]
         v = float(uncompensated_command(self, p, reference, seen, command)[0])
         own = self.pid.start(reference, seen, v, {**without_prefix(value, "pid"), "Kp": float(self.gains(p)[0])})
@@ -384,14 +372,15 @@ class ClosedLoop:
     def _sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
         if self.sensor is None:
             return {}
-        own = without_prefix(x, "sensor"), y, self._sensor_feedback, without_prefix(p, "sensor")
+        own = without_prefix(x, "sensor"), y, self.sensed_signal, without_prefix(p, "sensor")
         return with_prefix(self.sensor.rates(*own), "sensor")
 
     def _plant_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
         return evaluate_plant(self.plant, self.command.name, t, x, u, p, command)
 
     @cached_property
-    def _sensor_feedback(self) -> SensedSignal:
+    def sensed_signal(self) -> SensedSignal:
+        """What the sensor reads."""
         return SensedSignal(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time)
 
 

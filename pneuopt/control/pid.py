@@ -217,33 +217,34 @@ class PID:
         Parameters as for `rates`; the states are "integral", "derivative", "previous_error", "command", and with a
         delay "pending", the command that the next sample holds.
         """
-        integral, derivative = self._sampled_terms(x, r, y, p)
-        w = self._proportional_term(r, y, p) + integral + derivative + added
+        terms = self.terms(x, r, y, p)
+        w = self.output(x, r, y, p) + added
         u = self.clip(w, p)
         windup = (self.sample_time or 0.0) / p["Tt"] * (u - w) if self.limits else 0.0
         sent = {"command": x["pending"], "pending": u} if self.delay else {"command": u}
-        return {"integral": integral + windup, "derivative": derivative, "previous_error": p["c"] * r - y, **sent}
+        remembered = {"derivative": terms["derivative"], "previous_error": p["c"] * r - y}
+        return {"integral": terms["integral"] + windup, **remembered, **sent}
+
+    def terms(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> dict[str, ca.SX]:
+        """The sampled law's terms at a sample: "proportional", "integral" before back-calculation, "derivative"."""
+        h, (Kp, Ki, Kd, Tf) = self.sample_time or 0.0, parallel_gains(self.form, p)
+        return {
+            "proportional": Kp * (p["b"] * r - y),
+            "integral": x["integral"] + Ki * h * self._integrand(r - y, p),
+            "derivative": (Tf * x["derivative"] + Kd * (p["c"] * r - y - x["previous_error"])) / (Tf + h),
+        }
 
     def output(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> ca.SX:
         """The command v of the law itself, before anything is added to it; at a sample that of a sampled one."""
         if self.sample_time is not None:
-            integral, derivative = self._sampled_terms(x, r, y, p)
-            return self._proportional_term(r, y, p) + integral + derivative
-        _, _, Kd, Tf = parallel_gains(self.form, p)
-        return self._proportional_term(r, y, p) + x["integral"] + Kd / Tf * (p["c"] * r - y - x["filter"])
+            terms = self.terms(x, r, y, p)
+            return terms["proportional"] + terms["integral"] + terms["derivative"]
+        Kp, _, Kd, Tf = parallel_gains(self.form, p)
+        return Kp * (p["b"] * r - y) + x["integral"] + Kd / Tf * (p["c"] * r - y - x["filter"])
 
     def clip(self, w: ca.SX, p: Symbols) -> ca.SX:
         """The saturated command: hard, as in a real controller; exact derivatives on either side of the corner."""
         return ca.fmin(ca.fmax(w, p["lower"]), p["upper"]) if self.limits else w
-
-    def _proportional_term(self, r: ca.SX, y: ca.SX, p: Symbols) -> ca.SX:
-        return parallel_gains(self.form, p)[0] * (p["b"] * r - y)
-
-    def _sampled_terms(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> tuple[ca.SX, ca.SX]:
-        """Integral, before back-calculation, and derivative of a sampled controller at a sample."""
-        h, (_, Ki, Kd, Tf) = self.sample_time or 0.0, parallel_gains(self.form, p)
-        derivative = (Tf * x["derivative"] + Kd * (p["c"] * r - y - x["previous_error"])) / (Tf + h)
-        return x["integral"] + Ki * h * self._integrand(r - y, p), derivative
 
     def _integrand(self, error: ca.SX, p: Symbols) -> ca.SX:
         if not self.dead_band:

@@ -1,0 +1,75 @@
+"""`controller_update`: what a sampled controller computes at a sample, without a plant around it.
+
+A `ClosedLoop` joins it to its plant, an export writes it for another machine: there is one law.
+"""
+
+from typing import NamedTuple, Protocol
+
+import casadi as ca
+
+from pneuopt.control.command import CommandParts, added_command, added_terms
+from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
+from pneuopt.control.wiring import Signals
+from pneuopt.dynamics.system import Symbols
+from pneuopt.quantities.parameters import with_prefix, without_prefix
+
+
+class ControllerParts(CommandParts, Protocol):
+    """The parts of a `ClosedLoop` that are computed at a sample."""
+
+    @property
+    def sensor(self) -> SensorLag | Encoder | None:
+        """Through which the controller sees the measured signal."""
+        ...
+
+    @property
+    def sensed_signal(self) -> SensedSignal:
+        """What the sensor reads."""
+        ...
+
+
+class ControllerUpdate(NamedTuple):
+    """What is computed at a sample, by name.
+
+    Attributes
+    ----------
+    states : dict of str to casadi.SX
+        The states of sensor, PID, feedforward and compensators after the sample, by the loop's names.
+    terms : dict of str to casadi.SX
+        What the command is made of: "error", "proportional", "integral" (before back-calculation), "derivative",
+        "feedforward", "compensation", "dither", and their sum before the clip, "unlimited".
+    """
+
+    states: Signals
+    terms: Signals
+
+
+def controller_update(
+    loop: ControllerParts, t: ca.SX, x: Symbols, u: Symbols, y: Symbols, p: Symbols
+) -> ControllerUpdate:
+    """What a sampled controller computes at a sample.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        With a sample time.
+    t : casadi.SX
+        [s]
+    x, u, p : mapping of str to casadi.SX
+        The loop's states, inputs (the "reference") and parameters.
+    y : mapping of str to casadi.SX
+        The plant's outputs: the measured one, or what an `Encoder` counts.
+    """
+    seen = (
+        loop.sensor.update(without_prefix(x, "sensor"), y, loop.sensed_signal, without_prefix(p, "sensor"))
+        if loop.sensor
+        else {}
+    )
+    measured = seen["reading"] if seen else y[loop.sensed_signal.measured.name]
+    moved, added = added_command(loop, t, x, u, measured, p)
+    arguments = without_prefix(x, "pid"), u["reference"], measured
+    own = without_prefix(p, "pid")
+    after = with_prefix(seen, "sensor") | with_prefix(loop.pid.update(*arguments, added, own), "pid") | moved
+    terms = loop.pid.terms(*arguments, own) | added_terms(loop, t, x, u, measured, p)[1]
+    sum_before_clip = loop.pid.output(*arguments, own) + added
+    return ControllerUpdate(after, {"error": u["reference"] - measured, **terms, "unlimited": sum_before_clip})
