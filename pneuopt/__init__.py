@@ -16,6 +16,7 @@ The concept map, in the order in which data flow:
     find_limit_cycle(t, speed)        -> hunting or crawl in a response or a log: amplitude, frequency, stick share
     evaluate, simulate                -> certified metrics; any trajectory, independently of the optimiser
     bumpless_transfer(loop, x, ...)   -> the state from which a running loop goes on with new gains, without a bump
+    export_controller(loop, tuned, C) -> the sampled controller as C99, structured text or Python, the same to rounding
     record(Rig(loop, sensors), ...)   -> the log of a rig with stick-slip, hysteresis, sensors; and the truth
     pareto_front(loop, steps, ...)    -> what one requirement costs in terms of another: a row a certified design
     grid, sweep(fn, parameters, cases)-> a study: any function over named cases, in processes, as a table

@@ -63,6 +63,7 @@ from .evaluation.requirements import (
 from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
+from .export.targets import Language, export_controller
 from .files.drive import read_drive, write_fit
 from .files.results import load_result
 from .files.tuning import read_tuning, write_tuned
@@ -210,6 +211,7 @@ __all__ = [
     "Journal",
     "Karnopp",
     "Knocker",
+    "Language",
     "LeastSquares",
     "LimitCycle",
     "Linearisation",
@@ -302,6 +304,7 @@ __all__ = [
     "evaluate_batch",
     "examine_logs",
     "expected_plants",
+    "export_controller",
     "find_limit_cycle",
     "frequency_response",
     "friction_ladder",

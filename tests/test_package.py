@@ -102,6 +102,8 @@ PUBLIC_NAMES = [
     "Journal",
     "Karnopp",
     "Knocker",
+    "Language",
+    "export_controller",
     "LeastSquares",
     "LimitCycle",
     "linear_plant",

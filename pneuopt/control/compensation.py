@@ -74,7 +74,7 @@ class Compensator(Protocol):
         """What it remembers."""
         ...
 
-    def start(self, command: float) -> list[float]:
+    def start(self, command: Any) -> list[Any]:
         """The states in a loop that so far rests on a command of the PID."""
         ...
 

@@ -1,7 +1,7 @@
 """`DeadZoneInverse`: a valve's dead zone added back to the command."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -52,7 +52,7 @@ class DeadZoneInverse:
         """None."""
         return ()
 
-    def start(self, _command: float) -> list[float]:
+    def start(self, _command: Any) -> list[Any]:
         """No states."""
         return []
 

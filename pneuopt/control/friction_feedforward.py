@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -86,7 +86,7 @@ class FrictionFeedforward:
         """None."""
         return ()
 
-    def start(self, _command: float) -> list[float]:
+    def start(self, _command: Any) -> list[Any]:
         """No states."""
         return []
 

@@ -1,7 +1,7 @@
 """`Knocker`: short pulses on the command, in the direction in which the controller's output moves."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -69,7 +69,7 @@ class Knocker:
         """The command and the direction at the last onset."""
         return replace(command, name="command"), Quantity("direction", "1")
 
-    def start(self, command: float) -> list[float]:
+    def start(self, command: Any) -> list[Any]:
         """The command so far, and no direction."""
         return [command, 0.0]
 

@@ -6,6 +6,7 @@ The parallel form is what runs, whatever form its gains are given in (`forms`).
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 import casadi as ca
 
@@ -173,14 +174,14 @@ class PID:
             *(pending for _ in range(self.delay)),
         )
 
-    def start(self, r: float, y: float, command: float, p: Mapping[str, float]) -> list[float]:
+    def start(self, r: Any, y: Any, command: Any, p: Mapping[str, Any]) -> list[Any]:
         """The states with which the controller goes on from a command without a bump.
 
         Parameters
         ----------
-        r, y, command : float
+        r, y, command : float or casadi.SX
             So far [input unit], [output unit].
-        p : mapping of str to float
+        p : mapping of str to float or casadi.SX
             Kp of the parallel form, b and c.
         """
         integral, error = command - p["Kp"] * (p["b"] * r - y), p["c"] * r - y

@@ -1,0 +1,251 @@
+"""`ControllerProgram`: a loop's sampled controller as named numbers and two symbolic functions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from pneuopt.control.compensation import Compensator
+from pneuopt.control.dither import Dither
+from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.forms import Form, parallel_gains
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.sampled import controller_update
+from pneuopt.control.sensor import Encoder, SensedSignal
+from pneuopt.control.wiring import Signals
+from pneuopt.dynamics.system import Symbols, symbols
+from pneuopt.quantities.errors import ModelError, require
+from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
+
+SAMPLE, CENTRE = "sample", "centre"  # the state that counts samples; the parameter of the valve's centre
+ADDED_TERMS = ("integral", "derivative", "proportional", "feedforward", "compensation", "dither")
+"""Terms of the command, whose names end in _term: the states of some have the name itself."""
+STATE_MEANINGS: Mapping[str, str] = {
+    SAMPLE: "samples since the start",
+    "sensor.reading": "filtered speed",
+    "sensor.count": "position of the sample before",
+    "pid.integral": "integral term, with what unwinds it",
+    "pid.derivative": "filtered derivative term",
+    "pid.previous_error": "weighted error of the sample before",
+    "pid.pending": "command that acts at the next sample",
+    "feedforward.filter": "reference, filtered",
+    "knocker.command": "command at the last pulse's onset",
+    "knocker.direction": "direction of the last pulse",
+}
+_UNNAMED_CONSTANTS = (0.5, 1.0, 2.0)  # sample times [s] that are found in many formulas, where their name would mislead
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A number of a program.
+
+    Parameters
+    ----------
+    name, unit, meaning : str
+    value : float
+        Of a parameter; of another 0.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    value: float = 0.0
+
+
+@dataclass(frozen=True)
+class ControllerProgram:
+    """What a sampled controller computes, apart from any plant and any language.
+
+    Attributes
+    ----------
+    sample_time : float
+        [s]
+    parameters, inputs, states, outputs : tuple of Variable
+        The first output is what the actuator gets.
+    start_inputs : tuple of Variable
+    start : casadi.Function
+        ``(start_inputs, parameters) -> states``: at rest, or from another controller's output without a bump.
+    step : casadi.Function
+        ``(inputs, states, parameters) -> (outputs and next states, terms)``.
+    terms : tuple of str
+        Names of intermediate values.
+    """
+
+    sample_time: float
+    parameters: tuple[Variable, ...]
+    inputs: tuple[Variable, ...]
+    states: tuple[Variable, ...]
+    outputs: tuple[Variable, ...]
+    start_inputs: tuple[Variable, ...]
+    start: ca.Function
+    step: ca.Function
+    terms: tuple[str, ...]
+
+    @property
+    def values(self) -> list[float]:
+        """Of the parameters."""
+        return [v.value for v in self.parameters]
+
+    @property
+    def constants(self) -> Mapping[float, str]:
+        """Constants that have a name."""
+        return {} if self.sample_time in _UNNAMED_CONSTANTS else {self.sample_time: "SAMPLE_TIME"}
+
+
+def controller_program(loop: ClosedLoop, parameters: ParameterSet, centre: float = 0.0) -> ControllerProgram:
+    """The program of a loop's controller.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        With a sample time. What is behind the controller, an analogue dither say, and before it, a sensor's lag or
+        steps, is hardware and not in it; what an `Encoder` computes of a position is.
+    parameters : ParameterSet
+    centre : float
+        On the wire to the valve while the command is zero [the command's unit]; 0 for nothing.
+
+    Raises
+    ------
+    ModelError
+        If the controller is continuous.
+    InputError
+        If the parameters cannot run.
+    """
+    h = loop.pid.sample_time
+    told = "a continuous controller cannot be exported: give it a sample time, sample_time under [pid], and tune again"
+    require(h is not None, told, ModelError)
+    loop.check(parameters)
+    return _assemble(_law(loop), loop, parameters, centre)
+
+
+@dataclass(frozen=True)
+class _ComputedParts:
+    """The parts of a loop that its controller computes, as `controller_update` asks for them."""
+
+    pid: PID
+    dither: Dither | None
+    feedforward: Feedforward | None
+    compensators: tuple[Compensator, ...]
+    sensor: Encoder | None
+    sensed_signal: SensedSignal
+
+
+@dataclass(frozen=True)
+class _Law:
+    """The controller symbolically.
+
+    Attributes
+    ----------
+    inputs, states, parameters : dict of str to casadi.SX
+        By the loop's names, and "sample", "centre".
+    measured : Quantity
+        What the controller's input shows.
+    after, start, terms : dict of str to casadi.SX
+        Next states, first ones, and intermediate values.
+    """
+
+    inputs: Signals
+    states: Signals
+    parameters: Signals
+    measured: Quantity
+    after: Signals
+    start: Signals
+    terms: Signals
+
+
+def _law(loop: ClosedLoop) -> _Law:
+    """What is computed at a sample, and at the start."""
+    sensed = loop.sensed_signal
+    counts = isinstance(loop.sensor, Encoder) and loop.sensor.differentiates(sensed)
+    encoder = replace(loop.sensor, resolution=0.0) if counts and isinstance(loop.sensor, Encoder) else None
+    parts = _ComputedParts(loop.pid, loop.dither, loop.feedforward, loop.compensators, encoder, sensed)
+    measured = sensed.outputs[encoder.position] if encoder else loop.feedback
+    known = loop.states[len(loop.plant.states) :]
+    x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}
+    p: Signals = {n: ca.SX.sym(n) for n in (*loop.parameters, CENTRE)}
+    u: Signals = {n: ca.SX.sym(n) for n in ("reference", "measured", "output")}
+    t = (loop.pid.sample_time or 0.0) * x[SAMPLE]
+    found = controller_update(parts, t, x, u, {measured.name: u["measured"]}, p)
+    own = without_prefix(p, "pid")
+    gains = dict(zip(Form.PARALLEL.gains, parallel_gains(loop.pid.form, own), strict=True))
+    more = {} if loop.pid.form is Form.PARALLEL else {f"{n}_parallel": value for n, value in gains.items()}
+    after = {**found.states, SAMPLE: x[SAMPLE] + 1}
+    terms = {f"{n}_term" if n in ADDED_TERMS else n: v for n, v in found.terms.items()} | more
+    return _Law(u, x, p, measured, after, _start(parts, u, {**own, "Kp": gains["Kp"]}, p[CENTRE]), terms)
+
+
+def _start(parts: _ComputedParts, u: Signals, p: Symbols, centre: ca.SX) -> Signals:
+    """The first states, as `ClosedLoop.initial` has them, from what the actuator has got so far."""
+    command, unit = u["output"] - centre, Quantity("command", "1")
+    seen = ca.SX(0) if parts.sensor else u["measured"]  # a position says no speed: the start is at rest
+    begun: Signals = {"sensor.reading": seen, "sensor.count": u["measured"]}
+    pid = parts.pid.start(u["reference"], seen, command, p)
+    begun |= {f"pid.{q.name}": v for q, v in zip(parts.pid.states(unit, unit), pid, strict=True)}
+    begun["feedforward.filter"] = u["reference"]
+    for part in parts.compensators:
+        own = zip(part.states(unit), part.start(command), strict=True)
+        begun |= {f"{part.section}.{q.name}": v for q, v in own}
+    return {**begun, SAMPLE: ca.SX(0)}
+
+
+def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: float) -> ControllerProgram:
+    """The program of a law, with the states and parameters that it needs and no others."""
+    outputs = _outputs(law, loop, centre)
+    states = _needed_states(ca.vertcat(*(v for v, _ in outputs.values())), law.states, law.after)
+    after, first = (ca.densify(ca.vertcat(*(v[n] for n in states))) for v in (law.after, law.start))
+    results = ca.vertcat(*(v for v, _ in outputs.values()), after)
+    everything = ca.vertcat(results, first)
+    given = [n for n, s in law.parameters.items() if ca.depends_on(everything, s)]
+    terms = {n: v for n, v in law.terms.items() if not (v.is_symbolic() or v.is_constant())}
+    x, p = (ca.vertcat(*(own[n] for n in chosen)) for own, chosen in ((law.states, states), (law.parameters, given)))
+    signals = ca.vertcat(law.inputs["reference"], law.inputs["measured"])
+    begin = ca.vertcat(signals, law.inputs["output"])
+    value = dict(zip(loop.parameters, loop.parameter_vector(parameters).tolist(), strict=True))
+    value[CENTRE] = centre
+    unit, wanted = loop.command.unit, Variable("setpoint", loop.feedback.unit, f"the {loop.feedback.name} wanted")
+    measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
+    declared = {n: (q.unit, q.meaning) for n, q in loop.parameters.items()}
+    declared[CENTRE] = (unit, "output while the command is zero: where the valve is closed")
+    units = {q.name: q.unit for q in loop.states} | {SAMPLE: "1"}
+    return ControllerProgram(
+        loop.pid.sample_time or 0.0,
+        tuple(Variable(short_name(n), *declared[n], value[n]) for n in given),
+        (wanted, measured),
+        tuple(Variable(short_name(n), units[n], STATE_MEANINGS.get(n, "")) for n in states),
+        tuple(Variable(n, unit, what) for n, (_, what) in outputs.items()),
+        (wanted, measured, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
+        ca.Function("start", [begin, p], [first]),
+        ca.Function("step", [signals, x, p], [ca.densify(results), ca.densify(ca.vertcat(*terms.values()))]),
+        tuple(terms),
+    )
+
+
+def _outputs(law: _Law, loop: ClosedLoop, centre: float) -> dict[str, tuple[ca.SX, str]]:
+    """What the controller gives: the value, and what it is."""
+    delayed, wire = bool(loop.pid.delay), law.parameters[CENTRE] if centre else ca.SX(0)
+    command = law.after["pid.pending" if delayed else "pid.command"]
+    later = ": write it at once, the design counts on one sample until it acts" if delayed else ""
+    found = {"output": (command + wire, f"what the actuator gets{later}")}
+    if centre:
+        found["command"] = (command, "the output less the valve's centre")
+    if delayed:
+        held = law.after["pid.command"] + wire
+        found["output_delayed"] = (held, "output of the sample before: for hardware on which an output acts at once")
+    return found
+
+
+def _needed_states(results: ca.SX, states: Signals, after: Signals) -> list[str]:
+    """The states on which results depend, now or later, in the loop's order."""
+    needed: set[str] = set()
+    while True:
+        sought = ca.vertcat(results, *(after[n] for n in needed))
+        found = {n for n, symbol in states.items() if ca.depends_on(sought, symbol)}
+        if found == needed:
+            return [n for n in states if n in needed]
+        needed = found
+
+
+def short_name(name: str) -> str:
+    """A parameter's or state's name in a program: "pid.Kp" is Kp, "dither.offset" is dither_offset."""
+    return name.removeprefix("pid.").replace(".", "_")

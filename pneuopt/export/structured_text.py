@@ -1,0 +1,96 @@
+"""The controller as one function block in IEC 61131-3 structured text, of standard functions alone.
+
+Type conversions and functions are those of IEC 61131-3:2013, 6.6.2.5; it has neither tanh nor floor, which are made of
+EXP and of a rounding. All numbers are LREAL.
+"""
+
+import textwrap
+
+import casadi as ca
+
+from pneuopt.export.expression_writer import ARITHMETIC, COMPARED, SELECT, Binding, Form, Syntax, infix
+from pneuopt.export.header import Header, comment_text
+from pneuopt.export.page import Places, write_page
+from pneuopt.export.program import ControllerProgram, Variable
+
+_WHOLE = "LINT_TO_LREAL(LREAL_TO_LINT({0}))"
+_TANH = "(1.0 - 2.0 / (EXP(2.0 * MAX(-20.0, MIN(20.0, {0}))) + 1.0))"  # beyond 20 it is 1 in 16 digits
+
+
+class _StructuredTextSyntax(Syntax):
+    """A real literal has a point and, before an exponent, a capital E."""
+
+    def literal(self, value: float) -> str:
+        mantissa, e, exponent = super().literal(value).partition("e")
+        if not e:
+            return mantissa
+        return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}E{int(exponent)}"
+
+
+STRUCTURED_TEXT = _StructuredTextSyntax(
+    {
+        **ARITHMETIC,
+        ca.OP_EQ: infix("=", Binding.COMPARISON),
+        ca.OP_NE: infix("<>", Binding.COMPARISON),
+        ca.OP_AND: Form("({0} AND {1})", needs=COMPARED),
+        ca.OP_OR: Form("({0} OR {1})", needs=COMPARED),
+        ca.OP_NOT: Form("(NOT ({0}))"),
+        ca.OP_FMIN: Form("MIN({0}, {1})"),
+        ca.OP_FMAX: Form("MAX({0}, {1})"),
+        ca.OP_FABS: Form("ABS({0})"),
+        ca.OP_LOG: Form("LN({0})"),
+        ca.OP_TANH: Form(_TANH),
+        ca.OP_FLOOR: Form(f"({_WHOLE} - SEL({_WHOLE} > {{0}}, 0.0, 1.0))"),
+        ca.OP_IF_ELSE_ZERO: Form("SEL({0}, 0.0, {1})"),
+        SELECT: Form("SEL({0}, {2}, {1})"),
+        ca.OP_SQRT: Form("SQRT({0})"),
+        ca.OP_EXP: Form("EXP({0})"),
+        ca.OP_SIN: Form("SIN({0})"),
+        ca.OP_COS: Form("COS({0})"),
+    },
+    infinity="1.0E308",
+    truth=Form("SEL({0}, 0.0, 1.0)"),
+    condition=Form("{0} <> 0.0", Binding.COMPARISON, (Binding.SUM,)),
+)
+
+
+def write_structured_text(program: ControllerProgram, header: Header) -> dict[str, str]:
+    """One function block; its text by the file's name."""
+    page, name = write_page(program, STRUCTURED_TEXT, Places()), header.name
+    values = [*page.coefficients, *page.start_locals, *page.locals]
+    lines = ["(*", *(f"  {line}".rstrip() for line in header.lines), "*)", f"FUNCTION_BLOCK {name}", "VAR_INPUT"]
+    lines += (
+        _declare(program.inputs, False)
+        + _declare(program.parameters, True)
+        + _declare(program.start_inputs[-1:], False)
+    )
+    lines += ["    restart : BOOL; (* TRUE: begin at start_output, without a bump; the first call always begins *)"]
+    lines += ["END_VAR", "VAR_OUTPUT", *_declare(program.outputs, False), "END_VAR", "VAR"]
+    lines += ["    runs : BOOL; (* whether it has begun *)", *_declare(program.states, False)]
+    lines += [f"    {n} : LREAL;" for n in dict.fromkeys(a.name for a in values)]
+    lines += ["END_VAR", "VAR CONSTANT", f"    SAMPLE_TIME : LREAL := {program.sample_time!r}; (* s *)", "END_VAR", ""]
+    lines += ["(* what the parameters alone give; they may be changed while it runs *)"]
+    lines += _assign({a.name: a.text for a in page.coefficients})
+    lines += ["", "IF restart OR NOT runs THEN"]
+    started = {a.name: a.text for a in (*page.start_locals, *page.start)}
+    lines += [f"    {line}" for line in _assign(started)]
+    lines += ["    runs := TRUE;", "END_IF;", "", *_assign({a.name: a.text for a in page.locals}), ""]
+    lines += [*_assign({**page.outputs, **page.states}), "END_FUNCTION_BLOCK"]
+    return {f"{name}.st": "\n".join(lines) + "\n"}
+
+
+def _declare(variables: tuple[Variable, ...], initial: bool) -> list[str]:
+    lines = []
+    for v in variables:
+        value = f" := {STRUCTURED_TEXT.literal(v.value)}" if initial else ""
+        lines.append(f"    {v.name} : LREAL{value}; (* {comment_text(f'{v.unit}: {v.meaning}')} *)")
+    return lines
+
+
+def _assign(values: dict[str, str]) -> list[str]:
+    lines = []
+    for name, text in values.items():
+        lines += textwrap.wrap(
+            f"{name} := {text};", 110, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False
+        )
+    return lines

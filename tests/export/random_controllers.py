@@ -1,0 +1,108 @@
+"""Random sampled controllers of every form, and their run in the library's own closed loop."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pneuopt.control.compensators import COMPENSATORS
+from pneuopt.control.dither import Dither, Waveform
+from pneuopt.control.feedforward import Feedforward
+from pneuopt.control.forms import Form
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.dynamics.system import names
+from pneuopt.export.program import controller_program, short_name
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Viscous
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.parameters import ParameterSet
+
+COUNT, SAMPLES = 20, 300
+RESOLUTION = 1e-5  # [m] of the encoders
+RANGES = {
+    **dict.fromkeys(("Kp", "K"), (0.5, 20.0)),
+    "Ki": (0.0, 200.0),
+    "Kd": (0.0, 0.3),
+    "Tf": (0.0, 0.02),
+    "Ti": (0.01, 0.5),
+    "Td": (0.0, 0.05),
+    "N": (3.0, 20.0),
+    "b": (0.0, 1.0),
+    "c": (0.0, 1.0),
+    "Tt": (0.01, 0.5),
+    "dead_band": (0.0, 0.02),
+    "amplitude": (0.0, 2.0),
+    "offset": (-1.0, 1.0),
+    "frequency": (20.0, 150.0),
+    "gain": (-2.0, 5.0),
+    "time": (0.01, 0.2),
+    "level": (0.0, 1.0),
+    "smoothing": (1e-3, 0.05),
+    "width": (0.004, 0.02),
+    "period": (0.02, 0.08),
+    "filter": (0.0, 0.01),
+}
+
+
+class Run(NamedTuple):
+    """What a controller is given and gives, sample by sample."""
+
+    loop: ClosedLoop
+    parameters: ParameterSet
+    centre: float
+    inputs: Array
+    outputs: Array
+
+
+def random_loop(seed: int) -> tuple[ClosedLoop, ParameterSet, float]:
+    """A controller whose form, parts and numbers the seed draws; every form and part comes in twenty."""
+    g = np.random.default_rng(seed)
+    form, sensor = list(Form)[seed % 3], [None, Encoder(RESOLUTION), Encoder(), SensorLag(0.005), None][seed % 5]
+    pid = PID([1e-3, 2e-3, 5e-4, 1.0 / 3000][seed % 4], bool(seed % 7), form, int(g.integers(2)), bool(g.integers(2)))
+    dither = [Dither(), Dither(waveform=Waveform.TRIANGLE), Dither(analogue=True), None][int(g.integers(4))]
+    lead = Feedforward() if g.integers(2) else None
+    measured = "position" if seed % 4 == 1 else "speed"
+    kinds = [k for k in COMPENSATORS.values() if g.integers(2) and not (k.size == "level" and measured == "position")]
+    loop = ClosedLoop(
+        ForceDrive(Viscous()), pid, dither, measured=measured, sensor=sensor, feedforward=lead,
+        compensators=tuple(k() for k in kinds),
+    )  # fmt: skip
+    values = {
+        n: g.uniform(*RANGES[n.split(".")[1]])
+        for n in loop.parameters
+        if n.split(".")[1] in RANGES and n.partition(".")[0] not in ("load", "friction")
+    }
+    values |= {"pid.lower": -g.uniform(0.5, 4.0), "pid.upper": g.uniform(0.5, 4.0)} if pid.limits else {}
+    return loop, loop.parameters.with_values(values), float(g.choice([0.0, 5.0]))
+
+
+def run_library(seed: int) -> Run:
+    """The commands of the library's closed loop while its plant is moved at random."""
+    loop, parameters, centre = random_loop(seed)
+    g, h, p = np.random.default_rng(seed + 1000), loop.pid.sample_time or 0.0, loop.parameter_vector(parameters)
+    order, plant = names(loop.states), names(loop.plant.states)
+    program = controller_program(loop, parameters, centre)
+    motion = 0.05 * np.cumsum(g.normal(size=(SAMPLES, 2)), axis=0) * [0.02, 0.2]
+    reference = 0.3 * np.repeat(g.normal(size=SAMPLES // 50), 50)
+    inputs, outputs = np.empty((SAMPLES, 2)), np.empty(SAMPLES)
+    begun = program.start([reference[0], _shown(loop, motion[0]), centre], program.values).full().ravel()
+    first = dict(zip((v.name for v in program.states), begun, strict=True))
+    x = np.array([first.get(short_name(n), 0.0) for n in order])
+    for k in range(SAMPLES):
+        x[[plant.index("position"), plant.index("speed")]] = motion[k]
+        if isinstance(loop.sensor, SensorLag):
+            x[order.index("sensor.reading")] = motion[k, int(loop.feedback.name == "speed")]
+        x = loop.update(k * h, x, [reference[k]], p).full().ravel()
+        by_name = dict(zip(order, x, strict=True))
+        inputs[k] = reference[k], _shown(loop, motion[k])
+        outputs[k] = by_name["pid.pending" if loop.pid.delay else "pid.command"] + centre
+    return Run(loop, parameters, centre, inputs, outputs)
+
+
+def _shown(loop: ClosedLoop, motion: Array) -> float:
+    """What the hardware shows the controller: a position in counts, or the signal itself."""
+    if isinstance(loop.sensor, Encoder):
+        size = loop.sensor.resolution
+        return float(size * np.floor(motion[0] / size + 0.5)) if size else float(motion[0])
+    return float(motion[int(loop.feedback.name == "speed")])

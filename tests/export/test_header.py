@@ -1,0 +1,83 @@
+"""What comes from files and names stays a comment, whatever it holds."""
+
+import ast
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from pneuopt.control.forms import Form
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.export.header import comment_text
+from pneuopt.export.targets import Language, export_controller
+from pneuopt.models.linear import FirstOrder
+from pneuopt.quantities.errors import InputError, ModelError
+from tests.export.structured_text_run import FunctionBlock
+
+HOSTILE = [
+    "a */ int evil; /*",
+    "b *) evil := 1; (*",
+    'c """\nimport os\n"""',
+    "d \\\nint evil;",
+    "e ??/\n */ evil",
+    "f *\n/ evil *\\/ evil",
+    "g **//** evil **)) ((**",
+    "h '''{$crlf} <script>evil</script> \x00\x1b[2J\u2028evil",
+    "i \\u002a/ evil",
+]
+LOOP = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, limits=False))
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_a_hostile_text_ends_no_comment(text: str) -> None:
+    plain = comment_text(text)
+    assert plain.isascii()
+    assert plain.isprintable()
+    assert not any(mark in plain for mark in ("*/", "/*", "(*", "*)", '"""', "'''", "\\", "??", "//"))
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler on the path")
+def test_hostile_texts_leave_the_code_as_it_is(tmp_path: Path) -> None:
+    plain = {n: t for kind in Language for n, t in export_controller(LOOP, LOOP.parameters, kind).items()}
+    hostile = {n: t for k in Language for n, t in export_controller(LOOP, LOOP.parameters, k, origin=HOSTILE).items()}
+    for files, folder in ((plain, tmp_path / "plain"), (hostile, tmp_path / "hostile")):
+        folder.mkdir()
+        for name, text in files.items():
+            (folder / name).write_text(text, "ascii")
+    built = [
+        subprocess.run(["gcc", "-E", "-P", "controller.c"], cwd=tmp_path / n, capture_output=True, check=True).stdout
+        for n in ("plain", "hostile")
+    ]
+    assert built[0] == built[1]
+    trees = [ast.parse(files["controller.py"]) for files in (plain, hostile)]
+    assert ast.dump(trees[0].body[1]) == ast.dump(trees[1].body[1])
+    assert [len(tree.body) for tree in trees] == [len(trees[0].body)] * 2
+
+
+def test_hostile_texts_leave_structured_text_as_it_is() -> None:
+    text = export_controller(LOOP, LOOP.parameters, Language.STRUCTURED_TEXT, origin=HOSTILE)["controller.st"]
+    assert "evil" in text
+    assert not any("evil" in name for name in FunctionBlock(text).variables)
+
+
+@pytest.mark.parametrize("name", ["a b", "1a", "x*/", "", "a__b", "ä", "a" * 41, "if\n", "_x"])
+def test_a_name_that_is_no_identifier_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="a block's name has letters, digits"):
+        export_controller(LOOP, LOOP.parameters, Language.C, name=name)
+
+
+def test_a_continuous_controller_is_refused() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID())
+    with pytest.raises(ModelError, match="give it a sample time"):
+        export_controller(loop, loop.parameters, Language.C)
+
+
+def test_the_gains_stand_there_in_every_form() -> None:
+    loop = ClosedLoop(FirstOrder().system(), PID(sample_time=1e-3, form=Form.STANDARD, limits=False))
+    given = loop.parameters.with_values({"pid.Kp": 2.0, "pid.Ti": 0.5, "pid.Td": 0.05, "pid.N": 10.0})
+    text = export_controller(loop, given, Language.C)["controller.h"]
+    assert "parallel: Kp = 2 V*s/m, Ki = 4 V/m, Kd = 0.1 V*s^2/m, Tf = 0.005 s" in text
+    assert "standard: Kp = 2 V*s/m, Ti = 0.5 s, Td = 0.05 s, N = 10" in text
+    assert "series: K = " in text
