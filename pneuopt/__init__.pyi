@@ -24,6 +24,7 @@ from .control.loop import ClosedLoop
 from .control.pid import PID
 from .control.reference import Step
 from .control.sensor import Encoder, SensorLag
+from .dynamics.python_control import from_control, to_control
 from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
 from .dynamics.stick_slip import EventKind
 from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
@@ -308,6 +309,7 @@ __all__ = [
     "find_limit_cycle",
     "frequency_response",
     "friction_ladder",
+    "from_control",
     "grid",
     "identifiability",
     "identify",
@@ -362,6 +364,7 @@ __all__ = [
     "stick_slip_drive",
     "sweep",
     "sweep_from_neighbours",
+    "to_control",
     "to_parallel",
     "to_series",
     "to_standard",

@@ -80,6 +80,8 @@ PUBLIC_NAMES = [
     "Form",
     "frequency_response",
     "friction_ladder",
+    "from_control",
+    "to_control",
     "FrictionFeedforward",
     "FullSpace",
     "GainMargin",

@@ -136,6 +136,15 @@ class Experiment:
         with count_gauge_from(ambient_pressure):
             return experiment_from_table(table, columns or {}, f"{name}: columns", plant, name)
 
+    def to_frame(self) -> "pd.DataFrame":
+        """Tabulate: the index is "time [s]", a column a channel, "position [m]"; `from_frame` reads it back.
+
+        Noise, conditions and what a sidecar says stay behind.
+        """
+        table = self.trajectory.to_frame()
+        units = {n: f"{n} [{unit}]" for n in self.trajectory if (unit := self.unit(n))}
+        return table.rename(columns=units).rename_axis("time [s]")
+
     def unit(self, channel: str) -> str:
         """The SI unit of a channel; empty where nothing says it."""
         return self.units.get(channel) or CHANNELS.get(channel, "")

@@ -4,6 +4,7 @@ import pytest
 
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.errors import LogError, UnitError, UnknownNameError
+from pneuopt.quantities.trajectories import Trajectory
 from tests.logs.styles import POSITION, PRESSURE, STAMPS, TIME
 
 FRAME = pd.DataFrame({"time": TIME, "position": POSITION, "p_A": PRESSURE})
@@ -52,3 +53,17 @@ def test_what_a_frame_does_not_say_is_asked_for() -> None:
         Experiment.from_frame(FRAME.set_axis(["time", "position", "position"], axis=1), units=UNITS)
     with pytest.raises(LogError, match="columns need names, as text"):
         Experiment.from_frame(FRAME.set_axis([0, 1, 2], axis=1))
+
+
+def test_a_log_goes_to_pandas_and_back() -> None:
+    run = Trajectory(
+        [0.0, 0.1, 0.3], {"position": [0.0, 0.02, np.nan], "pressure_a": [1e5, 2e5, 3e5], "mine": [1, 2, 3]}
+    )
+    log = Experiment(run, units={"mine": "N*m"})
+    frame = log.to_frame()
+    assert frame.columns.tolist() == ["position [m]", "pressure_a [Pa(a)]", "mine [N*m]"]
+    assert frame.index.tolist() == [0.0, 0.1, 0.3]
+    back = Experiment.from_frame(frame.drop(columns="mine [N*m]"))
+    assert back.trajectory.t.tolist() == run.t.tolist()
+    for name in back.trajectory:
+        assert np.array_equal(back.trajectory[name], run[name], equal_nan=True)
