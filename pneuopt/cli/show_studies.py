@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.evaluation.report import metric_cell
 from pneuopt.evaluation.requirements import larger_is_better
-from pneuopt.quantities.report import Column, Line, Report, Table, format_number
+from pneuopt.quantities.report import Column, Line, Report, Table, Tone, format_number
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 
 if TYPE_CHECKING:
@@ -71,6 +71,17 @@ def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: 
     failed = table[~table["error"].isin(["", INTERRUPTED_CASE])].to_dict(orient="records")
     lines += [f"failed ({second} {relation} {format_number(row['limit'], 4)}): {row['error']}" for row in failed]
     return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
+
+
+def lead_report(verdict: str, status: int) -> Report:
+    """The verdict as a report."""
+    return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
+
+
+def format_csv(table: "pd.DataFrame", units: Mapping[str, str]) -> str:
+    """As CSV, the units in the header."""
+    header = {n: f"{n} [{unit}]" for n, unit in units.items() if unit}
+    return str(table.rename(columns=header).to_csv(index=False, float_format="%.9g", lineterminator="\n"))
 
 
 def _format_gain(value: float) -> str:

@@ -1,4 +1,4 @@
-"""`pneuopt study`: a loop certified over a grid of parameters, or tuned along a Pareto front."""
+"""`pneuopt study`: a loop certified over a grid of parameters or other cases; a front is in `study_front`."""
 
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import (
@@ -19,37 +19,28 @@ from pneuopt.cli.shared import (
     warn,
     warn_of_status,
 )
-from pneuopt.cli.show_studies import report_cases, report_front
-from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page, front_page
+from pneuopt.cli.show_studies import format_csv, lead_report, report_cases
+from pneuopt.cli.study_front import run_front
+from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page
 from pneuopt.cli.terminal import progress
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.report import metric_units
 from pneuopt.evaluation.requirements import (
     METRICS,
-    SettlingTime,
-    StepEnvelope,
     larger_is_better,
-    metric_name,
-    upper_limit,
-    user_limit,
-    with_user_limit,
 )
 from pneuopt.files.drive import read_drive
-from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units
-from pneuopt.files.study import Pareto, Study, SweptAxis, read_axes, read_pareto, read_study, swept_axes
+from pneuopt.files.study import Study, SweptAxis, read_axes, read_study, swept_axes
 from pneuopt.files.study_cases import read_study_cases
-from pneuopt.files.toml import construct_at
 from pneuopt.files.tuning import Tuning, read_tuning
-from pneuopt.plotting import plot_front, plot_map
+from pneuopt.plotting import plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.source import read_once
 from pneuopt.quantities.status import Code, Status
-from pneuopt.quantities.units import write_value
 from pneuopt.studies.cases import grid
 from pneuopt.studies.cluster import open_executor
 from pneuopt.studies.journal import Journal
@@ -58,7 +49,6 @@ from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.processes import Processes
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.certifier import certified_objective
-from pneuopt.tuning.pareto import pareto_front
 from pneuopt.tuning.tune import tune
 
 if TYPE_CHECKING:
@@ -133,7 +123,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     breaks = table["case"][table["breaks"]] if study.tune else ()
     flags = tuple(Line(f"{case}: breaks with its neighbours, also searched from their gains") for case in breaks)
-    report = _lead(verdict, status) + report_cases(seen, written, metrics) + Report(flags)
+    report = lead_report(verdict, status) + report_cases(seen, written, metrics) + Report(flags)
     writers: Writers = {}
     if outputs.output is not None:
         text = _grid_csv(table, {n: parameters[n].unit for n in written}, task.loop)
@@ -238,101 +228,6 @@ def tune_cell(sources: Mapping[str, bytes], drive: Path, tuning: Path, parameter
     return metrics | {OBJECTIVE: certified_objective(task.specification, result)} | found
 
 
-def run_front(study: Study, outputs: Outputs, quiet: bool) -> int:
-    """Tune a loop along a front between two requirements; returns the exit status."""
-    task, parameters = read_fit_and_tuning(study.drive, study.tuning)
-    warn_of_status(study.tuning, "tuning")
-    front_spec = read_pareto(study, bound_units(task.loop))
-    first, second, until = _front_requirements(study, front_spec, task)
-    free = task.parameters.free_names
-    require(len(free) > 0, f"{study.tuning}: no gain is free; mark what to tune with free = true")
-    with progress("finding the front's ends", quiet=quiet) as report_progress:
-        front = pareto_front(
-            task.loop,
-            task.references,
-            parameters,
-            minimise=(first, second),
-            subject_to=[q for q in task.specification.limits if metric_name(q) != metric_name(second)],
-            scenarios=task.scenarios(parameters),
-            points=front_spec.points,
-            until=until,
-            max_steps=task.max_steps,
-            progress=report_progress,
-        )
-    front, known = _convert_to_percent(front, first, second), metric_units(task.loop)
-    pair, gains = (
-        {metric_name(q): known[metric_name(q)] for q in (first, second)},
-        {n: parameters[n].unit for n in front if n in free},
-    )
-    verdict, status = _front_verdict(front, pair)
-    report = _lead(verdict, status) + report_front(front, pair, gains)
-    writers: Writers = {}
-    if outputs.output is not None:
-        claimed = {f"claimed {n}": unit for n, unit in pair.items()}
-        units = {**pair, **claimed, "limit": pair[metric_name(second)], **gains, "solver_seconds": "s", "seconds": "s"}
-        writers[outputs.output] = partial(write_text, text=_to_csv(front, units))
-    hashes = file_hashes(study.path, study.drive, study.tuning)
-    tables = {"verdict": verdict, "designs": records(front), "units": {**pair, **gains}, "provenance": hashes}
-    stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_front, front, pair)
-    page = partial(front_page, study, report, drawn, pair)
-    finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
-    return status
-
-
-def _front_requirements(
-    study: Study, front_spec: Pareto, task: Tuning
-) -> tuple[Requirement, Requirement, float | None]:
-    """The two requirements, the second one bounded where the front begins, and its bound where the front ends."""
-    where = f"{study.path}: [pareto]"
-    given = {metric_name(q): q for q in (*task.specification.weights, *task.specification.limits)}
-    first, second = (_find_requirement(key, given, task, f"{where} between") for key in front_spec.between)
-    ends = {"lower": front_spec.lower, "upper": front_spec.upper}
-    begin, end = ("lower", "upper") if second.metric.sense is Sense.AT_LEAST else ("upper", "lower")
-    start, until = ends[begin], ends[end]
-    loosest = second if start is None else construct_at(lambda: with_user_limit(second, start), f"{where} {begin}")
-    if until is not None:
-        tightest = construct_at(lambda: with_user_limit(second, until), f"{where} {end}")
-        side, unit = "below" if end == "lower" else "above", bound_units(task.loop)[front_spec.between[1]]
-        ends_at, begins_at = (write_value(user_limit(q) or math.inf, unit) for q in (tightest, loosest))
-        message = f"{where} {end}, {ends_at}, is not {side} the {begins_at} that {study.tuning} allows under [limits]"
-        require(upper_limit(tightest) < upper_limit(loosest), message)
-    return first, loosest, until
-
-
-def _find_requirement(key: str, given: Mapping[str, Requirement], task: Tuning, where: str) -> Requirement:
-    """The requirement of the tuning, with its bound; else one without a bound."""
-    kind: Any = REQUIREMENTS_BY_KEY[key]
-    if kind.__name__ in given:
-        return given[kind.__name__]
-    require(kind is not StepEnvelope, f"{where}: the tuning has no bounds for step_envelope; add them under [limits]")
-    plain: Requirement = SettlingTime(task.specification.band) if kind is SettlingTime else kind()
-    return plain
-
-
-def _front_verdict(front: "pd.DataFrame", pair: Mapping[str, str]) -> tuple[str, int]:
-    """How many designs are not certified, and the exit status."""
-    interrupted = int((front["error"] == INTERRUPTED_CASE).sum())
-    failed = int((front["error"] != "").sum()) - interrupted
-    parts = [f"{count} {what}" for count, what in ((interrupted, "interrupted"), (failed, "not certified")) if count]
-    status = EXIT_INTERRUPTED if interrupted else EXIT_FAILURE if failed else EXIT_SUCCESS
-    one = " (one is best by both)" if len(front) == 1 and not parts else ""
-    what = f"{len(front)} design{'s' if len(front) > 1 else ''} between {' and '.join(pair)}"
-    return f"{what}: {', '.join(parts) or 'all certified'}{one}", status
-
-
-def _lead(verdict: str, status: int) -> Report:
-    """The verdict as a report."""
-    return Report((Line(verdict, Tone.BAD if status else Tone.GOOD),))
-
-
-def _convert_to_percent(front: "pd.DataFrame", first: Requirement, second: Requirement) -> "pd.DataFrame":
-    """The front with figures as the metrics are shown, overshoot in percent."""
-    factors = {c: q.metric.factor for q in (first, second) for c in (metric_name(q), f"claimed {metric_name(q)}")}
-    factors["limit"] = second.metric.factor
-    return front.assign(**{c: factor * front[c] for c, factor in factors.items() if factor != 1})
-
-
 def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
     """How many cases are certified, fail, never settle or break with their neighbours, and the exit status."""
     settling = table[[c for c in table if _metric_name(c) == "SettlingTime"]]
@@ -370,10 +265,4 @@ def _grid_csv(table: "pd.DataFrame", axes: Mapping[str, str], loop: ClosedLoop) 
     """As CSV, each column with its unit."""
     own = (loop.command.unit, loop.feedback.unit)
     known = {**axes, **{n: metric.shown_unit(*own) for n, metric in METRICS.items()}, "seconds": "s"}
-    return _to_csv(table, {str(c): known.get(_metric_name(c), "") for c in table})
-
-
-def _to_csv(table: "pd.DataFrame", units: Mapping[str, str]) -> str:
-    """As CSV, the units in the header."""
-    header = {n: f"{n} [{unit}]" for n, unit in units.items() if unit}
-    return str(table.rename(columns=header).to_csv(index=False, float_format="%.9g", lineterminator="\n"))
+    return format_csv(table, {str(c): known.get(_metric_name(c), "") for c in table})

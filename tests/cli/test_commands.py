@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from pneuopt.cli import study as study_module
+from pneuopt.cli import study_front
 from pneuopt.cli.app import app
 from pneuopt.cli.study import tune_cell
 from pneuopt.quantities.parameters import ParameterSet
@@ -94,7 +95,7 @@ def front(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     edit("tuning.toml", "[limits]", '[limits]\npeak_control = "120 N"')
     edit("tuning.toml", 'max = "1 s"', 'max = "250 ms"')
     (folder / "front.toml").write_text(FRONT, encoding="utf-8")
-    monkeypatch.setattr(study_module, "pareto_front", partial(pareto_front, method=Racing(8, 40)))
+    monkeypatch.setattr(study_front, "pareto_front", partial(pareto_front, method=Racing(8, 40)))
     return folder
 
 
@@ -328,7 +329,7 @@ def table(*errors: str) -> pd.DataFrame:
 def test_designs_that_fail_are_rows_of_a_front(
     front: Path, monkeypatch: pytest.MonkeyPatch, errors: tuple[str, ...], status: int, verdict: str
 ) -> None:
-    monkeypatch.setattr(study_module, "pareto_front", lambda *_, **__: table(*errors))
+    monkeypatch.setattr(study_front, "pareto_front", lambda *_, **__: table(*errors))
     result = run(FRONT_LINE)
     assert result.exit_code == status
     assert result.stdout.startswith(f"{len(errors)} designs between Overshoot and PeakControl: {verdict}\n")

@@ -1,0 +1,188 @@
+"""`Fleet`: the plants of a batch as rows of numbers, run in SIMD lanes, and the metrics read off their responses."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from math import nan
+from typing import Any
+
+import numpy as np
+
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reference import Step
+from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.evaluation.cases import TuningCase
+from pneuopt.evaluation.meter import needed_channels
+from pneuopt.quantities.arrays import Array, Indices, Mask
+from pneuopt.quantities.errors import PneuoptError, check_names
+from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.tuning.grids import reference_grids
+from pneuopt.tuning.readings import ReferenceGrid, has_integral, loop_pieces, read_metrics
+from pneuopt.tuning.responses import is_sound
+from pneuopt.tuning.space import MAX_LOOP_SUBSTEPS, dither_resolution_rate, fastest_eigenvalue, rk4_substeps
+
+MAX_PROBED = 64
+"""Plants, beside those with an extreme value, whose fastest mode is sought: fewer may miss a stiff one, on which RK4
+is then unstable; each more costs an eigenvalue problem a plant and state."""
+RATE_MARGIN = 1.2
+"""Factor on the fastest mode found [1]: the plants that are not probed may be faster by that much."""
+SAME_START = 1e-9
+"""Share of the states' nominal sizes [1] by which starts differ by rounding: at 0 each plant's is computed anew."""
+RAN_AWAY = "the response runs away"
+
+
+class Fleet:
+    """The plants of a batch as rows of numbers, and the grids on which they run."""
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        steps: Sequence[Step],
+        parameters: ParameterSet,
+        cases: Mapping[str, Mapping[str, float]],
+        metrics: Sequence[str],
+        band: float,
+    ) -> None:
+        self.loop, self.metrics, self.band = loop, tuple(metrics), band
+        self._full = loop.complete(parameters).select(loop.parameters)
+        self._order = {n: k for k, n in enumerate(self._full)}
+        self._cases, self.errors = list(cases.values()), [""] * len(cases)
+        self.varied = list(dict.fromkeys(n for values in self._cases for n in values))
+        check_names("parameter", self.varied, self._order, "cases")
+        self._places = [self._order[n] for n in self.varied]
+        self._nominal = np.array([p.value for p in self._full.values()])
+        self._values = np.array(
+            [[v.get(n, self._full.value(n)) for n in self.varied] for v in self._cases], dtype=float
+        )
+        self._check_values()
+        self._channels = needed_channels(metrics)
+        self._held: tuple[Any, ...] = ()
+        self._rollout = Rollout(loop_pieces(loop, self._channels))
+        fastest = {"dither.frequency": self._most("dither.frequency")} if "dither.frequency" in self.varied else {}
+        self._grids = reference_grids(loop, steps, self._full.with_values(fastest))
+        self._starts = [self._shared_start(grid.reference) for grid in self._grids]
+        rate = max(RATE_MARGIN * self._fastest_mode(), dither_resolution_rate(loop, self._full))
+        self._substeps = [rk4_substeps(rate, grid.spacing) for grid in self._grids]
+
+    def column(self, metric: str, grid: ReferenceGrid) -> str:
+        """Heading of a metric's column."""
+        return metric if len(self._grids) == 1 else f"{metric}[{grid.reference.label}]"
+
+    def empty_columns(self) -> dict[str, Array]:
+        """The metrics' columns, NaN."""
+        return {self.column(n, g): np.full(len(self._cases), nan) for g in self._grids for n in self.metrics}
+
+    def varied_columns(self) -> dict[str, Array]:
+        """The parameters in which the plants differ."""
+        return {n: self._values[:, k] for k, n in enumerate(self.varied)}
+
+    def measure(self, rows: Indices, columns: Mapping[str, Array]) -> None:
+        """Run some plants on every reference and fill their rows of the columns."""
+        for grid, start, substeps in zip(self._grids, self._starts, self._substeps, strict=True):
+            own, x0 = self._start_states(rows, grid.reference, start)
+            if not len(own):
+                continue
+            p, y, sound = self._run(own, x0, grid, substeps)
+            if not sound.all() and 2 * substeps <= MAX_LOOP_SUBSTEPS:  # RK4 may be what runs away
+                again = ~sound
+                _, y[again], sound[again] = self._run(own[again], x0[again], grid, 2 * substeps)
+            for k in own[~sound].tolist():
+                self.errors[k] = self.errors[k] or f"{RAN_AWAY} in the lanes"
+            for period, some in self._by_dither_period(p, sound):
+                seen = np.moveaxis(np.ascontiguousarray(np.moveaxis(y[some], 2, 0)), 0, 2)
+                read = read_metrics(grid, seen, (self.band,), period, self.metrics, (), self._channels)
+                for n, value in read.items():
+                    columns[self.column(n, grid)][own[some]] = value
+
+    def _run(self, own: Indices, x0: Array, grid: ReferenceGrid, substeps: int) -> tuple[Array, Array, Mask]:
+        """Parameters and outputs of plants, and which of them do not run away."""
+        p = np.tile(self._nominal, (len(own), 1))
+        p[:, self._places] = self._values[own]
+        if self._held[:2] != (
+            grid,
+            len(own),
+        ):  # most chunks are alike; a copy for each would take a quarter of its time
+            shown = (np.tile(a, (len(own), *[1] * a.ndim)) for a in grid.pad(len(grid.t)))
+            self._held = (grid, len(own), *shown)
+        u, t, h = self._held[2:]
+        with np.errstate(all="ignore"):
+            found = self._rollout.run(x0, u, p, t, h, substeps=substeps)
+        return p, found.y, is_sound(found.y, found.x_end)
+
+    def _by_dither_period(self, p: Array, sound: Mask) -> Iterator[tuple[float | None, Indices]]:
+        """The time over which a plant's signal is averaged [s], None without dither, and the rows that it is for."""
+        rates, dither = np.zeros(len(p)), self.loop.dither
+        if dither is not None:
+            amplitude, frequency = (p[:, self._order[f"dither.{n}"]] for n in ("amplitude", "frequency"))
+            rates = np.where(amplitude == 0, 0.0, frequency)
+        for rate in np.unique(rates[sound]).tolist():
+            period = dither.period(rate, self.loop.pid.sample_time) if dither is not None and rate else None
+            yield period, np.flatnonzero(sound & (rates == rate))
+
+    def _start_states(self, rows: Indices, step: Step, shared: Array | None) -> tuple[Indices, Array]:
+        """The plants that can begin, and their states before the step; the others get their reason."""
+        good, states = list[int](), list[Array]()
+        for k in rows.tolist():
+            if self.errors[k]:
+                continue
+            try:
+                states.append(shared if shared is not None else self._start(self._cases[k], step))
+                good.append(k)
+            except PneuoptError as error:
+                self.errors[k] = str(error)
+        found = np.reshape(states, (len(good), len(self.loop.states)))
+        return np.array(good, dtype=np.intp), np.pad(found, ((0, 0), (0, int(has_integral(self.loop)))))
+
+    def _start(self, values: Mapping[str, float], step: Step) -> Array:
+        return TuningCase(step, "", values).initial(self.loop, self._full)
+
+    def _shared_start(self, step: Step) -> Array | None:
+        """The state before the step, if it is the same on every plant, as far as probes tell; None: each has its own.
+
+        It takes a millisecond, which is longer than a plant's response in the lanes. The probes are the plants with the
+        least and the greatest value of each parameter, and the first.
+        """
+        try:
+            states = [self._start(self._cases[k], step) for k in self._extremes()]
+        except PneuoptError:
+            return None
+        room = SAME_START * np.array([q.nominal for q in self.loop.states])
+        return states[0] if states and all(np.all(np.abs(states[0] - x) <= room) for x in states) else None
+
+    def _extremes(self) -> list[int]:
+        """Plants with the least and the greatest value of each parameter, and the first sound one."""
+        good = np.flatnonzero([not e for e in self.errors])
+        values = self._values[good]
+        ends = [*values.argmin(axis=0).tolist(), *values.argmax(axis=0).tolist()] if len(good) else []
+        return [int(good[k]) for k in sorted({0, *ends})] if len(good) else []
+
+    def _fastest_mode(self) -> float:
+        """The rate of the fastest mode of the probed plants along the nominal plant's responses [1/s]."""
+        good = np.flatnonzero([not e for e in self.errors])
+        spread = good[np.unique(np.linspace(0, len(good) - 1, MAX_PROBED).astype(int))] if len(good) else good
+        probed = np.unique([*self._extremes(), *spread.tolist()]).astype(int)
+        p = np.tile(self._nominal, (len(probed) + 1, 1))
+        p[1:, self._places] = self._values[probed]
+        return float(fastest_eigenvalue(self.loop, p, [x for grid in self._grids for x in self._along(grid)]).max())
+
+    def _along(self, grid: ReferenceGrid) -> list[Array]:
+        """States along the nominal plant's response, its start first."""
+        start = self._start({}, grid.reference)
+        x0 = np.pad(start, (0, int(has_integral(self.loop))))[None]
+        u, t, h = (a[None] for a in grid.pad(len(grid.t)))
+        every = max(1, len(grid.t) // 10)
+        found = self._rollout.run(x0, u, self._nominal, t, h, substeps=MAX_LOOP_SUBSTEPS // 4, states=every).x
+        assert found is not None
+        rows = np.vstack([start, found[0][:, : len(start)]])
+        return list(rows[np.isfinite(rows).all(axis=1)])
+
+    def _check_values(self) -> None:
+        """Give each plant with a value that is no number, or out of bounds, its reason."""
+        for k, n in enumerate(self.varied):
+            p, column = self._full[n], self._values[:, k]
+            bad = ~((column >= p.lower) & (column <= p.upper) & np.isfinite(column))
+            for row in np.flatnonzero(bad).tolist():
+                said = f"{n} is {column[row]:g} {p.unit}, outside [{p.lower:g}, {p.upper:g}]"
+                self.errors[row] = self.errors[row] or said
+
+    def _most(self, name: str) -> float:
+        values = self._values[:, self.varied.index(name)]
+        return float(np.max(values, where=np.isfinite(values), initial=self._full.value(name)))
