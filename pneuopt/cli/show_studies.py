@@ -47,6 +47,26 @@ def report_cases(table: "pd.DataFrame", axes: Mapping[str, str], metrics: Mappin
     return Report((Table(tuple(map(Column, heads)), tuple(rows)), *map(Line, lines)))
 
 
+def report_checks(checks: "pd.DataFrame") -> Report:
+    """The certified cases of a batch: the largest difference a metric, and the cases in which lanes are refuted.
+
+    Parameters
+    ----------
+    checks : DataFrame
+        Of a `BatchEvaluation`.
+    """
+    rows = [(str(m), format_number(float(own["difference"].max()), 2)) for m, own in checks.groupby("metric")]
+    lines = [
+        Line(f"{row['case']}: {row['metric']} is {row['batch']:.6g} in the lanes, {row['certified']:.6g} certified")
+        for row in checks[~checks["agrees"]].head(MAX_FAILURE_REASONS).to_dict(orient="records")
+    ]
+    table = (
+        (Table((Column("metric"), Column("largest difference\nfrom the certificate")), tuple(rows)),) if rows else ()
+    )
+    left = "margins, stick-slip events and what comes after the horizon are not in the lanes: leave out batch for them"
+    return Report((*table, *lines, Line(left)))
+
+
 def report_front(table: "pd.DataFrame", requirements: Mapping[str, str], gains: Mapping[str, str]) -> Report:
     """A front, a row a design, of those that are not certified the limit; then the reasons.
 

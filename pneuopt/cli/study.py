@@ -19,7 +19,7 @@ from pneuopt.cli.shared import (
     warn,
     warn_of_status,
 )
-from pneuopt.cli.show_studies import format_csv, lead_report, report_cases
+from pneuopt.cli.show_studies import format_csv, lead_report, report_cases, report_checks
 from pneuopt.cli.study_front import run_front
 from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page
 from pneuopt.cli.terminal import progress
@@ -32,7 +32,7 @@ from pneuopt.evaluation.requirements import (
 )
 from pneuopt.files.drive import read_drive
 from pneuopt.files.study import Study, SweptAxis, read_axes, read_study, swept_axes
-from pneuopt.files.study_cases import read_study_cases
+from pneuopt.files.study_cases import Cases, read_study_cases
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.plotting import plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
@@ -41,6 +41,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.source import read_once
 from pneuopt.quantities.status import Code, Status
+from pneuopt.studies.batch import LANE_METRICS, evaluate_batch
 from pneuopt.studies.cases import grid
 from pneuopt.studies.cluster import open_executor
 from pneuopt.studies.journal import Journal
@@ -111,24 +112,23 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     (cases, axes), units = _read_cases(study, parameters), metric_units(task.loop)
     check_names("metric", study.show, units, f"{file}: [metrics] show")
     with _keep_cases(study, outputs, len(cases), computing.resume) as journal, computing.open() as executor:
-        if study.tune:
-            table = _tune_cells(study, task, parameters, axes, quiet, journal, executor)
-        else:
-            band = study.band or task.specification.band
-            certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
-            with progress("certifying", quiet=quiet) as report_progress:
-                table = sweep(certify, parameters, cases, executor=executor, progress=report_progress, journal=journal)
+        table, checks = _compute_cases(study, task, parameters, (cases, axes), quiet, journal, executor)
     verdict, status = _grid_verdict(table, len(task.references))
+    if checks is not None:
+        verdict, status = _batch_verdict(checks, verdict, status)
     seen = _worst_of_references(table, axes, study.show)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     breaks = table["case"][table["breaks"]] if study.tune else ()
     flags = tuple(Line(f"{case}: breaks with its neighbours, also searched from their gains") for case in breaks)
     report = lead_report(verdict, status) + report_cases(seen, written, metrics) + Report(flags)
+    if checks is not None:
+        report += report_checks(checks)
     writers: Writers = {}
     if outputs.output is not None:
         text = _grid_csv(table, {n: parameters[n].unit for n in written}, task.loop)
         writers[outputs.output] = partial(write_text, text=text)
     tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
+    tables |= {} if checks is None else {"checks": records(checks)}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
     drawn = partial(plot_map, seen, written, metrics)
     page = partial(case_page, study, report, drawn, written, metrics)
@@ -138,7 +138,44 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     return status
 
 
-def _read_cases(study: Study, parameters: ParameterSet) -> tuple[dict[str, dict[str, float]], tuple[SweptAxis, ...]]:
+def _compute_cases(
+    study: Study,
+    task: Tuning,
+    parameters: ParameterSet,
+    given: tuple[Cases, Sequence[SweptAxis]],
+    quiet: bool,
+    journal: Journal | None,
+    executor: Executor | Processes,
+) -> "tuple[pd.DataFrame, pd.DataFrame | None]":
+    """A row a case; and of a batch the certificates of some of them."""
+    cases, axes = given
+    if study.tune:
+        return _tune_cells(study, task, parameters, axes, quiet, journal, executor), None
+    band = study.band or task.specification.band
+    if study.batch:
+        left = [n for n in study.show if n not in LANE_METRICS]
+        remedy = "leave it out, or leave out [study] batch"
+        require(not left, f"{study.path}: [metrics] show: {', '.join(left)} is not read off responses; {remedy}")
+        with progress("running", quiet=quiet) as report_progress:
+            found = evaluate_batch(
+                task.loop,
+                task.references,
+                parameters,
+                cases,
+                metrics=study.show,
+                band=band,
+                executor=executor,
+                progress=report_progress,
+                journal=journal,
+            )
+        return found.table, found.checks
+    certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
+    with progress("certifying", quiet=quiet) as report_progress:
+        table = sweep(certify, parameters, cases, executor=executor, progress=report_progress, journal=journal)
+    return table, None
+
+
+def _read_cases(study: Study, parameters: ParameterSet) -> tuple[Cases, tuple[SweptAxis, ...]]:
     """The cases of a study, and the parameters in which they differ."""
     if study.cases:
         cases = read_study_cases(study, parameters)
@@ -242,6 +279,13 @@ def _grid_verdict(table: "pd.DataFrame", references: int) -> tuple[str, int]:
     status = EXIT_INTERRUPTED if counts["interrupted"] else EXIT_FAILURE if parts else EXIT_SUCCESS
     each = f", each the worst of {references} references" if references > 1 else ""
     return f"{len(table)} cases{each}: {', '.join(parts) or 'all settle'}", status
+
+
+def _batch_verdict(checks: "pd.DataFrame", verdict: str, status: int) -> tuple[str, int]:
+    """The verdict on a grid with how many of its cases are certified; where lanes are refuted, that is a failure."""
+    differ, certified = checks["case"][~checks["agrees"]].nunique(), checks["case"].nunique()
+    said = f"{differ} of {certified} certified differ from the lanes" if differ else f"{certified} certified, all agree"
+    return f"{verdict}; {said}", max(status, EXIT_FAILURE) if differ else status
 
 
 def _worst_of_references(table: "pd.DataFrame", axes: Sequence[SweptAxis], metrics: Sequence[str]) -> "pd.DataFrame":

@@ -35,6 +35,7 @@ STUDY_KEYS: Mapping[str, Key] = {
             "drive": Key("a drive.toml or a fit.toml", Takes.TEXT, required=True, example='"fit.toml"'),
             "tuning": Key("a tuning.toml or a tuned.toml", Takes.TEXT, required=True, example='"tuned.toml"'),
             "tune": flag("whether each cell of a grid is tuned, from its neighbours' gains"),
+            "batch": flag("whether cases run many at once in SIMD lanes, and only the worst and a share are certified"),
         },
         required=True,
     ),
@@ -88,6 +89,9 @@ class Study:
         A front is asked for in place of a grid: as written; `read_pareto` reads it.
     tune : bool
         Whether each cell of the grid is tuned, from the gains of its neighbours, and not only certified.
+    batch : bool
+        Whether the cases run many at once in SIMD lanes (`evaluate_batch`), and only the worst and a share are
+        certified.
     """
 
     path: Path
@@ -99,6 +103,7 @@ class Study:
     pareto: Mapping[str, Any] | None = None
     tune: bool = False
     cases: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    batch: bool = False
 
 
 @dataclass(frozen=True)
@@ -179,14 +184,26 @@ def read_study(path: str | Path) -> Study:
     require(len(chosen) == 1, f"{path}: [{'], ['.join(chosen)}]: a study has cases of one kind; leave one of them out")
     band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
     require(band is None or 0 < band < 1, f'{path}: [metrics] band is a fraction of the step, "2 %" say, not {band}')
-    given, known = sections.get("study", {}), STUDY_KEYS["study"].keys
+    given = sections.get("study", {})
     drive, tuning = (_file_path(given, key, path) for key in ("drive", "tuning"))
-    tune = given.get("tune", known["tune"].usual)
-    require(isinstance(tune, bool), f"{path}: [study] tune must be true or false, got {tune!r}")
+    tune, batch = (_read_flag(given, key, path) for key in ("tune", "batch"))
+    require(not (tune and batch), f"{path}: [study] a batch is of one design: leave out tune or batch")
+    require(not (batch and "pareto" in sections), f"{path}: [study] batch is of cases; a front is tuned: leave it out")
     require(not (tune and "pareto" in sections), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
     require(not (tune and cases), f"{path}: [study] tune needs a grid, whose cells have neighbours: write [axes]")
     require(not (tune and band), f"{path}: [metrics] band would not be the one tuned for; state it in {tuning.name}")
-    return Study(path, drive, tuning, axes, band, _metric_names(metrics, path), sections.get("pareto"), tune, cases)
+    return Study(
+        path,
+        drive,
+        tuning,
+        axes,
+        band,
+        _metric_names(metrics, path),
+        sections.get("pareto"),
+        tune,
+        cases,
+        batch,
+    )
 
 
 def read_axes(study: Study, parameters: ParameterSet) -> tuple[SweptAxis, ...]:
@@ -305,6 +322,12 @@ def _metric_names(metrics: Mapping[str, Any], path: Path) -> tuple[str, ...]:
     good = isinstance(show, list) and len(show) > 0 and all(isinstance(name, str) for name in show)
     require(good, f'{path}: [metrics] show must be a list of names, ["SettlingTime", "Overshoot"], got {show!r}')
     return tuple(dict.fromkeys(show))
+
+
+def _read_flag(given: Mapping[str, Any], key: str, path: Path) -> bool:
+    value = given.get(key, STUDY_KEYS["study"].keys[key].usual)
+    require(isinstance(value, bool), f"{path}: [study] {key} must be true or false, got {value!r}")
+    return bool(value)
 
 
 def _file_path(given: Mapping[str, Any], key: str, path: Path) -> Path:

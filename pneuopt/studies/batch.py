@@ -8,6 +8,7 @@ on which a metric is worst, and on a share of all that is drawn at random.
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from math import ceil, inf, nan
@@ -24,12 +25,15 @@ from pneuopt.evaluation.meter import check_channels
 from pneuopt.evaluation.metric import Source
 from pneuopt.evaluation.requirements import METRICS, larger_is_better
 from pneuopt.quantities.arguments import check_parameters
+from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.progress import Progress, ProgressReporter
 from pneuopt.quantities.report import Line, Report, Table, Tone, format_number, number_columns, text_columns
 from pneuopt.quantities.shown import Shown
 from pneuopt.studies.fleet import Fleet
+from pneuopt.studies.journal import CaseMarks, Journal
+from pneuopt.studies.outcome import INTERRUPTED_CASE, Outcome
 from pneuopt.studies.processes import Processes
 from pneuopt.studies.sweep import sweep
 
@@ -37,11 +41,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 BATCH_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl")
+LANE_METRICS = tuple(n for n, m in METRICS.items() if m.source is not Source.LINEAR_LOOP and n != "StepEnvelope")
+"""The metrics that lanes can tell: those of the response, the command and the meter."""
 CHUNK = 64
 """Plants that are run and read at a time: fewer leave cores idle; the responses of more do not fit a cache."""
 USUAL_TOLERANCE = 0.01
 """Share of a metric, or of its median over the plants, by which lanes and certificate may differ: a search claims no
 figure that differs by more."""
+
+CERTIFIED = "certified "  # before a plant's name where a journal keeps its certificate, beside its metrics in lanes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -101,6 +109,7 @@ def evaluate_batch(
     chunk: int = CHUNK,
     executor: Executor | Processes | None = None,
     progress: Callable[[Progress], None] | None = None,
+    journal: Journal | None = None,
 ) -> BatchEvaluation:
     """Evaluate a fixed design on many plants at once, and certify the worst of them and a random share.
 
@@ -128,6 +137,9 @@ def evaluate_batch(
         Where the chosen plants are certified, as for `sweep`; the lanes run on all cores of this machine.
     progress : callable, optional
         Called with a `Progress` after each chunk.
+    journal : Journal, optional
+        Keeps each plant's metrics, and each certificate, on the disk as they come, as for `sweep`. Ctrl-C leaves the
+        plants without metrics that were not reached, and certifies none.
 
     Returns
     -------
@@ -160,14 +172,60 @@ def evaluate_batch(
     cases = {str(name): values for name, values in cases.items()}
     fleet = Fleet(add_disturbances(loop, steps), steps, parameters, cases, chosen, band)
     columns, report = fleet.empty_columns(), ProgressReporter(progress, "batch")
-    for begin in range(0, len(cases), chunk):
-        rows = np.arange(begin, min(begin + chunk, len(cases)))
-        fleet.measure(rows, columns)
-        report(f"{rows[-1] + 1} of {len(cases)} plants", int(rows[-1]) + 1, len(cases))
+    memory = _Memory(journal, parameters, cases, columns)
+    with suppress(KeyboardInterrupt):
+        for begin in range(0, len(memory.missing), chunk):
+            rows = memory.missing[begin : begin + chunk]
+            fleet.measure(rows, columns)
+            memory.keep(rows, fleet.errors)
+            done = memory.done
+            report(f"{done} of {len(cases)} plants", done, len(cases))
+    for row in memory.missing[memory.kept :].tolist():
+        fleet.errors[row] = fleet.errors[row] or INTERRUPTED_CASE
     table = WideFrame({"case": list(cases), **fleet.varied_columns(), **columns, "error": fleet.errors})
-    picked = _pick_cases(table, list(columns), recertify, seed)
-    checks = _certify(loop, steps, parameters, {n: cases[n] for n in picked}, table, (band, tolerance), executor)
+    picked = _pick_cases(table, list(columns), recertify, seed) if memory.done == len(cases) else []
+    compute = partial(sweep, executor=executor, journal=journal)
+    checks = _certify(loop, steps, parameters, {n: cases[n] for n in picked}, table, (band, tolerance), compute)
     return BatchEvaluation(table, checks)
+
+
+class _Memory:
+    """What a journal knows of the plants, and which are still to be run."""
+
+    def __init__(
+        self,
+        journal: Journal | None,
+        parameters: ParameterSet,
+        cases: Mapping[str, Mapping[str, float]],
+        columns: Mapping[str, Array],
+    ) -> None:
+        self._journal, self._marks, self._columns = journal, CaseMarks(parameters), columns
+        self._cases, self.kept = list(cases.items()), 0
+        self.missing = np.array([k for k in range(len(cases)) if not self._recall(k)], dtype=np.intp)
+
+    @property
+    def done(self) -> int:
+        """How many plants have been run, now or before."""
+        return len(self._cases) - len(self.missing) + self.kept
+
+    def keep(self, rows: Indices, errors: Sequence[str]) -> None:
+        """Keep the metrics of the next missing plants."""
+        self.kept += len(rows)
+        for k in rows.tolist() if self._journal is not None else ():
+            name, values = self._cases[k]
+            results = {n: float(column[k]) for n, column in self._columns.items()}
+            assert self._journal is not None
+            self._journal.add(name, self._marks.of(values), Outcome(results, error=errors[k]))
+
+    def _recall(self, k: int) -> bool:
+        """Fill a row of the columns, if the journal has all of it."""
+        name, values = self._cases[k]
+        found = self._journal.find(name, self._marks.of(values)) if self._journal is not None else None
+        if found is None or not self._columns.keys() <= found.results.keys():
+            return False
+        for n, column in self._columns.items():
+            column[k] = found.results[n]
+        return True
 
 
 def _check_batch(
@@ -178,10 +236,9 @@ def _check_batch(
     require(len(cases) > 0, "a batch needs a case")
     require(0 <= recertify <= 1, f"recertify is a share of the plants between 0 and 1, got {recertify:g}; 0.01 is 1 %")
     require(chunk >= 1, f"chunk must be at least 1, got {chunk}")
-    known = [n for n, m in METRICS.items() if m.source is not Source.LINEAR_LOOP and n != "StepEnvelope"]
-    left = [n for n in metrics if n in METRICS and n not in known]
+    left = [n for n in metrics if n in METRICS and n not in LANE_METRICS]
     require(not left, f"{', '.join(left)}: not read off the lanes' responses; sweep `evaluate` for it")
-    check_names("metric", metrics, known, "metrics")
+    check_names("metric", metrics, LANE_METRICS, "metrics")
     check_channels(loop.plant, metrics)
 
 
@@ -205,7 +262,7 @@ def _certify(
     cases: Mapping[str, Mapping[str, float]],
     table: "pd.DataFrame",
     limits: tuple[float, float],
-    executor: Executor | Processes | None,
+    compute: "Callable[..., pd.DataFrame]",
 ) -> "pd.DataFrame":
     """Hold the lanes' figures of some cases to the independent simulation's."""
     import pandas as pd
@@ -215,7 +272,8 @@ def _certify(
     rows = []
     if cases:
         run = partial(evaluate, loop, steps, band=band)
-        found = sweep(run, parameters, cases, executor=executor)
+        found = compute(run, parameters, {f"{CERTIFIED}{name}": values for name, values in cases.items()})
+        found["case"] = list(cases)
         own, lanes = (t[t["case"].isin(list(cases))].set_index("case").to_dict("index") for t in (found, table))
         typical = {str(c): abs(float(table[c].median())) for c in columns}
         for case, c in ((case, c) for case in cases for c in typical):

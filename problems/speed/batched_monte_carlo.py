@@ -29,7 +29,7 @@ from pneuopt.dynamics.compiled.functions import compile_rate
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD
-from pneuopt.studies.batch import RATE_MARGIN
+from pneuopt.studies.fleet import RATE_MARGIN
 from pneuopt.tuning.readings import loop_pieces
 from pneuopt.tuning.space import fastest_eigenvalue, rk4_substeps
 from problems.shared.arrays import Array

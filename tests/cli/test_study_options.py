@@ -1,16 +1,19 @@
 """How `pneuopt study` computes its cases, and which it takes."""
 
+import json
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from pneuopt.cli import study as study_module
+from pneuopt.studies.batch import evaluate_batch
 from pneuopt.studies.sweep import sweep
-from tests.cli.test_commands import DRIVE, STUDY, TUNING, in_threads, run
+from tests.cli.test_commands import DRIVE, STUDY, TUNING, edit, in_threads, run
 
 
 @pytest.fixture
@@ -61,6 +64,27 @@ def test_samples_are_certified_and_shown(folder: Path) -> None:
     assert "--plot draws a grid of one or two [axes]" in " ".join(
         run("study study.toml -q --plot map.png").stderr.split()
     )
+
+
+def test_a_batch_is_run_in_lanes_and_the_worst_of_it_are_certified(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run("study study.toml -q -o alone.csv")
+    text = Path("study.toml").read_text("utf-8")
+    Path("study.toml").write_text(text.replace("[study]", "[study]\nbatch = true"), encoding="utf-8")
+    monkeypatch.setattr(study_module, "evaluate_batch", in_threads(evaluate_batch, ThreadPoolExecutor(1)))
+    result = run("study study.toml -q -o batch.csv --json batch.json")
+    assert result.exit_code == 0, result.stdout
+    assert result.stdout.splitlines()[0].endswith("certified, all agree")
+    assert "largest difference" in result.stdout
+    alone, batch = (pd.read_csv(f"{name}.csv") for name in ("alone", "batch"))
+    shown = [c for c in map(str, batch) if "Overshoot" in c or "SettlingTime" in c]
+    assert len(shown) == 4
+    np.testing.assert_allclose(batch[shown], alone[shown], rtol=1e-2, atol=1e-3)
+    assert {row["agrees"] for row in json.loads(Path("batch.json").read_text("utf-8"))["checks"]} == {True}
+    edit("study.toml", "[axes]", '[metrics]\nshow = ["MaxSensitivity"]\n[axes]')
+    refused = " ".join(run("study study.toml -q").stderr.split())
+    assert "MaxSensitivity is not read off responses; leave it out, or leave out [study] batch" in refused
 
 
 def test_processes_do_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

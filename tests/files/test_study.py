@@ -154,9 +154,19 @@ def test_a_study_may_tune_each_cell_of_a_grid(file: Path) -> None:
     assert read_study(file).tune
 
 
+def test_a_study_may_run_its_cases_as_a_batch(file: Path) -> None:
+    file.write_text(STUDY, encoding="utf-8")
+    assert not read_study(file).batch
+    file.write_text(STUDY.replace("[axes]", "batch = true\n[axes]"), encoding="utf-8")
+    assert read_study(file).batch
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
+        (STUDY.replace("[axes]", 'batch = "yes"\n[axes]'), "batch must be true or false, got 'yes'"),
+        (STUDY.replace("[axes]", "batch = true\ntune = true\n[axes]"), "a batch is of one design"),
+        (FRONT.replace("[pareto]", "batch = true\n[pareto]"), "batch is of cases; a front is tuned"),
         (STUDY.replace("[axes]", 'tune = "yes"\n[axes]'), "tune must be true or false, got 'yes'"),
         (FRONT.replace("[pareto]", "tune = true\n[pareto]"), "tune belongs to a grid; a front is tuned anyway"),
         (STUDY.replace("[axes]", "tune = true\n[axes]") + '[metrics]\nband = "5 %"\n', "state it in tuned.toml"),
