@@ -8,7 +8,7 @@ BIN := .venv/bin
 endif
 PY := $(BIN)/python
 
-.PHONY: demo test coverage test-slow lint format clean
+.PHONY: demo test coverage test-slow lint docs format clean
 
 demo: .venv/installed
 	$(PY) problems/demo/rig_demo.py --out out
@@ -27,6 +27,12 @@ lint: .venv/installed
 	$(PY) -m ruff check .
 	$(PY) -m mypy
 	$(BIN)/lint-imports
+
+docs: .venv/installed
+	$(PY) -m pip install --quiet --disable-pip-version-check --group docs
+	$(PY) .docs/make_pages.py build/pages
+	$(PY) -m sphinx --quiet --fail-on-warning --keep-going -c .docs build/pages build/docs
+	$(PY) .docs/check_links.py build/docs
 
 format: .venv/installed
 	$(PY) -m ruff format .

@@ -1,0 +1,241 @@
+"""Write the site's pages from what stands elsewhere: README, CONTRIBUTING, docstrings, scripts, the commands' help.
+
+    python .docs/make_pages.py FOLDER
+
+Two pages are written by hand and copied: theory.md and validated.md. A source's link to what is no page of the site
+ends this, so that nothing is moved without its readers.
+"""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pneuopt
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+PAGES = {  # of the site, for the files that the sources link to
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "data/README.md": "data.md",
+    "problems/paper/README.md": "paper.md",
+}
+SECTIONS = {  # pages of README's sections
+    "tutorial.md": ("Your own rig", "# Tutorial: your own rig"),
+    "jobs.md": ("The three jobs", "# How to: the three jobs"),
+    "concepts.md": ("Concept map", "# Concepts"),
+    "keys.md": ("Appendix: the keys of the files", "# Keys of the files"),
+    "changelog.md": ("Changelog", "# Changelog"),
+}
+ROOMS = {  # whose public names have a page, in the order in which data go through them
+    "logs": "Logs",
+    "models": "Plants and friction",
+    "identification": "Identification",
+    "control": "The loop",
+    "evaluation": "Requirements and certificates",
+    "tuning": "Tuning",
+    "studies": "Studies",
+    "dynamics": "Systems and their simulation",
+    "shooting": "Multiple shooting",
+    "files": "Files",
+    "plotting": "Figures",
+    "report": "Reports",
+    "export": "Exports",
+    "quantities": "Numbers, trajectories, errors",
+}
+CONTENTS = {  # the site's pages by what a reader comes for
+    "Learn": ["tutorial", "jobs", "concepts", "theory", "validated"],
+    "Look up": ["commands", "keys", "api/index"],
+    "Results": ["gallery", "paper", "data"],
+    "Project": ["contributing", "changelog"],
+}
+FOLDER = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "build" / "pages"
+
+
+def write(page: str, text: str) -> None:
+    """A page of the site."""
+    path = FOLDER / page
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def section(title: str) -> str:
+    """The text below a heading of README."""
+    found = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", README, re.DOTALL | re.MULTILINE)
+    assert found is not None, f"README has no section {title!r}"
+    return found[1]
+
+
+def localise(text: str, folder: str, page: str) -> str:
+    """A source's text with its links turned into the site's; figures are copied into it."""
+
+    def turn(found: re.Match[str]) -> str:
+        label, target = found[1], found[2]
+        if target.startswith(("http:", "https:")):
+            return found[0]
+        path, _, anchor = target.partition("#")
+        if not path:
+            return f"[{label}]({home_of(anchor, page)})"
+        file = (ROOT / folder / path).resolve().relative_to(ROOT).as_posix()
+        if file.endswith(".png"):
+            copy_figure(file)
+            return f"[{label}](figures/{Path(file).name})"
+        assert file in PAGES, f"{folder or 'README'}: a link to {target}, of which the site has no page"
+        return f"[{label}]({home_of(anchor, PAGES[file]) if anchor else PAGES[file]})"
+
+    return link_names(re.sub(r"(?<=\[)([^\]]*)\]\(([^)\s]+)\)", lambda m: turn(m)[1:], text))
+
+
+def link_names(text: str) -> str:
+    """Public names between backticks become links to their pages; code stays as it is."""
+    is_code, lines = False, list[str]()
+    for line in text.splitlines():
+        is_code ^= line.startswith("```")
+        is_text = not (is_code or line.startswith(("    ", "```")))
+        lines.append(re.sub(r"`(po\.)?(\w+)`", lambda m: link_to(m[2], m[0]), line) if is_text else line)
+    return "\n".join(lines)
+
+
+def link_to(name: str, text: str) -> str:
+    """The link to a public name's page; the text itself where it is none."""
+    is_public = not name.startswith("_") and name in pneuopt.__all__
+    return f"{{py:obj}}`{name} <pneuopt.{name}>`" if is_public else text
+
+
+def home_of(anchor: str, page: str) -> str:
+    """The page of README's section with an anchor, or the anchor on the page itself."""
+    for name, (title, _) in SECTIONS.items():
+        if re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") == anchor:
+            return name
+    return f"#{anchor}" if page not in SECTIONS else f"{page}#{anchor}"
+
+
+def copy_figure(file: str) -> None:
+    """A figure of the checkout, into the site."""
+    (FOLDER / "figures").mkdir(parents=True, exist_ok=True)
+    shutil.copy(ROOT / file, FOLDER / "figures")
+
+
+def public_names() -> dict[str, list[str]]:
+    """The package's public names by the room in which they are written; the .pyi is what lazy_loader reads."""
+    rooms = defaultdict(list)
+    tree = ast.parse((ROOT / "pneuopt" / "__init__.pyi").read_text("utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            rooms[node.module.split(".")[0]] += [alias.asname or alias.name for alias in node.names]
+    return {room: sorted(names, key=str.lower) for room, names in rooms.items()}
+
+
+def write_api() -> None:
+    """A page a room, with its public names, and one that lists them."""
+    names = public_names()
+    assert set(names) <= set(ROOMS), f"rooms without a title: {set(names) - set(ROOMS)}"
+    index = ["# Python", "", "`import pneuopt as po` has every public name; a module's path is private.", ""]
+    pages = [room for room in ROOMS if room in names]
+    for room in pages:
+        docstring = ast.get_docstring(ast.parse((ROOT / "pneuopt" / room / "__init__.py").read_text("utf-8"))) or ""
+        parts = [f"# {ROOMS[room]}", "", docstring.partition("\n\n")[0], ""]
+        for name in names[room]:
+            parts += ["```{eval-rst}", *describe(name), "```", ""]
+        write(f"api/{room}.md", "\n".join(parts))
+        links = ", ".join(f"{{py:obj}}`{name} <pneuopt.{name}>`" for name in names[room])
+        index += [f"## [{ROOMS[room]}]({room}.md)", "", links, ""]
+    write("api/index.md", "\n".join([*index, *table_of_contents("", pages, hidden=True)]))
+
+
+def describe(name: str) -> list[str]:
+    """The directive that describes a public name: a class with its members, a function, a module, or a value."""
+    value = getattr(pneuopt, name)
+    if isinstance(value, type):
+        return [f".. autoclass:: pneuopt.{name}", "   :members:"]
+    if isinstance(value, ModuleType):
+        return [f".. automodule:: pneuopt.{name}"]
+    return [f".. autofunction:: pneuopt.{name}" if callable(value) else f".. autodata:: pneuopt.{name}"]
+
+
+def table_of_contents(caption: str, pages: list[str], *, hidden: bool) -> list[str]:
+    """The directive that puts pages into the navigation."""
+    options = [f":caption: {caption}"] * bool(caption) + [":hidden:"] * hidden + [":maxdepth: 1"]
+    return ["```{toctree}", *options, "", *pages, "```", ""]
+
+
+def write_commands() -> None:
+    """What each command says of itself, at 80 columns."""
+    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1", "TERM": "dumb"}
+
+    def ask(*words: str) -> str:
+        command = [sys.executable, "-m", "pneuopt", *words, "--help"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment, cwd=ROOT)
+        return done.stdout.replace("python -m pneuopt", "pneuopt").strip()
+
+    first = ask()
+    names = re.findall(r"^  ([a-z][a-z-]+) {2,}\S", first.partition("Commands:")[2], re.MULTILINE)
+    assert len(names) > 5, f"no commands in {first!r}"
+    parts = ["# Commands", "", f"```text\n{first}\n```", ""]
+    for name in names:
+        parts += [f"## pneuopt {name}", "", f"```text\n{ask(name)}\n```", ""]
+    write("commands.md", "\n".join(parts))
+
+
+def scripts() -> Iterator[tuple[str, str, str]]:
+    """Group, path with arguments, and result of each row of README's table of results; a group's row has no path."""
+    group = ""
+    for first, second in re.findall(r"^\| (.+?) \| ?(.*?) ?\|$", section("Results"), re.MULTILINE):
+        if first.startswith("**"):
+            group = first.strip("*")
+            yield group, "", second
+        elif first.startswith("`"):
+            yield group, first.strip("`"), second
+
+
+def write_gallery() -> None:
+    """Every claim script with its result and its figures: of the checkout, and those that `--out out` has drawn."""
+    lead = section("Results").partition("|")[0].strip()
+    parts = ["# Gallery", "", localise(lead, "", "gallery.md"), ""]
+    for group, call, result in scripts():
+        if not call:
+            parts += [f"## {group}", "", localise(result, "", "gallery.md"), ""]
+            continue
+        path = ROOT / call.split()[0]
+        text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+        figures = [*path.parent.glob(f"{path.stem}*.png"), *sorted((ROOT / "out").glob(f"{path.stem}*.png"))]
+        parts += [
+            f"### {path.stem.replace('_', ' ')}",
+            "",
+            localise(result[:1].upper() + result[1:], "", "gallery.md") + ".",
+            "",
+        ]
+        for figure in figures:
+            copy_figure(figure.relative_to(ROOT).as_posix())
+            parts += [f"![The figure of {path.stem}](figures/{figure.name})", ""]
+        parts += [text, ""]
+    write("gallery.md", "\n".join(parts))
+
+
+def write_all() -> None:
+    """All pages."""
+    head = README.partition("\n## The three jobs")[0]
+    contents = [table_of_contents(caption, pages, hidden=True) for caption, pages in CONTENTS.items()]
+    write("index.md", "\n".join([localise(head, "", "index.md"), "", *(line for part in contents for line in part)]))
+    for page, (title, heading) in SECTIONS.items():
+        write(page, f"{heading}\n\n{localise(section(title), '', page)}")
+    for source, page in PAGES.items():
+        if page != "index.md":
+            write(page, localise((ROOT / source).read_text("utf-8"), str(Path(source).parent), page))
+    for page in ("theory.md", "validated.md"):
+        shutil.copy(Path(__file__).with_name(page), FOLDER)
+    write_api()
+    write_commands()
+    write_gallery()
+
+
+if __name__ == "__main__":
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    write_all()

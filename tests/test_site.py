@@ -1,0 +1,67 @@
+"""The site: every public name has its page, no source links to what is none; the slow part builds it."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import pneuopt
+
+ROOT = Path(__file__).parents[1]
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / ".docs" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def pages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
+    monkeypatch.setattr(sys, "argv", ["make_pages.py", str(tmp_path / "pages")])
+    return load("make_pages")
+
+
+def test_every_public_name_and_script_has_its_place(pages: ModuleType) -> None:
+    rooms = pages.public_names()
+    assert set(rooms) <= set(pages.ROOMS)
+    modules = {"catalog", "paper2015", "plotting"}
+    assert {name for names in rooms.values() for name in names} | modules >= set(pneuopt.__all__) - {"__version__"}
+    assert all((ROOT / call.split()[0]).is_file() for _, call, _ in pages.scripts() if call)
+
+
+def test_sources_link_to_pages_of_the_site(pages: ModuleType) -> None:
+    for title, _ in pages.SECTIONS.values():
+        pages.localise(pages.section(title), "", "index.md")
+    with pytest.raises(AssertionError, match=r"a link to LICENSE, of which the site has no page"):
+        pages.localise("[licence](LICENSE)", "", "index.md")
+    assert pages.localise("[keys](#appendix-the-keys-of-the-files)", "", "index.md") == "[keys](keys.md)"
+    assert pages.link_names("see `tune`\n```\n`tune`\n```") == "see {py:obj}`tune <pneuopt.tune>`\n```\n`tune`\n```"
+
+
+def test_a_broken_link_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text('<p id="x"><a href="b.html#y">b</a> <a href="#x">x</a><img src="http://c/d.png">')
+    (tmp_path / "b.html").write_text('<a href="c.html">c</a>')
+    wrong, inside, outside = load("check_links").problems_of(tmp_path)
+    assert sorted(wrong) == [
+        "a.html: b.html#y: the page has no such place",
+        "a.html: fetches http://c/d.png",
+        "b.html: c.html is not there",
+    ]
+    assert (inside, outside) == (3, 1)
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_or_a_broken_link(tmp_path: Path) -> None:
+    pytest.importorskip("furo", reason="the group docs is not installed: make docs")
+    pages, site, config = tmp_path / "pages", tmp_path / "site", ROOT / ".docs"
+    sphinx = ["-m", "sphinx", "-q", "-W", "--keep-going", "-c", str(config), str(pages), str(site)]
+    for arguments in ([str(config / "make_pages.py"), str(pages)], sphinx, [str(config / "check_links.py"), str(site)]):
+        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
