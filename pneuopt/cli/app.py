@@ -5,20 +5,16 @@ error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 
 needs, so that `--help` waits for no heavy import.
 """
 
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from math import inf
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED
+from pneuopt.cli.errors import report_errors
 from pneuopt.cli.guard import run_guarded
-from pneuopt.cli.interruption import interruption_status
-from pneuopt.quantities.errors import ConvergenceError, InputError, PhysicsWarning, require
-from pneuopt.quantities.source import read_once
+from pneuopt.quantities.errors import require
 
 app = typer.Typer(
     name="pneuopt",
@@ -80,7 +76,7 @@ def init_command(
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
 ) -> None:
     """Write a first drive.toml, tuning.toml, study.toml, rig.toml and log.toml, with every key explained."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.init import run_init
 
         parts = {"size": size, "cylinder": cylinder, "valve": valve}
@@ -107,7 +103,7 @@ def check_command(
     ] = None,
 ) -> None:
     """Show what is read, assumed and wrong before a fit, and what the logs identify; status 1 if a fit refuses them."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.check import run_check
         from pneuopt.cli.shared import Outputs
 
@@ -150,7 +146,7 @@ def identify_command(
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.identify import run_identify, run_select
         from pneuopt.cli.shared import Outputs
 
@@ -181,7 +177,7 @@ def tune_command(
     quiet: Quiet = False,
 ) -> None:
     """Tune PID and dither together, and certify them."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.tune import run_tune
 
@@ -203,7 +199,7 @@ def simulate_command(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a closed loop, or predict a log."""
-    with _report_errors():
+    with report_errors():
         require((tuning is None) != (log is None), "give either a tuning file or --log, to say what to simulate")
         from pneuopt.cli.identify import run_predict
         from pneuopt.cli.shared import Outputs
@@ -247,7 +243,7 @@ def study_command(
     quiet: Quiet = False,
 ) -> None:
     """Certify a loop over any plants, or tune it over a grid or along a Pareto front; status 1 if a case fails."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.study import Computing, run_study
 
@@ -287,7 +283,7 @@ def next_experiment_command(
     quiet: Quiet = False,
 ) -> None:
     """Plan the run that shrinks the confidence intervals of a fit most, within limits."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.next_experiment import PlannedOptions, run_next_experiment
         from pneuopt.cli.shared import Outputs
 
@@ -318,7 +314,7 @@ def track_command(
     quiet: Quiet = False,
 ) -> None:
     """Tell whether parameters drift over dated logs, and what that does to a tuned loop; status 1 if so."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.shared import Outputs
         from pneuopt.cli.track import TrackOptions, run_track
 
@@ -335,7 +331,7 @@ def keys_command(
     markdown: Annotated[bool, typer.Option("--markdown", help="Print tables in Markdown, as in README.")] = False,
 ) -> None:
     """Show what may stand in the files: each key, its unit, its default and what it means."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.keys import run_keys
 
         raise typer.Exit(run_keys(word, markdown))
@@ -344,49 +340,10 @@ def keys_command(
 @app.command("info")
 def info_command() -> None:
     """Show versions, compiler, cache, a self-check and the speed, to be quoted in a question or a bug report."""
-    with _report_errors():
+    with report_errors():
         from pneuopt.cli.info import run_info
 
         raise typer.Exit(run_info())
-
-
-@contextmanager
-def _report_errors() -> Iterator[None]:
-    """Turn an error that a user can mend into one message and an exit status, and a `PhysicsWarning` into one line."""
-    try:
-        with warnings.catch_warnings(), read_once():
-            warnings.simplefilter("always", PhysicsWarning)
-            warnings.showwarning = _warning_printer()
-            yield
-    except InputError as error:
-        _say(f"error: {error}")
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except ConvergenceError as error:
-        _say(f"NOT converged: {error}")
-        raise typer.Exit(EXIT_FAILURE) from None
-    except KeyboardInterrupt:
-        _say("interrupted: no file was left half-written")
-        raise typer.Exit(interruption_status() or EXIT_INTERRUPTED) from None
-
-
-def _say(sentence: str) -> None:
-    """Say a sentence on standard error, on a terminal in lines that end between words."""
-    from pneuopt.cli.terminal import make_console, show_sentence
-
-    show_sentence(make_console(error=True), sentence)
-
-
-def _warning_printer() -> Callable[..., None]:
-    """A function that prints each warning once, as soon as it comes."""
-    printed: set[str] = set()
-
-    def print_warning(message: Warning | str, *_: object) -> None:
-        line = f"warning: {message}"
-        if line not in printed:
-            printed.add(line)
-            _say(line)
-
-    return print_warning
 
 
 def _expand_patterns(paths: Sequence[Path]) -> list[Path]:
