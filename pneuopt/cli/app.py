@@ -1,4 +1,4 @@
-"""The commands `pneuopt init | check | identify | tune | simulate | study | next-experiment | track | keys | info`.
+"""The commands `pneuopt init | check | identify | tune | simulate | study | export | ...`, as `pneuopt --help` has them.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
 error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it
@@ -249,6 +249,25 @@ def study_command(
 
         computing = Computing(executor, time_limit, memory_limit, resume)
         raise typer.Exit(run_study(file, Outputs(output, json, plot, report), quiet, computing))
+
+
+@app.command("export")
+def export_command(
+    fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant, for units.")],
+    tuned: Annotated[Path, typer.Argument(metavar="TUNED", help="tuned.toml: the controller.")],
+    to: Annotated[str, typer.Option(metavar="FORM", help="c, st (IEC 61131-3 structured text) or python.")],
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where to write.")] = Path(),
+    name: Annotated[
+        str, typer.Option(metavar="NAME", help="Of the block and its files.", show_default="controller")
+    ] = "controller",
+    uncertified: Annotated[bool, typer.Option("--uncertified", help="Export gains that no certificate holds.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
+) -> None:
+    """Write a tuned sampled controller as C99, structured text or Python."""
+    with report_errors():
+        from pneuopt.cli.export import run_export
+
+        raise typer.Exit(run_export(fit, tuned, to, folder, name, uncertified, force))
 
 
 @app.command("next-experiment")

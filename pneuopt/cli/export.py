@@ -1,0 +1,82 @@
+"""`pneuopt export`: a tuned controller in the form that another machine takes."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pneuopt.cli.exit_status import EXIT_SUCCESS
+from pneuopt.cli.init import write_files
+from pneuopt.cli.shared import read_fit_and_tuning, warn
+from pneuopt.cli.terminal import make_console, show_output_files
+from pneuopt.export.targets import Language, export_controller
+from pneuopt.files.drive import read_status
+from pneuopt.files.toml import read_toml
+from pneuopt.quantities.errors import check_names, require
+from pneuopt.quantities.source import read_toml_source
+from pneuopt.quantities.status import Code
+
+NOT_CERTIFIED = "NOT CERTIFIED: no independent simulation stands behind these gains."
+
+
+def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncertified: bool, force: bool) -> int:
+    """Write the files and say which; returns the exit status.
+
+    Parameters
+    ----------
+    fit, tuned : Path
+    to : str
+        A `Language`.
+    folder : Path
+        Made where it is missing.
+    name : str
+    uncertified : bool
+        Whether gains without a certificate may be written.
+    force : bool
+        Whether old files may be replaced.
+    """
+    languages = {language.value: language for language in Language}
+    check_names("form", [to], languages, "export --to")
+    task, parameters = read_fit_and_tuning(fit, tuned)
+    origin = [*_certificate_lines(tuned, uncertified), *_source_lines(fit, tuned)]
+    files = export_controller(task.loop, parameters, languages[to], name=name, centre=task.centre, origin=origin)
+    placed = {folder / file: text for file, text in files.items()}
+    write_files(placed, force)
+    show_output_files(make_console(), list(placed))
+    return EXIT_SUCCESS
+
+
+def _certificate_lines(tuned: Path, uncertified: bool) -> list[str]:
+    """What a file says of its certificate; refused where it has none, unless that is accepted."""
+    status = read_status(tuned)
+    if status is None or status.code is not Code.CONVERGED:
+        why = "its gains were not written by pneuopt tune" if status is None else f"its tuning is {status.code.value}"
+        told = "tune it, or accept that with --uncertified"
+        require(uncertified, f"{tuned}: {why}, so that no certificate holds them; {told}")
+        warn(f"{tuned}: {why}; what is written says NOT CERTIFIED")
+        return [NOT_CERTIFIED]
+    metrics = read_toml(tuned).unwrap().get("certified", {})
+    return [f"Certified: {line}" for line in _metric_lines(metrics)]
+
+
+def _metric_lines(metrics: Any) -> list[str]:
+    """Of a tuned.toml: its references, and the certified settling time and overshoot of each."""
+    if not isinstance(metrics, Mapping):
+        return []
+    rows = {k: row for k, row in metrics.items() if isinstance(row, Mapping)}
+    lines = []
+    for metric in ("SettlingTime", "Overshoot"):
+        shown = (f"{v:.4g} ({step})" for step, v in rows.get(metric, {}).items() if isinstance(v, int | float))
+        text = ", ".join(shown)
+        lines += [f"{metric} {text}"] if text else []
+    return lines
+
+
+def _source_lines(fit: Path, tuned: Path) -> list[str]:
+    """Which files the gains and the plant come from; a plant that is not the tuned one is warned of."""
+    sums = {path: hashlib.sha256(read_toml_source(path)).hexdigest() for path in (fit, tuned)}
+    made = read_toml(tuned).unwrap().get("provenance", {})
+    known = [v for k, v in made.items() if str(k).startswith("sha256")] if isinstance(made, Mapping) else []
+    if known and sums[fit] not in known:
+        warn(f"{tuned}: was tuned with another file than {fit}; its units and the valve's centre are used all the same")
+    return [f"from {tuned.name}, sha256 {sums[tuned]}", f"plant {fit.name}, sha256 {sums[fit]}"]
