@@ -48,7 +48,7 @@ def replace_keys(path: Path, lines: str) -> None:
 def test_the_readmes_commands_and_edits_are_seen() -> None:
     jobs, own = list(steps(section("The three jobs"))), list(steps(section("Your own rig")))
     assert [name for name, _ in jobs] == ["$"] * len(jobs)
-    assert {words.split()[1] for _, words in jobs} == {"check", "identify", "tune", "simulate", "study"}
+    assert {words.split()[1] for _, words in jobs} == {"check", "identify", "tune", "simulate", "study", "export"}
     assert [words.split()[1] for name, words in own if name == "$"] == [
         "init", "check", "identify", "init", "simulate", "tune", "study",
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The commands `pneuopt init | check | identify | tune | simulate | study | export | ...`, as `pneuopt --help` has them.
+"""The commands `pneuopt init | check | identify | tune | simulate | export | ...`, as `pneuopt --help` has them.
 
 Exit status: 0 good, 1 not converged or not certified (in a study: a case failed or never settles), 2 bad input, 70 an
 error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 terminated. Each command imports what it

@@ -50,7 +50,11 @@ def _certificate_lines(tuned: Path, uncertified: bool) -> list[str]:
     """What a file says of its certificate; refused where it has none, unless that is accepted."""
     status = read_status(tuned)
     if status is None or status.code is not Code.CONVERGED:
-        why = "its gains were not written by pneuopt tune" if status is None else f"its tuning is {status.code.value}"
+        why = (
+            "its gains were not written by pneuopt tune"
+            if status is None
+            else f"its tuning ended so: {status.code.value}"
+        )
         told = "tune it, or accept that with --uncertified"
         require(uncertified, f"{tuned}: {why}, so that no certificate holds them; {told}")
         warn(f"{tuned}: {why}; what is written says NOT CERTIFIED")

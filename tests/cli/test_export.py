@@ -94,7 +94,11 @@ def test_no_old_file_is_replaced_and_then_none_is_written(place: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('code = "converged"', 'code = "infeasible"', "its tuning is infeasible, so that no certificate holds"),
+        (
+            'code = "converged"',
+            'code = "the limits contradict each other"',
+            "its tuning ended so: the limits contradict each other, so that no certificate holds",
+        ),
         ("[status]", "[provenance]", "its gains were not written by pneuopt tune"),
         ('sample_time = "1 ms"', "", "a continuous controller cannot be exported"),
     ],
