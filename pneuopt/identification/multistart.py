@@ -38,6 +38,10 @@ ACCEPTED_CHI_SQUARE_RATIO = 1.05
 SHORT_ITERATIONS = 10
 SAME_COST_RATIO = 1.001  # costs of two fits up to which both are one optimum; lower, and rounding makes two of it
 
+# cost of a settled start over that of the first one after as many stages [1] up to which the guess is not what is
+# wrong: lower settles all starts of a wrong model, higher takes another basin for the same
+SAME_MISFIT_RATIO = 1.02
+
 Candidate = tuple[EstimationProblem, Fit, str]
 
 
@@ -72,7 +76,7 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
     interrupted, tightest = False, problem.method.stages[-1].gap
     try:
         confirms, left_after = lambda: _only_needs_confirmation(fits), lambda: _stages_before_left(problem, fits[0][1])
-        for start in starts_by_cost(problem, confirms, left_after):
+        for start in starts_by_cost(problem, confirms, left_after, lambda: _cost_after_guesses(problem, fits)):
             may_wait = not fits and loss is None and problem.has_gaps and start.trial_parameters
             limit = HOPELESS_MISFIT if may_wait else math.inf
             known = () if loss is not None or estimate_noise else _joinable_costs(fits)
@@ -155,6 +159,7 @@ def starts_by_cost(
     problem: EstimationProblem,
     confirms: Callable[[], bool] = lambda: False,
     left_after: Callable[[], int] = lambda: 0,
+    left_cost: Callable[[], float] = lambda: math.nan,
 ) -> Iterator[Start]:
     """The model's first start; if more are asked for, the others: settled to what each holds, the least cost first.
 
@@ -168,6 +173,9 @@ def starts_by_cost(
     left_after : callable
         Called before the others settle: the stages after which the first start was left, 0 if it was not. The others
         then get no more than those, either.
+    left_cost : callable
+        Called then, too: the cost of the first start after as many stages as the others get, NaN if it got fewer. Where
+        a start costs the same with another guess held, the guess is not what is wrong, and no more of them settle.
 
     Yields
     ------
@@ -188,14 +196,18 @@ def starts_by_cost(
     # where no segment continues another, stages differ in nothing, and each would go on where the last one gave up
     left = left_after()
     stages = min(GUESS_STAGES, left or GUESS_STAGES) if problem.has_gaps else 1
-    settled = list[tuple[tuple[float, float], Start]]()
-    for guess in guessed if len(guessed) > 1 else []:
-        cost, start, explains = _settle_start(problem, guess, stages)
+    settled, known = list[tuple[tuple[float, float], Start]](), left_cost() if left else math.nan
+    others = list(guessed) if len(guessed) > 1 else []
+    while others:
+        cost, start, explains = _settle_start(problem, others.pop(0), stages)
         if explains:
             yield start
-        else:
-            settled.append((cost, start))
+            continue
+        settled.append((cost, start))
+        if cost[1] <= SAME_MISFIT_RATIO * known and cost[0] == problem.method.stages[GUESS_STAGES - 1].gap:
+            break
     yield from [start for _, start in sorted(settled, key=lambda each: each[0])]
+    yield from others
     yield from [c for c in candidates[1:] if len(guessed) < 2 or not c.trial_parameters]
     yield from candidates[:1] if left and len(guessed) < 2 else []
 
@@ -204,6 +216,12 @@ def _stages_before_left(problem: EstimationProblem, fit: Fit) -> int:
     """The stages after which a search was left for other starts; 0 if it was not."""
     gaps = [stage.gap for stage in problem.method.stages]
     return 1 + gaps.index(fit.stats["gap_deviation"]) if fit.status is ABANDONED_START else 0
+
+
+def _cost_after_guesses(problem: EstimationProblem, fits: Sequence[Candidate]) -> float:
+    """The cost of the first start after the stages in which the others settle; NaN where it was left before."""
+    gap = problem.method.stages[min(GUESS_STAGES, len(problem.method.stages)) - 1].gap
+    return next((cost for stage, cost in fits[0][1].stage_costs if stage == gap), math.nan)
 
 
 def _settle_start(problem: EstimationProblem, candidate: Start, stages: int) -> tuple[tuple[float, float], Start, bool]:

@@ -16,6 +16,7 @@ from pneuopt.identification.identifiability import (
     verdict_from_covariance,
     verdict_from_sensitivities,
 )
+from pneuopt.identification.misfit import MODEL_ERROR_LEVEL
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiles import Profile, trace_profile
 from pneuopt.identification.result import (
@@ -144,10 +145,9 @@ def _profiles(problem: EstimationProblem, result: IdentificationResult) -> tuple
     found: dict[str, Profile] = {}
     rows = result.estimates
     known = rows.index[np.isfinite(rows["stderr"])]
-    if (
-        result.stats["gap_deviation"] > problem.method.stages[-1].gap
-    ):  # noise of the states: the bias is not in a profile
-        return found, []
+    is_missed = result.stats["chi_square_ratio"] > MODEL_ERROR_LEVEL**2
+    if is_missed or result.stats["gap_deviation"] > problem.method.stages[-1].gap:
+        return found, []  # an error of the model, or noise of the states: the bias is not in a profile
     unknowns = problem.unknowns()
     waiting = [n for n in known if unknowns[n].log and rows["stderr"][n] > MAX_LINEAR_DEVIATION * rows["value"][n]]
     try:

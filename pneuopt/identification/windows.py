@@ -168,8 +168,10 @@ def _lengths(problem: EstimationProblem) -> list[float]:
 
 def _try_length(problem: EstimationProblem, fit: Fit, length: float) -> _Trial:
     """The fit in windows of one length, a segment each, and what its residuals tell."""
-    cut = replace(problem, window=length, method=replace(problem.method, segment_time=length))
+    last = problem.method.stages[-1:]  # without gaps all stages are alike
+    cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=last))
     held, found = fit_holding_unidentifiable(cut, cut.start_from(fit))
+    held = replace(held, method=replace(held.method, stages=problem.method.stages))
     unknowns = len(found.parameters.free_names) + len(held.experiments) * len(held.system.states)
     freedom = max(1, found.count - unknowns)
     return _Trial(length, held, found, diagnose_misfit(held, found, found.chi_square / freedom, freedom))

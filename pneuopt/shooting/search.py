@@ -22,7 +22,6 @@ from pneuopt.shooting.convergence import (
     MAX_GAP_SHARE,
     ConvergenceTest,
     assess_convergence,
-    largest_parameter_step,
 )
 from pneuopt.shooting.equations import correct_residuals, weigh_gaps
 from pneuopt.shooting.integration_steps import IntegrationSteps
@@ -38,20 +37,11 @@ from pneuopt.shooting.search_end import (
 )
 from pneuopt.shooting.segments import IntegrationCorrection, Segments, gap_scales, start_nodes
 from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.stage_end import STAGE_COST_TOLERANCE, is_negligible_step
 
 if TYPE_CHECKING:
     from pneuopt.shooting.least_squares import LeastSquares, Stage
 
-# promised decrease over the cost [1] at which a stage ends: lower wastes iterations, higher ends it too early
-STAGE_COST_TOLERANCE = 1e-3
-# promised decrease at which the last stage ends, in noise variances: half of (0.1 % of a standard deviation)^2
-FINAL_COST_TOLERANCE = 5e-7
-# promised decrease in noise variances at which the last stage ends where no parameter moves: lower iterates for states
-# that no parameter depends on, higher leaves costs that are compared short of their least
-SETTLED_COST_DECREASE = 0.01
-# step of a parameter over the tolerance of convergence [1] at which the last stage ends: lower settles states that no
-# parameter depends on, higher leaves the parameters short of their optimum; and where finer steps follow, which move it
-FINE_TOLERANCE, COARSE_TOLERANCE = 0.01, 0.5
 MAX_STEP_HALVINGS = 3  # halvings of the integration steps: more cost time, fewer leave an answer that depends on them
 # relative decrease of the cost an iteration [1] below which a search has stalled: lower keeps crawling, higher gives up
 STALL_COST_DECREASE = 2e-3
@@ -61,9 +51,6 @@ MAX_GRADIENT_ERROR = 0.01
 # iterations of the last stage right after the first: more are lost where stages between are needed, fewer may not
 # converge
 JUMP_ITERATIONS = 10
-# promised decrease over the cost [1] at which such a first stage ends: lower iterates for what the last one finds
-# anyway, higher jumps from a start that is not near
-JUMP_COST_TOLERANCE = 1e-2
 # squares that the last stage promises by the linearised equations, in noise variances [1], above which it is not tried
 # right after the first: lower passes over it for a start that is only not yet near, higher iterates for wrong models
 MAX_JUMP_MISFIT = 10.0
@@ -94,7 +81,7 @@ class Search:
         self.segments, self.method = segments, method
         self.scaling = ParameterScaling(segments.transcription)
         self.gap_scales = gap_scales(segments, method.kinematic)
-        self.iterations, self.stage = 0, method.stages[0]
+        self.iterations, self.stage_began, self.stage = 0, 0, method.stages[0]
         self.correction: IntegrationCorrection | None
         self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[StageEnd]()
         nodes = start_nodes(segments)
@@ -134,7 +121,7 @@ class Search:
                 return self._refine_steps(found)
         status = self._convergence_status(self.current)
         # gaps that absorb the misfit of the model: the answer depends on their weight
-        gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
+        gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None and not status.converged
         return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
 
     def _early_end(self, stage: "Stage") -> Status | None:
@@ -157,7 +144,7 @@ class Search:
     def _jump(self) -> Status | None:
         """The status of an optimum that is soon reached after a first stage that explains the log; or None."""
         stays = len(self.method.stages) < 3 or bool(self.method.known_costs)
-        if stays or not self._is_noise(self.current.cost):
+        if stays or not self.is_noise(self.current.cost):
             return None
         count, (first, *between, last) = self.current.equations.count, self.method.stages
         if not self._promised_squares(last) > MAX_JUMP_MISFIT * count:
@@ -178,22 +165,28 @@ class Search:
         self._enter_stage(self.method.stages[-1], self.current.nodes, self.current.z)
         if math.isfinite(self.current.cost):
             self._run_stage(JUMP_ITERATIONS)
-            if self._is_noise(self.current.cost):  # finer steps are lost on what has not come near the noise by then
+            if self.is_noise(self.current.cost):  # finer steps are lost on what has not come near the noise by then
                 self._finish_stage(JUMP_ITERATIONS)
-                if (found := self._convergence_status(self.current)).converged and self._is_noise(self.current.cost):
+                if (found := self._convergence_status(self.current)).converged and self.is_noise(self.current.cost):
                     return found
+            elif (found := self._convergence_status(self.current)).converged and self._is_near():
+                return found
         self._restore(before)
         return None
+
+    def _is_near(self) -> bool:
+        """Whether a model with some misfit has led here: what is farther off may be a wrong basin."""
+        return 2 * self.current.cost <= MAX_JUMP_MISFIT * self.current.equations.count
 
     def _gaps_absorb_misfit(self) -> bool:
         """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""
         absorbing = self.current.equations.gap_share > MAX_GAP_SHARE
-        return self.has_stalled and absorbing and not self._is_noise(self.current.cost)
+        return self.has_stalled and absorbing and not self.is_noise(self.current.cost)
 
     def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
         """Let the gaps stand for noise of the states of a wrong model: the tightest with which all residuals agree."""
         ended = zip(self.method.stages[:-1], self.stage_ends, strict=False)
-        explaining = [(stage, end) for stage, end in ended if self._is_noise(end.cost)]
+        explaining = [(stage, end) for stage, end in ended if self.is_noise(end.cost)]
         for stage, end in reversed(explaining[-MAX_LOOSENED:]):
             found = self._loosen(stage, end.nodes, end.z)
             if found.converged:
@@ -244,7 +237,7 @@ class Search:
     @property
     def _corrects_residuals(self) -> bool:
         """Whether finer steps are for the residuals alone: derivatives need them where these exceed the noise."""
-        return not self.noisy_gaps and self._is_noise(self.current.cost)
+        return not self.noisy_gaps and self.is_noise(self.current.cost)
 
     def _correct_residuals(self, steps: int) -> None:
         """Add what finer steps change to the current residuals; derivatives are computed anew where that is much."""
@@ -297,7 +290,7 @@ class Search:
             self._restore(before)
         return has_ended
 
-    def _is_noise(self, cost: float) -> bool:
+    def is_noise(self, cost: float) -> bool:
         """Whether this cost is that of the noise alone."""
         return 2 * cost <= MAX_CHI_SQUARE_RATIO * self.current.equations.count
 
@@ -305,7 +298,7 @@ class Search:
         """Iterate in a stage; return whether it converged, or had stalled when its iterations were used up."""
         damping, before = min(INITIAL_DAMPING, 10 * self.stage.gap**2), math.inf  # as the diagonal grows
         descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
-        hopeless = 0
+        hopeless, self.stage_began = 0, self.iterations
         for _ in range(iterations):
             if self.method.budget is not None:
                 self.method.budget.check()
@@ -340,25 +333,7 @@ class Search:
         )
 
     def _is_negligible_step(self, current: Iterate, reduced: ReducedEquations, step: GaussNewtonStep) -> bool:
-        """Whether a step is negligible: in the last stage, 0.1 % of a deviation in any direction, or as good as that.
-
-        The states of noisy gaps estimate that noise, and settle long after the parameters, whose step then counts;
-        where no parameter is free, the states are what is asked for.
-        """
-        promised = 0.5 * current.equations.arrow.descent_rate(step)
-        is_last, misfit = self.stage is self.method.stages[-1], max(1.0, 2 * current.cost / current.equations.count)
-        if not (self.noisy_gaps or is_last):
-            is_first = self.stage is self.method.stages[0] and self._is_noise(current.cost)
-            return promised < (JUMP_COST_TOLERANCE if is_first else STAGE_COST_TOLERANCE) * current.cost
-        if is_last and promised < FINAL_COST_TOLERANCE * misfit:
-            return True
-        asks_parameters = bool(self.segments.transcription.parameters.free_names)
-        is_settled = asks_parameters and (self.is_coarse or promised < SETTLED_COST_DECREASE * misfit)
-        if not ((is_settled or self.noisy_gaps) and promised < STAGE_COST_TOLERANCE * current.cost):
-            return False
-        keep = self.scaling.movable(current.z, current.equations, reduced)
-        largest = largest_parameter_step(current.equations, keep, reduced, step)
-        return largest < (COARSE_TOLERANCE if self.is_coarse else FINE_TOLERANCE) * self.method.tolerance
+        return is_negligible_step(self, current, reduced, step)
 
     def _objective(self) -> Objective:
         sigma = self.stage.gap * self.gap_scales
@@ -373,9 +348,8 @@ class Search:
     def assess(self, current: Iterate) -> ConvergenceTest:
         """The convergence test of an iterate."""
         message, tolerance = f"{self.iterations} iterations", self.method.tolerance
-        return assess_convergence(
-            current.equations, self.scaling, current.z, tolerance, message, noisy_gaps=self.noisy_gaps
-        )
+        given = current.equations, self.scaling, current.z, tolerance, message
+        return assess_convergence(*given, noisy_gaps=self.noisy_gaps, gap=self.stage.gap)
 
     def largest_change(self, change: Array) -> float:
         """The largest change of a measured output [noise standard deviations], of all that are given."""

@@ -153,7 +153,7 @@ def test_a_search_with_noise_of_the_states_that_creeps_leaps(
     monkeypatch.setattr(Descent, "step", creep)
     monkeypatch.setattr(Descent, "leap", leap)
     monkeypatch.setattr(Search, "_report", lambda _: None)
-    monkeypatch.setattr(Search, "_is_noise", lambda *_: False)
+    monkeypatch.setattr(Search, "is_noise", lambda *_: False)
     search._run_stage(30)
     assert len(taken) == steps
     search.noisy_gaps = False

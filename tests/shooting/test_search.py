@@ -14,10 +14,11 @@ from pneuopt.shooting.equations import correct_residuals, normal_equations
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
 from pneuopt.shooting.levenberg_marquardt import Iterate
 from pneuopt.shooting.scaling import ParameterScaling
-from pneuopt.shooting.search import FINE_TOLERANCE, Search
+from pneuopt.shooting.search import Search
 from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH, StageEnd
 from pneuopt.shooting.segments import IntegrationCorrection, segment, start_nodes
 from pneuopt.shooting.solution import Fit
+from pneuopt.shooting.stage_end import FINE_TOLERANCE
 from tests.shooting.test_least_squares import TRUTH, found, shaken, two_logs
 
 FIRST, *OTHERS = LeastSquares().stages
@@ -86,14 +87,14 @@ def test_a_last_stage_that_stays_above_the_noise_is_not_integrated_by_finer_step
 ) -> None:
     """A log with hysteresis in the valve lost two thirds of its search to that."""
     monkeypatch.setattr("pneuopt.shooting.search.JUMP_ITERATIONS", 1)
-    is_noise, jumps = Search._is_noise, list[bool]()
+    is_noise, jumps = Search.is_noise, list[bool]()
 
     def only_loose(search: Search, cost: float) -> bool:
         return search.stage is FIRST and is_noise(search, cost)
 
     def jumped(search: Search) -> None:
         with monkeypatch.context() as patch:
-            patch.setattr(Search, "_is_noise", only_loose)
+            patch.setattr(Search, "is_noise", only_loose)
             patch.setattr(Search, "_apply_finer_steps", lambda *_: pytest.fail("finer steps"))
             jumps.append(jump(search) is None)
 
@@ -137,7 +138,7 @@ def test_nothing_is_iterated_to_the_end_before_finer_steps_follow(monkeypatch: p
     """Where the model misses the log, the coarse steps of the last stage end as soon as the parameters do not move."""
     problem = shaken(2e-3)
     fit = solve_least_squares(problem)
-    monkeypatch.setattr("pneuopt.shooting.search.COARSE_TOLERANCE", FINE_TOLERANCE)
+    monkeypatch.setattr("pneuopt.shooting.stage_end.COARSE_TOLERANCE", FINE_TOLERANCE)
     fine = solve_least_squares(problem)
     assert fit.covariance is not None
     assert np.abs((found(fit) - found(fine)) / np.sqrt(np.diag(fit.covariance))).max() < 1e-2
