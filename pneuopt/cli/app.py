@@ -5,43 +5,33 @@ error that nobody foresaw, 74 the screen's output is lost, 130 interrupted, 143 
 needs, so that `--help` waits for no heavy import.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer.models import CommandFunctionType
 
+from pneuopt.cli.command_help import COMMAND_HELP, epilog
 from pneuopt.cli.errors import report_errors
 from pneuopt.cli.guard import run_guarded
+from pneuopt.cli.options import Accept, Json, Plot, Quiet, ReportFile, Window
 from pneuopt.quantities.errors import require
 
 app = typer.Typer(
     name="pneuopt",
     help="Identify and optimally tune pneumatic drives: friction from logs, PID and dither together, certified.",
     epilog="Exit status: 0 good, 1 not converged or not certified, 2 bad input, 70 a bug, 130 interrupted.",
-    add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all figures as JSON.")]
-Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw: .png, .pdf or .svg.")]
-ReportFile = Annotated[
-    Path | None,
-    typer.Option("--report", metavar="FILE", help="Write one page of HTML: verdict first, tables, figures, hashes."),
-]
-Window = Annotated[
-    float | None, typer.Option(metavar="SECONDS", help="Cut the logs into windows, each with a start of its own.")
-]
-Accept = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="CHECK",
-        help="Logs are right: motion, speed, work, command, scale, jumps, stops, mass, pressures; repeatable.",
-    ),
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+
+
+def _command(name: str) -> Callable[[CommandFunctionType], CommandFunctionType]:
+    """Register a command with what `command_help` says of it."""
+    return app.command(name, short_help=COMMAND_HELP[name].line, epilog=epilog(name))
 
 
 def main() -> None:
@@ -61,7 +51,7 @@ def options(
         raise typer.Exit
 
 
-@app.command("init")
+@_command("init")
 def init_command(
     kind: Annotated[
         str | None, typer.Argument(metavar="KIND", help="What drives the load: pneumatic, force, rotary, linear.")
@@ -83,7 +73,7 @@ def init_command(
         raise typer.Exit(run_init(kind, folder, parts, log, force))
 
 
-@app.command("check")
+@_command("check")
 def check_command(
     drive: Annotated[
         Path,
@@ -110,7 +100,7 @@ def check_command(
         raise typer.Exit(run_check(drive, _expand_patterns(logs), Outputs(None, json, plot), accept or (), fix))
 
 
-@app.command("identify")
+@_command("identify")
 def identify_command(
     drive: Annotated[
         Path, typer.Argument(metavar="DRIVE", help="drive.toml: the hardware; what is `free` in it is identified.")
@@ -158,7 +148,7 @@ def identify_command(
         raise typer.Exit(run_select(*given) if select else run_identify(*given, budget, draws))
 
 
-@app.command("tune")
+@_command("tune")
 def tune_command(
     fit: Annotated[
         Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant; nothing of it is tuned.")
@@ -184,7 +174,7 @@ def tune_command(
         raise typer.Exit(run_tune(fit, tuning, rig, Outputs(output, json, plot, report), quiet))
 
 
-@app.command("simulate")
+@_command("simulate")
 def simulate_command(
     fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml.")],
     tuning: Annotated[
@@ -213,7 +203,7 @@ def simulate_command(
             raise typer.Exit(run_predict(fit, log, window, outputs, quiet))
 
 
-@app.command("study")
+@_command("study")
 def study_command(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="study.toml: the drive, the tuning, and which cases, or a front.")
@@ -251,7 +241,7 @@ def study_command(
         raise typer.Exit(run_study(file, Outputs(output, json, plot, report), quiet, computing))
 
 
-@app.command("export")
+@_command("export")
 def export_command(
     fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant, for units.")],
     tuned: Annotated[Path, typer.Argument(metavar="TUNED", help="tuned.toml: the controller.")],
@@ -270,7 +260,7 @@ def export_command(
         raise typer.Exit(run_export(fit, tuned, to, folder, name, uncertified, force))
 
 
-@app.command("next-experiment")
+@_command("next-experiment")
 def next_experiment_command(
     fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml: estimates, their covariance, what is free.")],
     duration: Annotated[str, typer.Option(metavar="TIME", help="Of a run: 10s.")],
@@ -312,7 +302,7 @@ def next_experiment_command(
         raise typer.Exit(run_next_experiment(fit, tuning, options, Outputs(output, json, None), quiet))
 
 
-@app.command("track")
+@_command("track")
 def track_command(
     drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="drive.toml: what is `free` in it is tracked.")],
     logs: Annotated[list[Path], typer.Argument(metavar="LOGS", help="Four or more logs, each of another day.")],
@@ -342,7 +332,7 @@ def track_command(
         raise typer.Exit(run_track(drive, _expand_patterns(logs), options, Outputs(output, json, plot), quiet))
 
 
-@app.command("keys")
+@_command("keys")
 def keys_command(
     word: Annotated[
         str | None, typer.Argument(metavar="WORD", help="A file, a section, a key, or a word of its meaning.")
@@ -356,7 +346,7 @@ def keys_command(
         raise typer.Exit(run_keys(word, markdown))
 
 
-@app.command("info")
+@_command("info")
 def info_command() -> None:
     """Show versions, compiler, cache, a self-check and the speed, to be quoted in a question or a bug report."""
     with report_errors():
