@@ -21,7 +21,7 @@ from .control.friction_feedforward import Direction, FrictionFeedforward
 from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
-from .control.pid import PID
+from .control.pid import PID, AntiWindup
 from .control.reference import Step
 from .control.sensor import Encoder, SensorLag
 from .dynamics.python_control import from_control, to_control
@@ -162,6 +162,7 @@ __all__ = [
     "AOptimal",
     "Actuator",
     "AirUse",
+    "AntiWindup",
     "Assumption",
     "Asymmetric",
     "BandCentre",

@@ -22,6 +22,7 @@ PUBLIC_NAMES = [
     "Precision",
     "Actuator",
     "AirUse",
+    "AntiWindup",
     "apply_scenario",
     "Asymmetric",
     "Assumption",

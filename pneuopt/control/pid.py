@@ -5,6 +5,7 @@ The parallel form is what runs, whatever form its gains are given in (`forms`).
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from math import inf
 from typing import Any
 
@@ -15,6 +16,13 @@ from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
+
+
+class AntiWindup(Enum):
+    """What keeps the integral from growing while the command is at a limit."""
+
+    BACK_CALCULATION = "back-calculation"
+    CLAMPING = "clamping"
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,11 @@ class PID:
     stiction: a mass that sticks within the band is left there, instead of being pushed off by a growing integral,
     over and over. Back-calculation goes on inside the band: a clipped command still unwinds the integral.
 
+    Clamping (conditional integration) stands in for the last line where that is asked for: where w is beyond a limit,
+    of the step ``Ki h (r - y)`` that drives it there I takes only what the limit leaves, mostly nothing; there is no
+    Tt. Many controllers' own blocks do so, all or nothing, which differs by less than one step and chatters along the
+    limit. K. J. Åström and T. Hägglund, Advanced PID Control, ISA 2006, section 3.5, compare the two kinds.
+
     Parameters
     ----------
     sample_time : float, optional
@@ -52,6 +65,8 @@ class PID:
         at the one before.
     dead_band : bool
         Whether the integral has one; its half width is the parameter dead_band [measured unit].
+    anti_windup : AntiWindup
+        Back-calculation, or of a sampled controller clamping. Without limits it is without effect.
 
     Raises
     ------
@@ -64,6 +79,7 @@ class PID:
     form: Form = Form.PARALLEL
     delay: int = 0
     dead_band: bool = False
+    anti_windup: AntiWindup = AntiWindup.BACK_CALCULATION
 
     def __post_init__(self) -> None:
         h, delay = self.sample_time, self.delay
@@ -73,6 +89,10 @@ class PID:
         require(not delay or h is not None, "PID: a delay of 1 sample needs a sample_time; without one, leave it out")
         names = ", ".join(f"Form.{f.name}" for f in Form)
         require(isinstance(self.form, Form), f"PID: form is one of {names}, got {self.form!r}")
+        kinds, kind = ", ".join(f"AntiWindup.{k.name}" for k in AntiWindup), self.anti_windup
+        require(isinstance(kind, AntiWindup), f"PID: anti_windup is one of {kinds}, got {kind!r}")
+        told = "PID: clamping is decided once a sample: give a sample_time, or take back-calculation"
+        require(h is not None or kind is AntiWindup.BACK_CALCULATION, told)
 
     def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
         """Defaults: a gain of 1, no I, no D, ``Tf = 10 ms`` or ``N = 10``, ``b = c = 1``, no limit, no dead band.
@@ -85,8 +105,8 @@ class PID:
         Returns
         -------
         ParameterSet
-            The form's gains, b, c [1], with a dead band dead_band [input_unit], and with limits Tt [s], lower and upper
-            [output_unit].
+            The form's gains, b, c [1], with a dead band dead_band [input_unit], and with limits lower and upper
+            [output_unit] and, for back-calculation, Tt [s].
 
         Examples
         --------
@@ -129,6 +149,8 @@ class PID:
             "lower": Parameter(-inf, output_unit, meaning="least command"),
             "upper": Parameter(inf, output_unit, meaning="largest command"),
         }
+        if self.anti_windup is AntiWindup.CLAMPING:
+            del saturation["Tt"]
         return ParameterSet(core | saturation if self.limits else core)
 
     @property
@@ -156,6 +178,7 @@ class PID:
         require(band >= 0, f"pid.dead_band must not be negative, got {band:g}; 0 is none")
         if self.limits:
             require(p["lower"] < p["upper"], f"pid.lower {p['lower']:g} is not below pid.upper {p['upper']:g} {unit}")
+        if self.limits and self.anti_windup is AntiWindup.BACK_CALCULATION:
             Tt, least = p["Tt"], h or 0.0
             told = f"anti-windup needs Tt > 0, and with sampling at least one sample ({least:g} s)"
             require(Tt > 0 and Tt >= least, f"pid.Tt = {Tt:g} s: {told}")
@@ -221,10 +244,9 @@ class PID:
         terms = self.terms(x, r, y, p)
         w = self.output(x, r, y, p) + added
         u = self.clip(w, p)
-        windup = (self.sample_time or 0.0) / p["Tt"] * (u - w) if self.limits else 0.0
         sent = {"command": x["pending"], "pending": u} if self.delay else {"command": u}
         remembered = {"derivative": terms["derivative"], "previous_error": p["c"] * r - y}
-        return {"integral": terms["integral"] + windup, **remembered, **sent}
+        return {"integral": self._unwind(x["integral"], terms["integral"], w, u, p), **remembered, **sent}
 
     def terms(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The sampled law's terms at a sample: "proportional", "integral" before back-calculation, "derivative"."""
@@ -246,6 +268,15 @@ class PID:
     def clip(self, w: ca.SX, p: Symbols) -> ca.SX:
         """The saturated command: hard, as in a real controller; exact derivatives on either side of the corner."""
         return ca.fmin(ca.fmax(w, p["lower"]), p["upper"]) if self.limits else w
+
+    def _unwind(self, before: ca.SX, integral: ca.SX, w: ca.SX, u: ca.SX, p: Symbols) -> ca.SX:
+        """The integral after a sample, by what the clip has taken from the command."""
+        if not self.limits:
+            return integral
+        if self.anti_windup is AntiWindup.BACK_CALCULATION:
+            return integral + (self.sample_time or 0.0) / p["Tt"] * (u - w)
+        step, excess = integral - before, w - u
+        return integral - ca.fmax(0, ca.fmin(step, excess)) - ca.fmin(0, ca.fmax(step, excess))
 
     def _integrand(self, error: ca.SX, p: Symbols) -> ca.SX:
         if not self.dead_band:

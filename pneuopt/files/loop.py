@@ -12,7 +12,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.pid import PID, AntiWindup
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import System
 from pneuopt.files.toml import construct_at, read_fixed_value, read_parameter
@@ -88,7 +88,10 @@ def _pid(table: Mapping[str, Any], where: str) -> PID:
     sample_time = _read_value(table, "sample_time", keys, where)
     delay = _sample_count(table.get("delay", keys["delay"].usual), f"{where} delay")
     banded = "dead_band" in table
-    return construct_at(lambda: PID(sample_time, "limits" in table, form, delay, banded), where)
+    unwinds = _read_choice(table, "anti_windup", keys, where)
+    told = "Tt is back-calculation's; clamping has none; leave it out"
+    require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
+    return construct_at(lambda: PID(sample_time, "limits" in table, form, delay, banded, unwinds), where)
 
 
 def _read_choice(table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str) -> Any:

@@ -48,7 +48,7 @@ def _pid_keys(command: str, measured: str) -> dict[str, Key]:
         for name in (n for n in pid if n not in _LIMITS and n not in found):
             forms = [f'"{f.value}"' for f in Form if name in f.gains]
             own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""
-            found[name] = parameter_key(pid[name], own or ("with limits" if name == "Tt" else ""))
+            found[name] = parameter_key(pid[name], own or ("with limits, for back-calculation" if name == "Tt" else ""))
     return found
 
 

@@ -11,6 +11,7 @@ from enum import Enum
 from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Waveform
 from pneuopt.control.forms import Form
+from pneuopt.control.pid import AntiWindup
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import MAX_STEPS
@@ -39,6 +40,9 @@ LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
         "form": choice("which gains are stated", _words(Form), Form.PARALLEL.value),
         "sample_time": Key("time between samples; without it the controller is continuous", unit="s", example='"1 ms"'),
         "delay": Key("samples from reading to acting", Takes.SAMPLES, usual=0, example='"1 sample"'),
+        "anti_windup": choice(
+            "what keeps the integral at bay at a limit", _words(AntiWindup), AntiWindup.BACK_CALCULATION.value
+        ),
         "limits": Key("least and largest command", Takes.LIST, "{command}", example='["-5 V", "5 V"]'),
     },
     "dither": {

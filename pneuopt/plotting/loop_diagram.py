@@ -8,6 +8,7 @@ import numpy as np
 from pneuopt.control.dither import Waveform
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
+from pneuopt.control.pid import AntiWindup
 from pneuopt.control.sensor import Encoder
 from pneuopt.plotting.diagram import (
     BLOCK_HEIGHT,
@@ -76,6 +77,7 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
 def _draw_pid(sheet: Sheet, loop: ClosedLoop) -> None:
     notes = [f"PID, {loop.pid.form.value} form;", "P sees b r − y, D sees c r − y"]
     notes += ["the integral has a dead band"] if loop.pid.dead_band else []
+    notes += ["it is clamped at a limit"] if loop.pid.limits and loop.pid.anti_windup is AntiWindup.CLAMPING else []
     sheet.write_below(sheet.draw_block(LAWS[loop.pid.form], PID_WIDTH), "\n".join(notes))
 
 

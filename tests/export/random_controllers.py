@@ -9,7 +9,7 @@ from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.pid import PID
+from pneuopt.control.pid import PID, AntiWindup
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
 from pneuopt.export.program import controller_program, short_name
@@ -59,7 +59,14 @@ def random_loop(seed: int) -> tuple[ClosedLoop, ParameterSet, float]:
     """A controller whose form, parts and numbers the seed draws; every form and part comes in twenty."""
     g = np.random.default_rng(seed)
     form, sensor = list(Form)[seed % 3], [None, Encoder(RESOLUTION), Encoder(), SensorLag(0.005), None][seed % 5]
-    pid = PID([1e-3, 2e-3, 5e-4, 1.0 / 3000][seed % 4], bool(seed % 7), form, int(g.integers(2)), bool(g.integers(2)))
+    pid = PID(
+        [1e-3, 2e-3, 5e-4, 1.0 / 3000][seed % 4],
+        bool(seed % 7),
+        form,
+        int(g.integers(2)),
+        bool(g.integers(2)),
+        list(AntiWindup)[seed % 4 == 2],
+    )
     dither = [Dither(), Dither(waveform=Waveform.TRIANGLE), Dither(analogue=True), None][int(g.integers(4))]
     lead = Feedforward() if g.integers(2) else None
     measured = "position" if seed % 4 == 1 else "speed"

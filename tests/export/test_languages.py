@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pneuopt.control.pid import AntiWindup
 from pneuopt.export.c99 import write_c99
 from pneuopt.export.header import make_header
 from pneuopt.export.program import controller_program
@@ -89,4 +90,5 @@ def test_every_form_and_part_is_among_the_random_controllers() -> None:
     }  # fmt: skip
     for option in ("delay", "dead_band", "limits"):
         assert {bool(getattr(loop.pid, option)) for loop in loops} == {False, True}
+    assert {loop.pid.anti_windup for loop in loops if loop.pid.limits} == set(AntiWindup)
     assert {loop.feedforward is None for loop in loops} == {False, True}
