@@ -10,6 +10,7 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.excitation import DEFAULT_WIDTH
 from pneuopt.files.drive import FIT_SECTIONS
 from pneuopt.files.drive_keys import default_parameters, drive_keys
+from pneuopt.files.json_outputs import output_schema
 from pneuopt.files.loop_parameters import SAMPLE_TIME, tuning_keys
 from pneuopt.files.rig import RIG_KEYS
 from pneuopt.files.schema import json_schema
@@ -95,6 +96,7 @@ def first_files(
     results = {"drive": FIT_SECTIONS, "tuning": TUNED_SECTIONS}
     files = {sidecar_name(log if n == "sidecar" else n): t.render() for n, t in templates.items()}
     schemas = {t.schema: json_schema(f"pneuopt {n}", t.sections, results.get(n, ())) for n, t in templates.items()}
+    schemas[_schema_path("output")] = output_schema()
     return files | {path: json.dumps(schema, indent=1, ensure_ascii=False) + "\n" for path, schema in schemas.items()}
 
 

@@ -1,9 +1,38 @@
 """What the commands' tests share."""
 
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
 import pytest
+from jsonschema import Draft202012Validator
+
+from pneuopt.files.json_outputs import OUTPUTS, output_schema
+from pneuopt.quantities.output import write_json
 
 
 @pytest.fixture(autouse=True)
 def _no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """Standard error holds what a command says, however slow the machine is."""
     monkeypatch.setattr("pneuopt.cli.terminal.SECONDS_A_LINE", 3600.0)
+
+
+@pytest.fixture(autouse=True)
+def _outputs_keep_their_schema(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever a command of these tests writes with --json is what the schema says."""
+    validator = Draft202012Validator(output_schema())
+
+    def write(path: Path, document: Mapping[str, Any]) -> None:
+        write_json(path, document)
+        written = json.loads(Path(path).read_text("utf-8"))
+        names = [n for n, member in OUTPUTS.items() if {*written} <= {*member.members}] or [*OUTPUTS]
+        problems = {n: [e.message for e in validator.evolve(schema=_definition(n)).iter_errors(written)] for n in names}
+        assert [] in problems.values(), problems
+
+    monkeypatch.setattr("pneuopt.cli.shared.write_json", write)
+
+
+def _definition(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = output_schema()["$defs"][name]
+    return found

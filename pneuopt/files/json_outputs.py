@@ -1,0 +1,320 @@
+"""What the commands write with --json: one declaration, from which the schema and README's appendix come.
+
+Numbers are in SI units unless a name or a "unit" beside them says otherwise; what is not finite is null; a table is a
+list of records, one a row. Members may be added from version to version; none is renamed without the changelog.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any
+
+from pneuopt.quantities.status import Code
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_NUMBER: dict[str, Any] = {"type": ["number", "null"]}
+_ANY: dict[str, Any] = {"type": ["number", "string", "boolean", "null"]}
+
+
+class Holds(Enum):
+    """What a member holds, in words; the schema of each stands in `_FORMS`."""
+
+    TEXT = "text"
+    TEXTS = "list of texts"
+    NUMBER = "number or null"
+    COUNT = "whole number"
+    FLAG = "true or false"
+    VALUE = "text, number or truth"
+    NUMBERS = "numbers by name"
+    WORDS = "texts by name"
+    LISTS = "lists of texts by name"
+    GROUPS = "list of lists of texts"
+    COUNTS = "list of whole numbers"
+    RECORDS = "records of texts by name"
+    RECORD = "record"
+    ROWS = "table"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A member of an output.
+
+    Attributes
+    ----------
+    meaning : str
+    holds : Holds
+    members : mapping of str to Member
+        Of a record, or of each row of a table.
+    is_open : bool
+        Whether a row has further columns, which are named after metrics, parameters or references.
+    is_optional : bool
+        Whether it is there only where there is something to say.
+    """
+
+    meaning: str
+    holds: Holds = Holds.NUMBER
+    members: Mapping[str, "Member"] = field(default_factory=dict)
+    is_open: bool = False
+    is_optional: bool = False
+
+
+def output_schema() -> dict[str, Any]:
+    """The JSON Schema of what `--json` writes: any of the commands' outputs, each by its name under "$defs"."""
+    return {
+        "$schema": DIALECT,
+        "title": "what pneuopt writes with --json",
+        "anyOf": [{"$ref": f"#/$defs/{name}"} for name in OUTPUTS],
+        "$defs": {name: {"title": member.meaning, **_record(member)} for name, member in OUTPUTS.items()},
+    }
+
+
+def describe_outputs() -> str:
+    """The outputs as tables in Markdown, one a command."""
+    parts = []
+    for name, output in OUTPUTS.items():
+        rows = [f"| `{n}` | {m.holds.value} | {_describe(m)} |" for n, m in output.members.items()]
+        parts.append("\n".join([f"**{name}**: {output.meaning}", "", "| member | holds | |", "|---|---|---|", *rows]))
+    return "\n\n".join(parts)
+
+
+def _describe(member: Member) -> str:
+    own = ", ".join(f"`{n}`" for n in member.members)
+    further = " and more" if member.is_open and own else ""
+    optional = "; not always there" if member.is_optional else ""
+    return f"{member.meaning}{': ' if own else ''}{own}{further}{optional}"
+
+
+def _schema(member: Member) -> dict[str, Any]:
+    return {"description": member.meaning, **_FORMS[member.holds](member)}
+
+
+def _record(member: Member) -> dict[str, Any]:
+    return {
+        "type": "object",
+        "properties": {name: _schema(own) for name, own in member.members.items()},
+        "required": [name for name, own in member.members.items() if not own.is_optional],
+        "additionalProperties": _ANY if member.is_open else False,
+    }
+
+
+def _by_name(values: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "additionalProperties": values}
+
+
+_FORMS: Mapping[Holds, Any] = {
+    Holds.TEXT: lambda _: {"type": "string"},
+    Holds.TEXTS: lambda _: {"type": "array", "items": {"type": "string"}},
+    Holds.NUMBER: lambda _: _NUMBER,
+    Holds.COUNT: lambda _: {"type": "integer"},
+    Holds.FLAG: lambda _: {"type": "boolean"},
+    Holds.VALUE: lambda _: _ANY,
+    Holds.NUMBERS: lambda _: _by_name(_NUMBER),
+    Holds.WORDS: lambda _: _by_name({"type": "string"}),
+    Holds.LISTS: lambda _: _by_name({"type": "array", "items": {"type": "string"}}),
+    Holds.GROUPS: lambda _: {"type": "array", "items": {"type": "array", "items": {"type": "string"}}},
+    Holds.COUNTS: lambda _: {"type": "array", "items": {"type": "integer"}},
+    Holds.RECORDS: lambda _: _by_name(_by_name({"type": "string"})),
+    Holds.RECORD: _record,
+    Holds.ROWS: lambda member: {"type": "array", "items": _record(member)},
+}
+
+
+def _text(meaning: str) -> Member:
+    return Member(meaning, Holds.TEXT)
+
+
+def _flag(meaning: str) -> Member:
+    return Member(meaning, Holds.FLAG)
+
+
+def _rows(meaning: str, members: Mapping[str, Member], *, is_open: bool = False) -> Member:
+    return Member(meaning, Holds.ROWS, members, is_open)
+
+
+def _optional(member: Member) -> Member:
+    return replace(member, is_optional=True)
+
+
+def _numbers(**meanings: str) -> dict[str, Member]:
+    return {name: Member(meaning) for name, meaning in meanings.items()}
+
+
+_CODES = ", ".join(f'"{code.value}"' for code in Code)
+_STATUS = Member(
+    "how it ended", Holds.RECORD, {"code": _text(f"one of {_CODES}"), "message": _text("verdict, details, remedy")}
+)
+_PROVENANCE = Member("versions, options, SHA-256 of what was read", Holds.WORDS)
+_STATS = Member("figures of the search, as the result's docstring says", Holds.NUMBERS)
+_FIT = _rows(
+    "agreement, a row a log and channel",
+    {
+        "log": _text("name"),
+        "channel": _text("name"),
+        **_numbers(rmse="[unit]", nrmse="over the channel's variation [1]", fit_percent="[%]", samples="compared"),
+        **_numbers(free_run_rmse="simulated to the end [unit]", free_run_nrmse="likewise [1]", noise="[unit]"),
+        "unit": _text("of the channel"),
+    },
+    is_open=True,
+)
+_IDENTIFIABLE = {
+    "name": _text("parameter"),
+    **_numbers(value="[its unit]", stderr="expected", relative="over the value", alone="if others were known"),
+    **_numbers(inflation="their ratio"),
+    "identifiable": _flag("whether the logs identify it"),
+}
+_VERDICT = Member(
+    "what the logs identify; empty where nothing was tried",
+    Holds.RECORD,
+    {
+        "sentences": Member("in words", Holds.TEXTS, is_optional=True),
+        "unidentifiable": Member("parameters", Holds.TEXTS, is_optional=True),
+        "unchanged": Member("parameters that keep their given values", Holds.TEXTS, is_optional=True),
+        "indistinguishable": Member("parameters that act only together", Holds.GROUPS, is_optional=True),
+        "reasons": Member("by parameter", Holds.WORDS, is_optional=True),
+        "table": _optional(_rows("a row a free parameter", _IDENTIFIABLE)),
+    },
+)
+_ESTIMATES = {
+    "name": _text('parameter, "name[log]" for one of a log'),
+    **_numbers(value="null where it is unidentifiable [unit]", ci_low="95 % [unit]", ci_high="95 % [unit]"),
+    "unit": _text("SI"),
+    "mark": _text("what to think of it"),
+    **_numbers(stderr="[unit]", dof="degrees of freedom", range_low="[unit]", range_high="[unit]"),
+    **_numbers(lower="bound [unit]", upper="bound [unit]"),
+    "at_bound": _flag("whether it is at a bound"),
+    "source": _text("of the given value"),
+    "note": _text("why it has no interval"),
+}
+_WIDTHS = {
+    "name": _text("parameter"),
+    "value": Member("[unit]"),
+    "unit": _text("SI"),
+    "given": Member("before [unit]"),
+    "too_stiff": _flag("whether narrower ones take too many steps"),
+}
+_WINDOW = _numbers(duration="[s]", shortest="tried [s]", longest="tried [s]", gap_share="of the cost [1]")
+_METRICS = "a row a reference or case, a column a metric, in the metric's unit"
+_GAINS = {
+    "name": _text("parameter"),
+    **_numbers(value="[unit]"),
+    "unit": _text("SI"),
+    **_numbers(lower="bound [unit]", upper="bound [unit]"),
+    **{n: _flag(n) for n in ("log", "free", "per_log")},
+    "source": _text("of the value"),
+}
+_REQUIREMENTS = {
+    "name": _text("metric"),
+    **_numbers(claimed="by the search", certified="by the independent simulation", allowed="limit", room="left [1]"),
+    "case": _text("where it is worst"),
+    "active": _flag("whether it holds the objective back"),
+}
+_DITHER = {
+    "usefulness": _text("useful, useless, harmful, ..."),
+    "reasons": Member("in words", Holds.TEXTS),
+    "rival": Member("gains tuned without it", Holds.NUMBERS, is_optional=True),
+}
+_NAMED = {"name": _text("what the row is of")}
+_READ = {
+    **{n: _text(m) for n, m in {"log": "name", "file": "path", "sidecar": "path, or empty"}.items()},
+    **{n: Member(n.replace("_", " "), Holds.COUNT) for n in ("rows", "first_row")},
+    **_numbers(begin="[s]", end="[s]", sample_time="[s]"),
+    "channels": Member("by channel: column, unit and what says so", Holds.RECORDS),
+    **{n: Member(m, Holds.TEXTS) for n, m in {"unread": "columns", "remarks": "what was mended or skipped"}.items()},
+}
+_ASSUMED = {
+    "name": _text("parameter or option"),
+    "value": Member("[unit]", Holds.VALUE),
+    "unit": _text("SI"),
+    "key": _text("what states it"),
+}
+_FOUND = {
+    **{n: _text(m) for n, m in {"severity": "fault, doubt or note", "log": "name", "check": "name"}.items()},
+    "rows": Member("first and last", Holds.COUNTS, is_optional=True),
+    "message": _text("what is wrong, and the remedy"),
+}
+
+
+def _output(meaning: str, **members: Member) -> Member:
+    return Member(meaning, Holds.RECORD, members)
+
+
+_STOPPED = _optional(replace(_STATUS, meaning="only where it was interrupted"))
+OUTPUTS: Mapping[str, Member] = {
+    "check": _output(
+        "`pneuopt check`",
+        verdict=_text("whether a fit takes the logs"),
+        read=_rows("a row a log", _READ),
+        assumed=_rows("values that stand in no file", _ASSUMED),
+        found=_rows("what is wrong", _FOUND),
+        identifiable=_rows("a row a free parameter", _IDENTIFIABLE),
+        reasons=Member("why one is not, by parameter", Holds.WORDS),
+        runs=Member("by run that would help: the parameters", Holds.LISTS),
+    ),
+    "identify": _output(
+        "`pneuopt identify`",
+        status=_STATUS,
+        estimates=_rows("a row a free parameter", _ESTIMATES),
+        fit=_FIT,
+        verdict=_VERDICT,
+        widths=_rows("widths that the logs have chosen", _WIDTHS),
+        window=Member("windows in which logs were fitted", Holds.RECORD, _WINDOW, is_optional=True),
+        bootstrap=_optional(_rows("with --bootstrap, a row an estimate", _NAMED, is_open=True)),
+        stats=_STATS,
+        provenance=_PROVENANCE,
+    ),
+    "select": _output(
+        "`pneuopt identify --select`",
+        status=_STATUS,
+        recommended=_text("a model"),
+        reason=_text("in a sentence"),
+        candidates=_rows("a row a model, the best first", _NAMED, is_open=True),
+    ),
+    "tune": _output(
+        "`pneuopt tune`",
+        status=_STATUS,
+        gains=_rows("a row a tuned parameter", _GAINS),
+        claimed=_rows(f"by the search; {_METRICS}", _NAMED, is_open=True),
+        certified=_rows(f"by the independent simulation; {_METRICS}", _NAMED, is_open=True),
+        requirements=_rows("a row an objective or limit", _REQUIREMENTS),
+        relaxations=_rows("where limits contradict each other, a row a limit", _NAMED, is_open=True),
+        active=Member("what keeps the objective from being smaller", Holds.TEXTS),
+        notes=Member("what the certificate notes", Holds.TEXTS, is_optional=True),
+        validation=_optional(_rows("on new plants, a row a requirement", _NAMED, is_open=True)),
+        dither=Member("the verdict on the dither", Holds.RECORD, _DITHER, is_optional=True),
+        stats=_STATS,
+        provenance=_PROVENANCE,
+    ),
+    "simulate": _output(
+        "`pneuopt simulate FIT TUNING`", certified=_rows(_METRICS, _NAMED, is_open=True), provenance=_PROVENANCE
+    ),
+    "predict": _output("`pneuopt simulate FIT --log LOG`", fit=_FIT, provenance=_PROVENANCE),
+    "study": _output(
+        "`pneuopt study` of cases",
+        status=_STOPPED,
+        verdict=_text("how many hold"),
+        cases=_rows("a row a case: parameters, metrics, seconds, error", {"case": _text("name")}, is_open=True),
+        provenance=_PROVENANCE,
+    ),
+    "front": _output(
+        "`pneuopt study` of a [pareto]",
+        status=_STOPPED,
+        verdict=_text("how many are certified"),
+        designs=_rows("a row a design: both requirements, gains, error", {"error": _text("or empty")}, is_open=True),
+        units=Member("of requirements and gains", Holds.WORDS),
+        provenance=_PROVENANCE,
+    ),
+    "next-experiment": _output(
+        "`pneuopt next-experiment`",
+        design=_rows("a row a free parameter, before and after the runs", _NAMED, is_open=True),
+        stats=_STATS,
+        provenance=_PROVENANCE,
+    ),
+    "track": _output(
+        "`pneuopt track`",
+        drift=_rows("a row a parameter", _NAMED, is_open=True),
+        history=_rows("a row a parameter and date", {}, is_open=True),
+        design=_optional(_rows("with --tuned, a row a date", {}, is_open=True)),
+        provenance=_PROVENANCE,
+    ),
+}
+"""The outputs by name, and their members."""
