@@ -17,7 +17,7 @@ _ANY: dict[str, Any] = {"type": ["number", "string", "boolean", "null"]}
 
 
 class Holds(Enum):
-    """What a member holds, in words; the schema of each stands in `_FORMS`."""
+    """What a member holds, in words; the schema of each stands in `_SCHEMAS`."""
 
     TEXT = "text"
     TEXTS = "list of texts"
@@ -85,7 +85,7 @@ def _describe(member: Member) -> str:
 
 
 def _schema(member: Member) -> dict[str, Any]:
-    return {"description": member.meaning, **_FORMS[member.holds](member)}
+    return {"description": member.meaning, **_SCHEMAS[member.holds](member)}
 
 
 def _record(member: Member) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def _by_name(values: dict[str, Any]) -> dict[str, Any]:
     return {"type": "object", "additionalProperties": values}
 
 
-_FORMS: Mapping[Holds, Any] = {
+_SCHEMAS: Mapping[Holds, Any] = {
     Holds.TEXT: lambda _: {"type": "string"},
     Holds.TEXTS: lambda _: {"type": "array", "items": {"type": "string"}},
     Holds.NUMBER: lambda _: _NUMBER,
