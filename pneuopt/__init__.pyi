@@ -64,7 +64,9 @@ from .evaluation.requirements import (
 from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
+from .export.block_settings import export_settings
 from .export.targets import Language, export_controller
+from .export.vendor_blocks import Block
 from .files.drive import read_drive, write_fit
 from .files.results import load_result
 from .files.tuning import read_tuning, write_tuned
@@ -167,6 +169,7 @@ __all__ = [
     "Asymmetric",
     "BandCentre",
     "BatchEvaluation",
+    "Block",
     "Bootstrap",
     "Certificate",
     "Checkup",
@@ -307,6 +310,7 @@ __all__ = [
     "examine_logs",
     "expected_plants",
     "export_controller",
+    "export_settings",
     "find_limit_cycle",
     "frequency_response",
     "friction_ladder",

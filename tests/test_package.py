@@ -107,6 +107,8 @@ PUBLIC_NAMES = [
     "Knocker",
     "Language",
     "export_controller",
+    "export_settings",
+    "Block",
     "LeastSquares",
     "LimitCycle",
     "linear_plant",

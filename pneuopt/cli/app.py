@@ -245,7 +245,14 @@ def study_command(
 def export_command(
     fit: Annotated[Path, typer.Argument(metavar="FIT", help="fit.toml, or a drive.toml: the plant, for units.")],
     tuned: Annotated[Path, typer.Argument(metavar="TUNED", help="tuned.toml: the controller.")],
-    to: Annotated[str, typer.Option(metavar="FORM", help="c, st (IEC 61131-3 structured text) or python.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            metavar="FORM",
+            help="c, st (IEC 61131-3 structured text), python; or the settings of a PID block: siemens, rockwell, "
+            "beckhoff, codesys, simulink.",
+        ),
+    ],
     folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where to write.")] = Path(),
     name: Annotated[
         str, typer.Option(metavar="NAME", help="Of the block and its files.", show_default="controller")
@@ -253,7 +260,7 @@ def export_command(
     uncertified: Annotated[bool, typer.Option("--uncertified", help="Export gains that no certificate holds.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
 ) -> None:
-    """Write a tuned sampled controller as C99, structured text or Python."""
+    """Write a tuned sampled controller as C99, structured text or Python, or as the settings of a maker's PID block."""
     with report_errors():
         from pneuopt.cli.export import run_export
 

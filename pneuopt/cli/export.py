@@ -5,11 +5,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from pneuopt.cli.exit_status import EXIT_SUCCESS
 from pneuopt.cli.init import write_files
 from pneuopt.cli.shared import read_fit_and_tuning, warn
 from pneuopt.cli.terminal import make_console, show_output_files
+from pneuopt.export.block_settings import export_settings
 from pneuopt.export.targets import Language, export_controller
+from pneuopt.export.vendor_blocks import Block
 from pneuopt.files.drive import read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require
@@ -26,7 +30,7 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
     ----------
     fit, tuned : Path
     to : str
-        A `Language`.
+        A `Language` or a `Block`, whose settings are shown, too.
     folder : Path
         Made where it is missing.
     name : str
@@ -35,13 +39,20 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
     force : bool
         Whether old files may be replaced.
     """
-    languages = {language.value: language for language in Language}
-    check_names("form", [to], languages, "export --to")
+    languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
+    check_names("form", [to], {**languages, **blocks}, "export --to")
     task, parameters = read_fit_and_tuning(fit, tuned)
     origin = [*_certificate_lines(tuned, uncertified), *_source_lines(fit, tuned)]
-    files = export_controller(task.loop, parameters, languages[to], name=name, centre=task.centre, origin=origin)
+    given = (task.loop, parameters)
+    if to in languages:
+        files = export_controller(*given, languages[to], name=name, centre=task.centre, origin=origin)
+    else:
+        block = blocks[to]
+        files = export_settings(*given, block, task.references, name=name, centre=task.centre, origin=origin)
     placed = {folder / file: text for file, text in files.items()}
     write_files(placed, force)
+    if to in blocks:
+        typer.echo("".join(files.values()))
     show_output_files(make_console(), list(placed))
     return EXIT_SUCCESS
 

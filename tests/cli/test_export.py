@@ -133,3 +133,13 @@ def test_a_form_that_is_not_known_and_a_bad_name_are_refused(place: Path) -> Non
     assert result.exit_code == 2
     assert "a block's name has letters" in result.stderr
     assert list(place.glob("*.c")) == []
+
+
+def test_the_settings_of_a_block_are_shown_and_written(place: Path) -> None:
+    result = run("export fit.toml tuned.toml --to siemens -o plc")
+    assert result.exit_code == 0, result.stderr
+    text = (place / "plc" / "controller_siemens.txt").read_text("ascii")
+    assert text in result.stdout
+    assert "Retain.CtrlParams.Gain" in text
+    assert "from tuned.toml, sha256 " in text
+    assert "its integral is clamped at a limit" in text

@@ -1,0 +1,122 @@
+"""The gains for makers' PID blocks: the numbers by the makers' own formulas, and the design as the block runs it."""
+
+import re
+
+import pytest
+
+from pneuopt.control.forms import Form, SeriesForm, to_parallel
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID, AntiWindup
+from pneuopt.control.reference import Step
+from pneuopt.evaluation.evaluate import evaluate
+from pneuopt.export.block_settings import export_settings, run_as_block
+from pneuopt.export.vendor_blocks import BLOCK_FORMS, Block
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.parameters import ParameterSet
+
+GAINS = {"pid.Kp": 200.0, "pid.Ki": 4000.0, "pid.Kd": 0.5, "pid.Tf": 4.6e-3, "pid.b": 0.8}
+STEP = Step(0.2, horizon=0.6)
+
+
+def saturated(dead_band: bool = False) -> tuple[ClosedLoop, ParameterSet]:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(2e-3, dead_band=dead_band))
+    return loop, loop.parameters.with_values({**GAINS, "pid.lower": -46.0, "pid.upper": 46.0})
+
+
+def settings(block: Block, centre: float = 0.0) -> dict[str, float]:
+    """The numbers of the settings by their names."""
+    loop, given = saturated()
+    (text,) = export_settings(loop, given, block, Step(0.2, horizon=0.02), centre=centre).values()
+    rows = re.findall(r"^  (\S.*?)  +(T#)?(-?[\d.e+-]+)(?:ms)?  ", text.partition("Formula:")[0], re.MULTILINE)
+    return {name: float(value) / (1000 if time else 1) for name, time, value in rows}
+
+
+def test_the_numbers_make_the_design_by_each_makers_formula() -> None:
+    """Kp, Ki, Kd and Tf again, from what is typed in."""
+    s = settings(Block.SIEMENS)
+    Kp, Ti, Td = s["Retain.CtrlParams.Gain"] * 92 / 100, s["Retain.CtrlParams.Ti"], s["Retain.CtrlParams.Td"]
+    assert (Kp, Kp / Ti, Kp * Td, s["Retain.CtrlParams.TdFiltRatio"] * Td) == pytest.approx((200, 4000, 0.5, 4.6e-3))
+    s = settings(Block.ROCKWELL)
+    R = 92.0
+    assert s["PID independent: Kp"] * R == pytest.approx(200)
+    assert s["PID independent: Ki [1/s]"] * R == pytest.approx(4000)
+    assert s["PID independent: Kd [s]"] * R == pytest.approx(0.5)
+    Kc, Ti, Td = (s[f"PID dependent: {n}"] for n in ("Kc", "Ti [min/repeat]", "Td [min]"))
+    assert (Kc * R, Kc * R / (60 * Ti), 60 * Kc * R * Td) == pytest.approx((200, 4000, 0.5))
+    assert (
+        s["PIDE independent: IGain [1/min]"] / 60 * R,
+        s["PIDE independent: DGain [min]"] * 60 * R,
+    ) == pytest.approx((4000, 0.5))
+    s = settings(Block.CODESYS)
+    assert (s["KP"], s["KP"] / s["TN"], s["KP"] * s["TV"]) == pytest.approx((200, 4000, 0.5))
+    s = settings(Block.SIMULINK)
+    assert (s["P"], s["I"], s["D"], 1 / s["N"], 1 / s["Kb"]) == pytest.approx((200, 4000, 0.5, 4.6e-3, 0.1))
+    s = settings(Block.BECKHOFF)
+    assert (s["FB_CTRL_PID: fKp"], s["FB_CTRL_PID: tTn"], s["FB_CTRL_PID: tTd"]) == pytest.approx((200, 0.05, 0.005))
+
+
+def test_the_centre_is_the_output_at_rest() -> None:
+    assert settings(Block.SIEMENS, centre=50.0)["(output at rest)"] == pytest.approx(50.0)
+    assert (settings(Block.CODESYS, centre=50.0)["Y_OFFSET"], settings(Block.CODESYS, centre=50.0)["Y_MAX"]) == (50, 96)
+
+
+@pytest.mark.parametrize("block", Block)
+def test_a_series_form_is_exported_as_its_parallel_one(block: Block) -> None:
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(2e-3, form=Form.SERIES, limits=False))
+    values = {"pid.K": 100.0, "pid.Ti": 0.1, "pid.Td": 0.01, "pid.Tf": 4e-3}
+    own, given, _ = run_as_block(loop, loop.parameters.with_values(values), block)
+    wanted = to_parallel(SeriesForm(100.0, 0.1, 0.01, 4e-3))
+    assert given.value("pid.Kp") == pytest.approx(wanted.Kp)
+    assert given.value("pid.Ki") == pytest.approx(wanted.Ki, rel=0.02)
+    assert own.pid.form is Form.PARALLEL
+
+
+def test_a_block_that_runs_the_design_changes_nothing() -> None:
+    loop, given = saturated()
+    own, values, found = run_as_block(loop, given, Block.SIMULINK)
+    assert found == []
+    mine, theirs = (evaluate(*pair)[STEP.label]["Overshoot"] for pair in ((loop, STEP, given), (own, STEP, values)))
+    assert mine == theirs
+    (text,) = export_settings(loop, given, Block.SIMULINK, STEP).values()
+    assert "The block runs the design as it was tuned." in text
+
+
+def test_what_differs_is_named_simulated_and_shown_beside_the_design() -> None:
+    loop, given = saturated(dead_band=True)
+    own, values, found = run_as_block(loop, given, Block.CODESYS)
+    assert [f.partition(",")[0] for f in found] == [
+        "its integral is clamped at a limit",
+        "it has no dead band of the integral",
+        "its set-point weight b is 1",
+        "its derivative has no filter",
+    ]
+    assert own.pid == PID(2e-3, anti_windup=AntiWindup.CLAMPING)
+    assert (values.value("pid.b"), values.value("pid.Tf")) == (1.0, 0.0)
+    (text,) = export_settings(loop, given, Block.CODESYS, STEP).values()
+    tuned, run = evaluate(loop, STEP, given)[STEP.label], evaluate(own, STEP, values)[STEP.label]
+    assert tuned["Overshoot"] > 1.0 > run["Overshoot"]
+    assert re.search(rf"Overshoot \[%\] +{tuned['Overshoot']:.4g} +{run['Overshoot']:.4g}$", text, re.MULTILINE)
+
+
+def test_beckhoffs_times_are_whole_milliseconds() -> None:
+    loop, given = saturated()
+    _, values, found = run_as_block(loop, given, Block.BECKHOFF)
+    assert any("whole milliseconds: Kd, Tf change" in f for f in found)
+    assert (values.value("pid.Tf"), values.value("pid.Kd")) == pytest.approx((0.005, 0.4))
+    fast = ClosedLoop(ForceDrive(Stribeck()).system(), PID(5e-4))
+    assert any("0.0005 s cannot be set" in f for f in run_as_block(fast, fast.parameters, Block.BECKHOFF)[2])
+
+
+def test_every_block_says_its_formula_and_sources() -> None:
+    for form in BLOCK_FORMS.values():
+        assert form.formula
+        assert len(form.sources) >= 2
+        assert all(text.isascii() and len(text) < 140 for text in (form.formula, *form.sources))
+
+
+def test_gains_that_the_standard_form_cannot_have_are_refused() -> None:
+    loop, given = saturated()
+    with pytest.raises(InputError, match="Kp = 0"):
+        export_settings(loop, given.with_values({"pid.Kp": 0.0}), Block.SIEMENS, STEP)
