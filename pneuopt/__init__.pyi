@@ -144,6 +144,7 @@ from .studies.bootstrap import Bootstrap, bootstrap
 from .studies.cases import grid, read_cases
 from .studies.cluster import open_executor
 from .studies.journal import Journal
+from .studies.local_sensitivity import LocalSensitivity, local_sensitivity
 from .studies.neighbours import search_again, sweep_from_neighbours
 from .studies.processes import Processes
 from .studies.sensitivity import Sensitivity, sensitivity
@@ -222,6 +223,7 @@ __all__ = [
     "Linearisation",
     "Load",
     "LoadDependent",
+    "LocalSensitivity",
     "LogComparison",
     "LogFinding",
     "LogNormal",
@@ -322,6 +324,7 @@ __all__ = [
     "judge_dither",
     "linear_plant",
     "load_result",
+    "local_sensitivity",
     "margins",
     "mean_start",
     "monte_carlo",

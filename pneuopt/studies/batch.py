@@ -236,6 +236,11 @@ def _check_batch(
     require(len(cases) > 0, "a batch needs a case")
     require(0 <= recertify <= 1, f"recertify is a share of the plants between 0 and 1, got {recertify:g}; 0.01 is 1 %")
     require(chunk >= 1, f"chunk must be at least 1, got {chunk}")
+    check_lanes(loop, metrics)
+
+
+def check_lanes(loop: ClosedLoop, metrics: Sequence[str]) -> None:
+    """Refuse metrics that are not read off responses; `InputError` names the remedy."""
     left = [n for n in metrics if n in METRICS and n not in LANE_METRICS]
     require(not left, f"{', '.join(left)}: not read off the lanes' responses; sweep `evaluate` for it")
     check_names("metric", metrics, LANE_METRICS, "metrics")

@@ -48,7 +48,7 @@ class Fleet:
         self.varied = list(dict.fromkeys(n for values in self._cases for n in values))
         check_names("parameter", self.varied, self._order, "cases")
         self._places = [self._order[n] for n in self.varied]
-        self._nominal = np.array([p.value for p in self._full.values()])
+        self.nominal = np.array([p.value for p in self._full.values()])
         self._values = np.array(
             [[v.get(n, self._full.value(n)) for n in self.varied] for v in self._cases], dtype=float
         )
@@ -57,18 +57,22 @@ class Fleet:
         self._held: tuple[Any, ...] = ()
         self._rollout = Rollout(loop_pieces(loop, self._channels))
         fastest = {"dither.frequency": self._most("dither.frequency")} if "dither.frequency" in self.varied else {}
-        self._grids = reference_grids(loop, steps, self._full.with_values(fastest))
-        self._starts = [self._shared_start(grid.reference) for grid in self._grids]
+        self.grids = reference_grids(loop, steps, self._full.with_values(fastest))
+        self._starts = [self._shared_start(grid.reference) for grid in self.grids]
         rate = max(RATE_MARGIN * self._fastest_mode(), dither_resolution_rate(loop, self._full))
-        self._substeps = [rk4_substeps(rate, grid.spacing) for grid in self._grids]
+        self.substeps = [rk4_substeps(rate, grid.spacing) for grid in self.grids]
+
+    def nominal_value(self, name: str) -> float:
+        """Of a parameter."""
+        return float(self._full.value(name))
 
     def column(self, metric: str, grid: ReferenceGrid) -> str:
         """Heading of a metric's column."""
-        return metric if len(self._grids) == 1 else f"{metric}[{grid.reference.label}]"
+        return metric if len(self.grids) == 1 else f"{metric}[{grid.reference.label}]"
 
     def empty_columns(self) -> dict[str, Array]:
         """The metrics' columns, NaN."""
-        return {self.column(n, g): np.full(len(self._cases), nan) for g in self._grids for n in self.metrics}
+        return {self.column(n, g): np.full(len(self._cases), nan) for g in self.grids for n in self.metrics}
 
     def varied_columns(self) -> dict[str, Array]:
         """The parameters in which the plants differ."""
@@ -76,7 +80,7 @@ class Fleet:
 
     def measure(self, rows: Indices, columns: Mapping[str, Array]) -> None:
         """Run some plants on every reference and fill their rows of the columns."""
-        for grid, start, substeps in zip(self._grids, self._starts, self._substeps, strict=True):
+        for grid, start, substeps in zip(self.grids, self._starts, self.substeps, strict=True):
             own, x0 = self._start_states(rows, grid.reference, start)
             if not len(own):
                 continue
@@ -94,7 +98,7 @@ class Fleet:
 
     def _run(self, own: Indices, x0: Array, grid: ReferenceGrid, substeps: int) -> tuple[Array, Array, Mask]:
         """Parameters and outputs of plants, and which of them do not run away."""
-        p = np.tile(self._nominal, (len(own), 1))
+        p = np.tile(self.nominal, (len(own), 1))
         p[:, self._places] = self._values[own]
         if self._held[:2] != (
             grid,
@@ -124,14 +128,15 @@ class Fleet:
             if self.errors[k]:
                 continue
             try:
-                states.append(shared if shared is not None else self._start(self._cases[k], step))
+                states.append(shared if shared is not None else self.start(self._cases[k], step))
                 good.append(k)
             except PneuoptError as error:
                 self.errors[k] = str(error)
         found = np.reshape(states, (len(good), len(self.loop.states)))
         return np.array(good, dtype=np.intp), np.pad(found, ((0, 0), (0, int(has_integral(self.loop)))))
 
-    def _start(self, values: Mapping[str, float], step: Step) -> Array:
+    def start(self, values: Mapping[str, float], step: Step) -> Array:
+        """The state before a step of the plant with these values."""
         return TuningCase(step, "", values).initial(self.loop, self._full)
 
     def _shared_start(self, step: Step) -> Array | None:
@@ -141,7 +146,7 @@ class Fleet:
         least and the greatest value of each parameter, and the first.
         """
         try:
-            states = [self._start(self._cases[k], step) for k in self._extremes()]
+            states = [self.start(self._cases[k], step) for k in self._extremes()]
         except PneuoptError:
             return None
         room = SAME_START * np.array([q.nominal for q in self.loop.states])
@@ -159,17 +164,17 @@ class Fleet:
         good = np.flatnonzero([not e for e in self.errors])
         spread = good[np.unique(np.linspace(0, len(good) - 1, MAX_PROBED).astype(int))] if len(good) else good
         probed = np.unique([*self._extremes(), *spread.tolist()]).astype(int)
-        p = np.tile(self._nominal, (len(probed) + 1, 1))
+        p = np.tile(self.nominal, (len(probed) + 1, 1))
         p[1:, self._places] = self._values[probed]
-        return float(fastest_eigenvalue(self.loop, p, [x for grid in self._grids for x in self._along(grid)]).max())
+        return float(fastest_eigenvalue(self.loop, p, [x for grid in self.grids for x in self._along(grid)]).max())
 
     def _along(self, grid: ReferenceGrid) -> list[Array]:
         """States along the nominal plant's response, its start first."""
-        start = self._start({}, grid.reference)
+        start = self.start({}, grid.reference)
         x0 = np.pad(start, (0, int(has_integral(self.loop))))[None]
         u, t, h = (a[None] for a in grid.pad(len(grid.t)))
         every = max(1, len(grid.t) // 10)
-        found = self._rollout.run(x0, u, self._nominal, t, h, substeps=MAX_LOOP_SUBSTEPS // 4, states=every).x
+        found = self._rollout.run(x0, u, self.nominal, t, h, substeps=MAX_LOOP_SUBSTEPS // 4, states=every).x
         assert found is not None
         rows = np.vstack([start, found[0][:, : len(start)]])
         return list(rows[np.isfinite(rows).all(axis=1)])

@@ -2,11 +2,13 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import pandas as pd
 import pytest
 from matplotlib.patches import Rectangle
 
 from pneuopt.plotting import plot_sensitivity
 from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.studies.local_sensitivity import LocalSensitivity
 from pneuopt.studies.sensitivity import sensitivity
 
 CUBE = ParameterSet(dict.fromkeys(("little", "much"), Parameter(1.0, "1")))
@@ -28,6 +30,17 @@ def test_bars_are_the_indices_and_what_is_left_out_is_said() -> None:
     own = found.table.loc["SettlingTime"]
     assert widths == pytest.approx([*own["total"][["much", "little"]], *own["first"][["much", "little"]]])
     assert [text.get_text() for text in picture.texts] == ["3 of 4 figures"]
+
+
+def test_a_third_bar_is_the_share_by_the_slope_at_a_design() -> None:
+    with ThreadPoolExecutor(1) as executor:
+        found = sensitivity(figures, CUBE, dict.fromkeys(CUBE, 0.1), count=32, executor=executor)
+    index = pd.MultiIndex.from_product([["SettlingTime", "Overshoot"], ["little", "much"]], names=["figure", "axis"])
+    shares = pd.DataFrame({"share": [0.1, 0.9, float("nan"), 0.5]}, index=index)
+    panels = plot_sensitivity(found, LocalSensitivity(shares, pd.DataFrame())).axes
+    widths = [[bar.get_width() for bar in panel.patches if isinstance(bar, Rectangle)][4:] for panel in panels]
+    assert widths == [[0.9, 0.1], [0.5, 0.0], [0.0, 0.0]]  # "much" stands on top
+    assert [text.get_text() for text in panels[0].get_yticklabels()] == ["much", "little"]
 
 
 def test_panels_have_one_scale_whose_end_is_the_whole_variance_for_a_constant_too() -> None:

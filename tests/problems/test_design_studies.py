@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 import pneuopt as po
-from problems.tune import ablate_dither, friction_tolerance, sample_time, valve_sizing
+from problems.tune import ablate_dither, friction_tolerance, sample_time, tolerance_sensitivity, valve_sizing
 
 RIPPLE, GAINS = 1e-3, {"pid.Kp": 1.0, "pid.Ki": 1.0, "pid.Kd": 0.0, "pid.Tf": 0.01}
 
@@ -69,3 +69,17 @@ def test_a_part_that_is_left_out_may_not_be_missed() -> None:
     assert np.isnan(values["2_percent.neither.settling_time"])
     parts[0.02, "all"] = {"SettlingTime": 0.25, "Ripple": RIPPLE}
     assert not rows_of(ablate_dither.main(ablate_dither.Job(parts)))[1]["parts.2_percent"]
+
+
+def test_slopes_are_held_to_central_differences_on_the_scale_of_all_axes() -> None:
+    axes = ["load.mass", "friction.coulomb + friction.static"]
+    index = pd.MultiIndex.from_product([tolerance_sensitivity.METRICS, axes], names=["figure", "axis"])
+    table = pd.DataFrame({"change": 3.0, "relative": 1.0, "share": 0.5, "first": 0.4}, index=index)
+    about = pd.DataFrame({"value": 1.0, "std": 10.0}, index=tolerance_sensitivity.METRICS)
+    job = tolerance_sensitivity.Job(
+        po.LocalSensitivity(table, about), po.Sensitivity(table, about, table), dict.fromkeys(index, 3.2)
+    )
+    values, hold = rows_of(tolerance_sensitivity.main(job))
+    assert values["SettlingTime.friction.coulomb.change"] == 3.0
+    assert values["Overshoot.apart"] == pytest.approx(0.02)
+    assert all(hold[f"{metric}.apart"] for metric in tolerance_sensitivity.METRICS)
