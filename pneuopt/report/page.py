@@ -1,5 +1,7 @@
 """`Page`: what a page holds, and how it becomes HTML. The template beside this file says how it looks."""
 
+import base64
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
@@ -63,12 +65,15 @@ class Page:
     sections : tuple of Section
     warnings : tuple of str
         What to know before any figure is believed; stands below the verdict.
+    script : callable, optional
+        Makes what moves the page's last part, `live_script`; no other script runs in the page.
     """
 
     title: str
     verdict: Report
     sections: tuple[Section, ...]
     warnings: tuple[str, ...] = ()
+    script: Callable[[], str] | None = None
 
 
 def write_page(path: str | Path, page: Page, *, draws: bool = True) -> None:
@@ -79,7 +84,7 @@ def write_page(path: str | Path, page: Page, *, draws: bool = True) -> None:
     path : str or Path
     page : Page
     draws : bool
-        Whether its figures are drawn; an interrupted command leaves them out.
+        Whether its figures are drawn and its script is made; an interrupted command leaves them out.
 
     Raises
     ------
@@ -113,8 +118,15 @@ def render_page(page: Page, *, draws: bool = True) -> str:
     verdict = list(blocks((page.verdict,)))
     tones = [block.get("tone", Tone.PLAIN.value) for block in verdict]
     tone = max(tones, key=_SEVERITY.index, default=Tone.PLAIN.value)
+    script = page.script() if page.script is not None and draws else ""
     text = environment.from_string(template).render(
-        title=page.title, tone=tone, verdict=verdict, warnings=page.warnings, sections=sections
+        title=page.title,
+        tone=tone,
+        verdict=verdict,
+        warnings=page.warnings,
+        sections=sections,
+        script=Markup(script),
+        script_hash=Markup(base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()),
     )
     return replace_unprintable(text)  # of a file's name, say, whose bytes are no letters
 

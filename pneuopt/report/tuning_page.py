@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop
@@ -16,6 +17,7 @@ from pneuopt.quantities.status import report_status
 from pneuopt.report.data import provenance_section
 from pneuopt.report.fit_page import Source
 from pneuopt.report.gains import report_forms, report_settings
+from pneuopt.report.live import live_script
 from pneuopt.report.loop_figures import diagram_picture, loop_figures, loop_pictures
 from pneuopt.report.page import Page, Picture, Section
 from pneuopt.tuning.report import (
@@ -72,6 +74,12 @@ class LoopView:
         """The steps and the Bode plot for a page."""
         return loop_pictures(self.figures, compared=self.before is not None)
 
+    def script(self, limits: Mapping[str, float], certified: "pd.DataFrame | None") -> str:
+        """What moves the page's last part, see `live_script`."""
+        return live_script(
+            self.loop, self.references, self.parameters, band=self.band, limits=limits, certified=certified
+        )
+
 
 def tuning_page(
     source: Source,
@@ -115,7 +123,8 @@ def tuning_page(
         provenance_section(result.provenance, source.hashes),
     )
     defects = tuple(f.sentence for f in certificate.findings) if certificate is not None else ()
-    return Page(source.title, verdict, sections, (*defects, *source.warnings))
+    script = None if view is None else partial(view.script, result.limits, result.certified if found else None)
+    return Page(source.title, verdict, sections, (*defects, *source.warnings), script)
 
 
 def simulation_page(
@@ -146,7 +155,8 @@ def simulation_page(
         _loop_section(view),
         provenance_section({}, source.hashes),
     )
-    return Page(source.title, verdict, sections, source.warnings)
+    script = None if view is None else partial(view.script, limits or {}, found.metrics)
+    return Page(source.title, verdict, sections, source.warnings, script)
 
 
 def _design_sections(

@@ -40,10 +40,11 @@ def write_report(
     parameters: ParameterSet | None = None,
     band: float = 0.02,
 ) -> None:
-    """Write a result as one page of HTML that needs no network and no script: verdict first, figures where they belong.
+    """Write a result as one page of HTML that needs no network: verdict first, figures where they belong, hashes.
 
     The same result gives the same page, to the letter. A result that did not converge gets its page, too, which says
-    so first. Results hold no models and no logs: what is to be drawn of these is given here.
+    so first. Results hold no models and no logs: what is to be drawn of these is given here. The page of a loop ends
+    with sliders, which a script within it follows by simulating the loop; without scripts only they are missing.
 
     Parameters
     ----------

@@ -1,5 +1,7 @@
 """A page as a browser reads it: what is open, in which order, where it leads, and what it says."""
 
+import base64
+import hashlib
 import re
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
@@ -34,7 +36,7 @@ class Read(HTMLParser):
             self.wrong.append(tag)
 
     def handle_data(self, data: str) -> None:
-        if data.strip() and "style" not in self.open[-1:]:
+        if data.strip() and self.open[-1:] not in (["style"], ["script"]):
             self.words.append((self.open[-1] if self.open else "", " ".join(data.split())))
 
     @property
@@ -53,7 +55,8 @@ def read_page(page: str | Path) -> Read:
     found.close()
     assert (found.open, found.wrong) == ([], []), "every tag is closed, in its order"
     names = [name for name, _ in found.tags]
-    assert not {"script", "link", "iframe", "object", "base", "form"} & set(names)
+    assert names.count("script") == ("script-src 'sha256-" in text), "no script, or our own, by its hash"
+    assert not {"link", "iframe", "object", "base", "form"} & set(names)
     for _, attrs in found.tags:
         assert not any(key.startswith("on") for key in attrs), attrs
         for key in ("href", "xlink:href", "src", "action"):
@@ -64,6 +67,9 @@ def read_page(page: str | Path) -> Read:
     assert "url(" not in styles[0]
     assert "@import" not in styles[0]
     assert "http" not in text.replace("http-equiv", ""), "no address of another page"
+    for script in re.findall("<script>(.*?)</script>", text, re.DOTALL):
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"script-src 'sha256-{digest}'\"" in text
     for svg in found.named("svg"):
         assert svg["role"] == "img"
         assert len(svg["aria-label"] or "") > 20

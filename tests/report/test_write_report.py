@@ -76,7 +76,7 @@ def test_a_certificate_has_steps_margins_and_forms(loop: tuple[ClosedLoop, Param
     place = tmp_path / "a.html"
     po.write_report(found, place, model=made, references=Step(1.0), parameters=parameters)
     read = read_page(place)
-    assert headings(read) == ["Metrics", "Gains in every form", "Margins", "The loop"]
+    assert headings(read) == ["Metrics", "Gains in every form", "Margins", "The loop", "Try it"]
     assert len(read.named("figure")) == 3
     with pytest.raises(InputError, match="give parameters with the loop"):
         po.write_report(found, place, model=made, references=Step(1.0))
