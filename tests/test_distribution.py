@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = {
     path.relative_to(ROOT).as_posix()
     for path in (ROOT / "pneuopt").rglob("*")
-    if path.suffix in (".py", ".pyi", ".c", ".h", ".typed")
+    if path.suffix in (".py", ".pyi", ".c", ".h", ".typed", ".html", ".js")
 }
 ABOUT = {"METADATA", "RECORD", "WHEEL", "entry_points.txt", "licenses/LICENSE", "top_level.txt"}
 
