@@ -14,7 +14,7 @@ from pneuopt.export.header import comment_text
 from pneuopt.export.targets import Language, export_controller
 from pneuopt.models.linear import FirstOrder
 from pneuopt.quantities.errors import InputError, ModelError
-from tests.export.structured_text_run import FunctionBlock
+from problems.shared.structured_text_run import FunctionBlock
 
 HOSTILE = [
     "a */ int evil; /*",

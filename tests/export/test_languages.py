@@ -15,8 +15,8 @@ from pneuopt.export.program import controller_program
 from pneuopt.export.python_class import write_python
 from pneuopt.export.reference_run import ReferenceRun
 from pneuopt.export.structured_text import write_structured_text
-from tests.export.random_controllers import COUNT, run_library
-from tests.export.structured_text_run import FunctionBlock
+from problems.shared.random_controllers import COUNT, run_library
+from problems.shared.structured_text_run import FunctionBlock
 
 GCC = shutil.which("gcc") or shutil.which("clang")
 needs_gcc = pytest.mark.skipif(GCC is None or os.name == "nt", reason="no C compiler on the path")

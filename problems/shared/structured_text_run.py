@@ -52,11 +52,13 @@ class FunctionBlock:
                     self.variables[name] = self.first_value(item.init)
 
     def first_value(self, init: Any) -> Any:
+        """Of a declaration."""
         kind, _, value = str(init).partition(":=")
         assert kind.strip() in ("LREAL", "BOOL")
         return float(value) if value.strip() else {"LREAL": 0.0, "BOOL": False}[kind.strip()]
 
     def call(self, **inputs: float) -> Mapping[str, Any]:
+        """Call it once with these inputs; returns all its variables."""
         for name, value in inputs.items():
             assert name in self.variables
             self.variables[name] = value
@@ -64,6 +66,7 @@ class FunctionBlock:
         return self.variables
 
     def run(self, statements: Any) -> None:
+        """Run assignments and conditions."""
         for s in statements:
             if type(s).__name__ == "IfStatement":
                 if self.value(s.if_expression):
@@ -76,6 +79,7 @@ class FunctionBlock:
             self.variables[str(target.name)] = value
 
     def value(self, e: Any) -> Any:
+        """Of an expression, which never mixes types."""
         kind = type(e).__name__
         if kind == "SimpleVariable":
             return self.variables[str(e.name)]
