@@ -17,7 +17,8 @@ from pneuopt.plotting.loop_diagram import plot_loop
 from pneuopt.plotting.loops import Response, plot_steps
 from pneuopt.plotting.maps import plot_map
 from pneuopt.plotting.sensitivities import plot_sensitivity
-from pneuopt.plotting.svg import replace_unprintable, to_svg
+from pneuopt.plotting.svg import to_svg
+from pneuopt.plotting.texts import replace_unprintable
 from pneuopt.plotting.trackings import plot_tracking
 
 __all__ = [

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pneuopt.logs.columns import CHANNELS
 from pneuopt.logs.experiments import Experiment
+from pneuopt.plotting.texts import mend_texts
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.trajectories import Trajectory
@@ -44,6 +45,7 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> None:
         If the suffix is another one, or the file cannot be written.
     """
     check_figure_path(path)
+    mend_texts(figure)
     content = io.BytesIO()
     figure.savefig(content, format=Path(path).suffix.lower().removeprefix("."), dpi=dpi)
     write_bytes(path, content.getvalue())

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pneuopt.plotting.texts import mend_texts, replace_unprintable
+
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.figure import Figure
-    from matplotlib.text import Text
 
 MAX_VECTOR_MARKERS = 400
 """Markers of a cloud that are drawn as vectors: of more an image is made, as they would fill megabytes."""
@@ -20,7 +21,6 @@ HASH_SALT = "pneuopt"
 """What matplotlib mixes into the names of marks: without it they are random, and no two pages are the same."""
 _LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
 _REFERENCE = re.compile(r"(^#|url\(#)([\w.-]+)")
-_UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
 
 
 def to_svg(figure: "Figure", name: str, alt: str) -> str:
@@ -44,9 +44,8 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
     from matplotlib import rc_context
     from matplotlib.text import Text
 
+    mend_texts(figure)
     texts = [artist for artist in figure.findobj(Text) if isinstance(artist, Text)]
-    for text in texts:
-        _mend_text(text)
     for artist in figure.findobj(_is_large_cloud):
         artist.set_rasterized(True)
     formulas = any(text.get_parse_math() and text.get_text().count("$") > 1 for text in texts)
@@ -54,11 +53,6 @@ def to_svg(figure: "Figure", name: str, alt: str) -> str:
     with rc_context({"svg.hashsalt": HASH_SALT, "svg.fonttype": "path" if formulas else "none"}):
         figure.savefig(content, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
     return _as_element(content.getvalue(), name, alt)
-
-
-def replace_unprintable(text: str) -> str:
-    """A text with a replacement character for each letter that neither XML nor UTF-8 can hold."""
-    return _UNPRINTABLE.sub("\ufffd", text)
 
 
 def _is_large_cloud(artist: "Artist") -> bool:
@@ -71,20 +65,6 @@ def _is_large_cloud(artist: "Artist") -> bool:
             and np.size(artist.get_xdata()) > MAX_VECTOR_MARKERS
         )
     return isinstance(artist, PathCollection) and len(np.asarray(artist.get_offsets())) > MAX_VECTOR_MARKERS
-
-
-def _mend_text(text: "Text") -> None:
-    """Take names from files as they are: replace what XML cannot hold, and read no formula in what is none."""
-    from matplotlib.mathtext import MathTextParser
-
-    words = replace_unprintable(text.get_text())
-    text.set_text(words)
-    if words.count("$") > 1 and text.get_parse_math():
-        try:
-            for line in words.split("\n"):
-                MathTextParser("path").parse(line)
-        except ValueError:
-            text.set_parse_math(False)
 
 
 def _as_element(document: bytes, name: str, alt: str) -> str:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
@@ -236,3 +237,11 @@ def test_a_figure_is_written_by_its_suffix(tmp_path: Path, suffix: str, start: b
     with pytest.raises(InputError, match="the folder does not exist"):
         save_figure(plot_bode(lag(5.0)), tmp_path / "none" / "bode.png")
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_a_name_that_is_a_broken_formula_or_no_letters_is_drawn_as_it_is(tmp_path: Path, suffix: str) -> None:
+    figure = Figure()
+    figure.subplots().set_title("run $\\frac$ \x07 \udcff")
+    save_figure(figure, tmp_path / f"a.{suffix}")
+    assert (tmp_path / f"a.{suffix}").stat().st_size > 1000
