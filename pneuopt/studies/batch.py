@@ -19,6 +19,7 @@ import numpy as np
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Step, as_steps
+from pneuopt.dynamics.compiled.rollout import processor_count
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.meter import check_channels
@@ -43,8 +44,9 @@ if TYPE_CHECKING:
 BATCH_METRICS = ("SettlingTime", "Overshoot", "SteadyStateError", "PeakControl")
 LANE_METRICS = tuple(n for n, m in METRICS.items() if m.source is not Source.LINEAR_LOOP and n != "StepEnvelope")
 """The metrics that lanes can tell: those of the response, the command and the meter."""
-CHUNK = 64
-"""Plants that are run and read at a time: fewer leave cores idle; the responses of more do not fit a cache."""
+CHUNK_A_CORE = 8
+"""Plants that a core runs before they are read: fewer fill no lanes; the responses of more leave its cache, for fresh
+pages, and 16 take two fifths longer."""
 USUAL_TOLERANCE = 0.01
 """Share of a metric, or of its median over the plants, by which lanes and certificate may differ: a search claims no
 figure that differs by more."""
@@ -106,7 +108,7 @@ def evaluate_batch(
     recertify: float = 0.01,
     tolerance: float = USUAL_TOLERANCE,
     seed: int = 0,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     executor: Executor | Processes | None = None,
     progress: Callable[[Progress], None] | None = None,
     journal: Journal | None = None,
@@ -131,8 +133,8 @@ def evaluate_batch(
         Share of a metric, or of its median over the plants if that is larger, by which the lanes may differ.
     seed : int
         Of the random share.
-    chunk : int
-        Plants that run at a time; memory grows with it, the table does not depend on it.
+    chunk : int, optional
+        Plants that run at a time, by default 8 a core; memory grows with it, the table does not depend on it.
     executor : concurrent.futures.Executor or Processes, optional
         Where the chosen plants are certified, as for `sweep`; the lanes run on all cores of this machine.
     progress : callable, optional
@@ -168,6 +170,7 @@ def evaluate_batch(
     steps, chosen = as_steps(references), tuple(dict.fromkeys(metrics))
     check_parameters(parameters)
     check_closed_loop(loop)
+    chunk = CHUNK_A_CORE * processor_count() if chunk is None else chunk
     _check_batch(loop, chosen, cases, recertify, chunk)
     cases = {str(name): values for name, values in cases.items()}
     fleet = Fleet(add_disturbances(loop, steps), steps, parameters, cases, chosen, band)

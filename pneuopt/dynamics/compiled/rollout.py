@@ -131,7 +131,7 @@ class Rollout:
         self.n_outputs = self._functions["output"].size1_out(0)
         self.n_columns = len(tuple(wrt)) + (self.n_states if start else 0)
         self._starts = self.n_states if start else 0
-        self._threads = threads or _processor_count()
+        self._threads = threads or processor_count()
         choices = ("SIMD", "LANES=1") if lanes is None else (f"LANES={lanes}",)
         self._library = compile_library(source, *choices) if source and lanes != 0 else None
         self.lanes = 0 if self._library is None else ctypes.c_int.in_dll(self._library, "rollout_lanes").value
@@ -317,7 +317,7 @@ def _call_part(function: Callable[..., None], call: tuple[object, ...], kept: tu
     function(*call)
 
 
-def _processor_count() -> int:
+def processor_count() -> int:
     """Processors that this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)  # Linux only
     return len(allowed(0)) if allowed else os.cpu_count() or 1
