@@ -293,6 +293,7 @@ OUTPUTS: Mapping[str, Member] = {
         status=_STOPPED,
         verdict=_text("how many hold"),
         cases=_rows("a row a case: parameters, metrics, seconds, error", {"case": _text("name")}, is_open=True),
+        checks=_optional(_rows("of a batch, a row a certified metric", {"case": _text("name")}, is_open=True)),
         provenance=_PROVENANCE,
     ),
     "front": _output(
