@@ -116,6 +116,7 @@ from .models.sensing import coarse_delay, with_sensors
 from .plotting import (
     plot_bode,
     plot_correlation,
+    plot_distribution,
     plot_fit,
     plot_friction,
     plot_front,
@@ -334,6 +335,7 @@ __all__ = [
     "pareto_front",
     "plot_bode",
     "plot_correlation",
+    "plot_distribution",
     "plot_fit",
     "plot_friction",
     "plot_front",

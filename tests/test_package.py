@@ -147,6 +147,7 @@ PUBLIC_NAMES = [
     "PID",
     "plot_bode",
     "plot_correlation",
+    "plot_distribution",
     "plot_fit",
     "plot_friction",
     "plot_front",

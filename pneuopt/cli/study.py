@@ -34,7 +34,7 @@ from pneuopt.files.drive import read_drive
 from pneuopt.files.study import Study, SweptAxis, read_axes, read_study, swept_axes
 from pneuopt.files.study_cases import Cases, read_study_cases
 from pneuopt.files.tuning import Tuning, read_tuning
-from pneuopt.plotting import plot_map
+from pneuopt.plotting import plot_distribution, plot_map
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.parameters import ParameterSet
@@ -104,7 +104,6 @@ def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -
 def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing) -> int:
     """Certify a loop over a grid or other cases; returns the exit status."""
     file, count = study.path, len(study.axes)
-    require(outputs.plot is None or not study.cases, f"{file}: --plot draws a grid of one or two [axes]; leave it out")
     many = f"{file}: --plot draws one or two axes, there are {count}; leave it out"
     require(outputs.plot is None or count <= MAX_MAP_AXES, many)
     task, parameters = read_fit_and_tuning(study.drive, study.tuning)
@@ -130,7 +129,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     tables = {"verdict": verdict, "cases": records(table), "provenance": file_hashes(file, study.drive, study.tuning)}
     tables |= {} if checks is None else {"checks": records(checks)}
     stopped = Status(Code.INTERRUPTED, (verdict,)) if status == EXIT_INTERRUPTED else None
-    drawn = partial(plot_map, seen, written, metrics)
+    drawn = partial(plot_distribution, seen, metrics) if study.cases else partial(plot_map, seen, written, metrics)
     page = partial(case_page, study, report, drawn, written, metrics)
     finish(outputs, writers, tables, stopped, figures=lambda: {"": drawn()}, report=report, page=page)
     if journal is not None and stopped is None:

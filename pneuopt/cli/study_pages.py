@@ -24,9 +24,11 @@ def case_page(
     axes: Mapping[str, str],
     metrics: Mapping[str, str],
 ) -> Page:
-    """The page of a study's cases; a map of one or two axes."""
+    """The page of a study's cases; a map of one or two axes, or how other cases are distributed."""
     alt = f"{', '.join(metrics)} over {' and '.join(axes)}, a cell or a point a case; what failed is marked."
-    drawn = draw if len(axes) <= MAX_MAP_AXES and not study.cases else None
+    if study.cases:
+        alt = f"Share of the cases that keep a bound, over the bound: {', '.join(metrics)}."
+    drawn = draw if study.cases or len(axes) <= MAX_MAP_AXES else None
     return study_page(_page_source(study), report, drawn, what="Cases", alt=alt)
 
 

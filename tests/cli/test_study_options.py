@@ -61,9 +61,8 @@ def test_samples_are_certified_and_shown(folder: Path) -> None:
     result = run("study study.toml -q -o cases.csv")
     assert result.stdout.startswith("3 cases, each the worst of 2 references")
     assert pd.read_csv("cases.csv")["load.mass [kg]"].between(4, 6).all()
-    assert "--plot draws a grid of one or two [axes]" in " ".join(
-        run("study study.toml -q --plot map.png").stderr.split()
-    )
+    assert run("study study.toml -q --plot shares.png").exit_code == 0
+    assert Path("shares.png").stat().st_size > 0
 
 
 def test_a_batch_is_run_in_lanes_and_the_worst_of_it_are_certified(
