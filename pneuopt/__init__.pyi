@@ -65,6 +65,7 @@ from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
 from .export.block_settings import export_settings
+from .export.fmu import export_fmu
 from .export.targets import Language, export_controller
 from .export.vendor_blocks import Block
 from .files.drive import read_drive, write_fit
@@ -313,6 +314,7 @@ __all__ = [
     "examine_logs",
     "expected_plants",
     "export_controller",
+    "export_fmu",
     "export_settings",
     "find_limit_cycle",
     "frequency_response",

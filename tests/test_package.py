@@ -107,6 +107,7 @@ PUBLIC_NAMES = [
     "Knocker",
     "Language",
     "export_controller",
+    "export_fmu",
     "export_settings",
     "Block",
     "LeastSquares",

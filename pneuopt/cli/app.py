@@ -250,7 +250,7 @@ def export_command(
         typer.Option(
             metavar="FORM",
             help="c, st (IEC 61131-3 structured text), python; or the settings of a PID block: siemens, rockwell, "
-            "beckhoff, codesys, simulink.",
+            "beckhoff, codesys, simulink; or fmu, the plant (FMI 3.0).",
         ),
     ],
     folder: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where to write.")] = Path(),

@@ -12,14 +12,17 @@ from pneuopt.cli.init import write_files
 from pneuopt.cli.shared import read_fit_and_tuning, warn
 from pneuopt.cli.terminal import make_console, show_output_files
 from pneuopt.export.block_settings import export_settings
+from pneuopt.export.fmu import export_fmu
 from pneuopt.export.targets import Language, export_controller
 from pneuopt.export.vendor_blocks import Block
 from pneuopt.files.drive import read_status
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import check_names, require
+from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.source import read_toml_source
 from pneuopt.quantities.status import Code
 
+FMU = "fmu"  # the form that is the plant, not the controller
 NOT_CERTIFIED = "NOT CERTIFIED: no independent simulation stands behind these gains."
 
 
@@ -30,7 +33,7 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
     ----------
     fit, tuned : Path
     to : str
-        A `Language` or a `Block`, whose settings are shown, too.
+        A `Language`, a `Block`, whose settings are shown, too, or "fmu", the plant.
     folder : Path
         Made where it is missing.
     name : str
@@ -40,10 +43,12 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
         Whether old files may be replaced.
     """
     languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
-    check_names("form", [to], {**languages, **blocks}, "export --to")
+    check_names("form", [to], {**languages, **blocks, FMU: None}, "export --to")
     task, parameters = read_fit_and_tuning(fit, tuned)
     origin = [*_certificate_lines(tuned, uncertified), *_source_lines(fit, tuned)]
     given = (task.loop, parameters)
+    if to == FMU:
+        return _write_fmu(folder / f"{name}.fmu", export_fmu(task.loop.plant, parameters, name=name), force)
     if to in languages:
         files = export_controller(*given, languages[to], name=name, centre=task.centre, origin=origin)
     else:
@@ -54,6 +59,19 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
     if to in blocks:
         typer.echo("".join(files.values()))
     show_output_files(make_console(), list(placed))
+    return EXIT_SUCCESS
+
+
+def _write_fmu(path: Path, content: bytes, force: bool) -> int:
+    """Write the plant as an FMU, whole or not at all."""
+    told = "is there already, and stays as it is; --force replaces it, -o names another folder"
+    require(force or not path.exists(), f"{path}: {told}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        require(False, f"{path.parent}: the folder cannot be made ({error.strerror}); name another with -o")
+    write_bytes(path, content)
+    show_output_files(make_console(), [path])
     return EXIT_SUCCESS
 
 

@@ -143,3 +143,12 @@ def test_the_settings_of_a_block_are_shown_and_written(place: Path) -> None:
     assert "Retain.CtrlParams.Gain" in text
     assert "from tuned.toml, sha256 " in text
     assert "its integral is clamped at a limit" in text
+
+
+def test_the_plant_is_written_as_an_fmu(place: Path) -> None:
+    result = run("export fit.toml tuned.toml --to fmu --name axis -o made")
+    assert result.exit_code == 0, result.stderr
+    assert (place / "made" / "axis.fmu").read_bytes().startswith(b"PK")
+    assert "is there already" in run("export fit.toml tuned.toml --to fmu --name axis -o made").stderr
+    result = run("export fit.toml tuned.toml --to fmu -o fit.toml/below")
+    assert (result.exit_code, "the folder cannot be made" in result.stderr) == (2, True)

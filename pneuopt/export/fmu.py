@@ -1,0 +1,104 @@
+"""`export_fmu`: a plant as a source-code FMU for model exchange (FMI 3.0), by CasADi's DaeBuilder."""
+
+import contextlib
+import hashlib
+import io
+import re
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import casadi as ca
+
+from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.export.header import check_name
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.errors import require
+from pneuopt.quantities.parameters import ParameterSet
+
+ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # of the files in an FMU: the same model makes the same bytes
+_MADE_AT, _TOKEN = re.compile(r' generationDateAndTime="[^"]*"'), re.compile(r'instantiationToken="([^"]*)"')
+_DESCRIPTION = "modelDescription.xml"
+
+
+def export_fmu(system: System, parameters: ParameterSet, x: Array | None = None, *, name: str = "plant") -> bytes:
+    """Write a plant as an FMU with C sources, for any tool that imports FMI 3.0 and has a compiler.
+
+    Inputs, states, outputs and tunable parameters have their names here ("load.mass"), an output that is called as a
+    state is called ``out.speed``; all numbers are in SI units. Derivatives are with it.
+
+    Parameters
+    ----------
+    system : System
+        Of a drive: ``drive.system()``. A friction that sticks (`Karnopp`) has no ODE and is simulated here only.
+    parameters : ParameterSet
+        A missing one has the system's default.
+    x : ndarray, shape (n_states,), optional
+        The state at the start; by default the plant's rest.
+    name : str
+
+    Returns
+    -------
+    bytes
+        Of the file ``NAME.fmu``.
+
+    Raises
+    ------
+    InputError
+        If the name is no identifier, or the state has another shape.
+    """
+    check_name(name)
+    start = system.rest_state(parameters, {}) if x is None else x
+    require(len(start) == len(system.states), f"x has {len(start)} entries, the plant {len(system.states)} states")
+    builder = _build(system, parameters, start, name)
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
+        files = builder.export_fmu({"no_warning": True, "with_serialization": False})
+        texts = {str(Path(place)): Path(local).read_text("utf-8") for local, place in files.items()}
+    return _pack(_repair(texts))
+
+
+def _build(system: System, parameters: ParameterSet, start: Array, name: str) -> ca.DaeBuilder:
+    """The equations of a system under its own names."""
+    dae, states = ca.DaeBuilder(name, "", {}), names(system.states)
+    x = {n: dae.add(n) for n in states}
+    u = {n: dae.add(n, "input") for n in names(system.inputs)}
+    p = {n: dae.add(n, "parameter", "tunable") for n in system.parameters}
+    t = dae.add("time", "independent")
+    vectors = (ca.vertcat(*own.values()) for own in (x, u, p))
+    rates, outputs = system.ode(t, *vectors)
+    for k, n in enumerate(states):
+        dae.eq(dae.der(x[n]), rates[k])
+        dae.set_initial(n, "exact")
+        dae.set_start(n, float(start[k]))
+    for k, n in enumerate(names(system.outputs)):
+        own = f"out.{n}" if n in states else n
+        dae.eq(dae.add(own, "output"), outputs[k])
+    values: Mapping[str, float] = dict(
+        zip(system.parameters, parameter_vector(system.parameters, parameters), strict=True)
+    )
+    for n, value in values.items():
+        dae.set_start(n, float(value))
+    return dae
+
+
+def _repair(texts: Mapping[str, str]) -> dict[str, str]:
+    """Say what CasADi's names are, flat ones, and take date and token, which change from call to call, out of it."""
+    description = texts[_DESCRIPTION].replace(
+        'variableNamingConvention="structured"', 'variableNamingConvention="flat"'
+    )
+    description = _MADE_AT.sub("", description)
+    found = _TOKEN.search(description)
+    old = found[1] if found else ""
+    plain = {place: text.replace(old, "") for place, text in {**texts, _DESCRIPTION: description}.items()}
+    token = hashlib.sha256("".join(plain.values()).encode()).hexdigest()[:32]
+    return {n: text.replace(old, token) for n, text in {**texts, _DESCRIPTION: description}.items()}
+
+
+def _pack(texts: Mapping[str, str]) -> bytes:
+    """A zip archive that depends on its texts alone."""
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as target:
+        for place, text in texts.items():
+            target.writestr(zipfile.ZipInfo(place, ZIP_DATE), text)
+    return archive.getvalue()

@@ -1,0 +1,101 @@
+"""The plant as an FMU: FMPy's validation, and the closed loop with the exported controller beside `simulate`."""
+
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi3 import FMU3Model
+from fmpy.validation import validate_fmu
+
+from pneuopt.control.dither import Dither
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.pid import PID
+from pneuopt.dynamics.simulate import simulate
+from pneuopt.dynamics.system import names
+from pneuopt.export.fmu import export_fmu
+from pneuopt.export.targets import Language, export_controller
+from pneuopt.models import catalog
+from pneuopt.models.drive import ForceDrive
+from pneuopt.models.friction import Stribeck
+from pneuopt.quantities.errors import InputError
+from pneuopt.quantities.trajectories import Trajectory
+
+GCC = shutil.which("gcc")
+
+
+def test_it_is_valid_and_the_same_each_time(tmp_path: Path) -> None:
+    drive, rig = catalog.s32()
+    made = export_fmu(drive.system(), rig)
+    assert made == export_fmu(drive.system(), rig)
+    (tmp_path / "plant.fmu").write_bytes(made)
+    assert validate_fmu(str(tmp_path / "plant.fmu")) == []
+    found = {v.name: v for v in fmpy.read_model_description(str(tmp_path / "plant.fmu")).modelVariables}
+    assert float(found["load.mass"].start) == rig.value("load.mass")
+    assert {"valve_voltage", "speed", "out.speed", "pressure_a"} <= set(found)
+
+
+def test_a_bad_name_and_a_bad_state_are_refused() -> None:
+    system = ForceDrive(Stribeck()).system()
+    with pytest.raises(InputError, match="a block's name"):
+        export_fmu(system, system.parameters, name="a b")
+    with pytest.raises(InputError, match="x has 3 entries, the plant 2 states"):
+        export_fmu(system, system.parameters, np.zeros(3))
+
+
+def plant_model(system: "object", folder: Path) -> tuple[FMU3Model, dict[str, int]]:
+    """The FMU, compiled by gcc and instantiated."""
+    path = folder / "plant.fmu"
+    path.write_bytes(export_fmu(system, system.parameters))  # type: ignore[arg-type, attr-defined]
+    zipfile.ZipFile(path).extractall(folder / "fmu")
+    place = folder / "fmu" / "binaries" / "x86_64-linux"
+    place.mkdir(parents=True)
+    headers = Path(fmpy.__file__).parent / "c-code"
+    sources = [str(p) for p in (folder / "fmu" / "sources").glob("*.c")]
+    command = [str(GCC), "-shared", "-fPIC", "-O1", f"-I{headers}", *sources, "-lm", "-o", str(place / "plant.so")]
+    subprocess.run(command, check=True, capture_output=True)
+    described = fmpy.read_model_description(str(path))
+    model = FMU3Model(
+        guid=described.guid, unzipDirectory=str(folder / "fmu"), modelIdentifier="plant", instanceName="plant"
+    )
+    model.instantiate()
+    model.enterInitializationMode()
+    model.exitInitializationMode()
+    model.enterContinuousTimeMode()
+    return model, {v.name: v.valueReference for v in described.modelVariables}
+
+
+@pytest.mark.skipif(GCC is None, reason="no C compiler on the path")
+def test_plant_and_controller_together_are_the_loop(tmp_path: Path) -> None:
+    """The exported Python controller drives the FMU by RK4, 10 steps a sample, beside the library's simulation."""
+    loop = ClosedLoop(ForceDrive(Stribeck()).system(), PID(2e-3), Dither(60.0))
+    values = {"pid.Kp": 200.0, "pid.Ki": 4000.0, "dither.amplitude": 10.0, "pid.lower": -80.0, "pid.upper": 80.0}
+    given = loop.parameters.with_values(values)
+    model, places = plant_model(loop.plant, tmp_path)
+    space: dict[str, type] = {}
+    exec(export_controller(loop, given, Language.PYTHON)["controller.py"], space)
+    controller = space["Controller"]()
+    t = np.arange(0.0, 0.2, 2e-3)
+    wanted = simulate(loop, Trajectory(t, {"reference": np.full(len(t), 0.2)}), given, initial=loop.initial(given))
+    x, found = np.array([0.0, 0.0]), []
+    speed = names(loop.plant.states).index("speed")
+
+    def rates(at: np.ndarray) -> np.ndarray:
+        model.setContinuousStates((fmpy.fmi3.fmi3Float64 * 2)(*at), 2)
+        rate = (fmpy.fmi3.fmi3Float64 * 2)()
+        model.getContinuousStateDerivatives(rate, 2)
+        return np.array(rate)
+
+    for _ in t:
+        found.append(x[speed])
+        model.setFloat64([places["force"]], [controller.step(0.2, x[speed])])
+        for _ in range(10):
+            h, k1 = 2e-4, rates(x)
+            k2 = rates(x + h / 2 * k1)
+            k3 = rates(x + h / 2 * k2)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3))
+    assert np.max(np.abs(np.array(found) - wanted["speed"])) < 1e-5 * 0.2
+    assert np.max(found) > 0.19
