@@ -133,6 +133,10 @@ def identify_command(
             help="Simulate the logs N times with the estimates, and with stick-slip if the fit misses them; fit again.",
         ),
     ] = 0,
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="LOG", help="Predict this log, which the fit has not seen, in the report; repeatable."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Fit parameters to logs, with confidence intervals; --plot adds residuals, friction and correlation."""
@@ -145,7 +149,8 @@ def identify_command(
         require(budget == inf or not select, "--budget limits one fit: leave it out with --select")
         require(draws == 0 or draws >= 2, f"--bootstrap {draws}: a spread takes two sets of logs at least")
         require(not (draws and select), "--bootstrap tries one model's fit: leave it out with --select")
-        raise typer.Exit(run_select(*given) if select else run_identify(*given, budget, draws))
+        require(not held_out or report is not None, "--held-out predicts a log in the report: name it, --report FILE")
+        raise typer.Exit(run_select(*given) if select else run_identify(*given, budget, draws, held_out or ()))
 
 
 @_command("tune")

@@ -70,14 +70,17 @@ def run_identify(
     accept: Sequence[str] = (),
     budget: float = math.inf,
     draws: int = 0,
+    held_out: Sequence[Path] = (),
 ) -> int:
-    """Identify from logs, and from simulated ones if draws are asked for; returns the exit status."""
-    outputs.check(
-        _input_files(drive, logs), "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS, *OTHER_CHECKS
-    )
+    """Identify from logs, and from simulated ones if draws are asked for; returns the exit status.
+
+    Held-out logs are predicted on the page of --report.
+    """
+    figures = "friction", "residuals", "correlation", REFUSAL_FIGURE, *CHECKS, *OTHER_CHECKS
+    outputs.check(_input_files(drive, [*logs, *held_out]), *figures)
     model, parameters = read_free_drive(drive)
     system = model.system()
-    experiments = read_experiments(logs, system, parameters, accept)
+    experiments, others = (read_experiments(own, system, parameters, accept) for own in (logs, held_out))
     found = check(system, experiments, parameters)
     for sentence in found.warnings:
         warn(f"before the fit: {sentence}")
@@ -106,7 +109,9 @@ def run_identify(
         result.status,
         figures=partial(_fit_figures, system, result, experiments, found.findings),
         report=report,
-        page=lambda: fit_page(source, result, experiments, system, findings=found.findings, trial=trial),
+        page=lambda: fit_page(
+            source, result, experiments, system, held_out=others, findings=found.findings, trial=trial
+        ),
     )
 
 

@@ -23,6 +23,7 @@ from pneuopt.plotting import (
     plot_prediction,
     plot_residuals,
 )
+from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.report import Line, Report, Tone
 from pneuopt.quantities.status import report_status
 from pneuopt.quantities.trajectories import Trajectory
@@ -173,8 +174,11 @@ def _held_out_section(
 ) -> Section:
     if system is None or not held_out:
         return Section("Held-out runs", ())
-    table = validate(system, held_out, result.parameters)
-    runs = [predict(system, e, result.parameters) for e in held_out]
+    try:
+        table = validate(system, held_out, result.parameters)
+        runs = [predict(system, e, result.parameters) for e in held_out]
+    except (ConvergenceError, InputError) as error:
+        return Section("Held-out runs", (Report((Line(f"not predicted: {error}", Tone.BAD),)),))
     lead = Report((Line("logs that the fit has not seen, predicted from their first sample on"),))
     parts = (lead, report_agreement(table), _comparison(runs, held_out, "predicted"))
     return Section("Held-out runs", parts)

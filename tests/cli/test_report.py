@@ -57,6 +57,18 @@ def test_a_fit_has_its_page(folder: Path) -> None:
     assert len(read.named("figure")) == 4
 
 
+def test_a_held_out_log_is_predicted_in_the_report(folder: Path) -> None:
+    line = ["identify", "drive.toml", "run_01.csv", "--held-out", "run_02.csv", "-q"]
+    result = run(*line, "--report", "page.html")
+    assert result.exit_code == 0, result.output
+    read = page()
+    assert headings(read)[2] == "Held-out runs"
+    assert ("th", "run_02") in read.words
+    hashes = [words for tag, words in read.words if tag == "td" and len(words) == 64]
+    assert len(hashes) == 3
+    assert run(*line).exit_code == 2
+
+
 def test_logs_that_are_refused_have_a_page_that_says_so_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise LogError("run_01: the force has the wrong sign")
