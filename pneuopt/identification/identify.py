@@ -14,7 +14,7 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.runnable import Fittable, HasSystem, check_smooth
 from pneuopt.dynamics.simulate import simulate
-from pneuopt.dynamics.system import names
+from pneuopt.identification.agreement_rows import agreement_rows, fit_table, residual_diagnosis
 from pneuopt.identification.checks import (
     as_experiments,
     check_free,
@@ -34,10 +34,11 @@ from pneuopt.identification.problem import EstimationProblem, apply_conditions, 
 from pneuopt.identification.repairs import input_behaviour, known_runs, window_runs
 from pneuopt.identification.result import ChosenWindow, IdentificationResult
 from pneuopt.identification.review import review_fit
-from pneuopt.identification.statistics import agreement, confidence_interval, cross_correlation, ljung_box
+from pneuopt.identification.statistics import confidence_interval
 from pneuopt.identification.width_bias import suspect_widths
 from pneuopt.identification.widths import choose_widths
-from pneuopt.identification.windows import check_window, fit_in_windows, run_freely
+from pneuopt.identification.windows import check_window, fit_in_windows
+from pneuopt.identification.wrong_values import FixedValueTest
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array, Mask
@@ -165,19 +166,23 @@ def _fit_and_review(
         for sentence in foresee_unidentifiable(problem):
             warnings.warn(sentence, PhysicsWarning, stacklevel=3)
     problem, widths = choose_widths(problem)
+    doubts = FixedValueTest()
     if start is None:
-        held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise)
+        gives_up = doubts.explains
+        held, fit, label = fit_from_starts(problem, loss, estimate_noise=estimate_noise, gives_up=gives_up)
     else:
         began = fit_holding_unidentifiable(problem, problem.start_from(start))
         (held, fit), label = fit_robustly(*began, loss, estimate_noise=estimate_noise), "a given fit"
     chosen = ChosenWindow(window, window, window, fit.stats["gap_share"]) if math.isfinite(window) else None
-    if windowed := fit_in_windows(held, fit):
+    if not doubts.found and (windowed := fit_in_windows(held, fit)):
         held, fit, chosen = windowed
         held, fit = fit_robustly(held, fit, loss, estimate_noise=estimate_noise)
     held, fit = hold_order(held, fit, label)
     result = replace(mark_order(held, review_fit(held, *_result(held, fit, label, loss))), widths=widths, window=chosen)
     if problem.method.budget is not None:
         result = replace(result, status=problem.method.budget.name_end(result.status))
+    if doubts.found:
+        result = replace(result, status=result.status.with_details(str(doubts.found)))
     return replace(result, status=result.status.with_details(str(chosen))) if chosen else result
 
 
@@ -221,8 +226,8 @@ def validate(
         free = _predict_log(model, experiment, fixed, None, method)
         run = free if window is None else _predict_log(model, experiment, fixed, window, method)
         rows += [
-            row | _residual_diagnosis(model, experiment, run, str(row["channel"]))
-            for row in _agreement_rows(model, experiment, run, free)
+            row | residual_diagnosis(model, experiment, run, str(row["channel"]))
+            for row in agreement_rows(model, experiment, run, free)
         ]
     return WideFrame(rows).set_index(["log", "channel"])
 
@@ -319,7 +324,7 @@ def _result(
         problem.parameters.with_values(values),
         _estimates(estimates, covariance, fit.at_bound, leaning, status, misfit),
         _covariance_frame(free, covariance),
-        _fit_table(problem, fit),
+        fit_table(problem, fit),
         runs,
         status,
         {**fit.stats, "chi_square_ratio": variance, "variance_inflation": misfit.inflation},
@@ -330,39 +335,6 @@ def _result(
         },
     )
     return result, unidentifiable
-
-
-def _fit_table(problem: EstimationProblem, fit: Fit) -> "pd.DataFrame":
-    from pneuopt.quantities.frames import WideFrame
-
-    runs = zip(problem.experiments, fit.trajectories, run_freely(problem, fit), strict=True)
-    rows = [row for e, run, free in runs for row in _agreement_rows(problem.system, e, run, free)]
-    return WideFrame(rows).set_index(["log", "channel"])
-
-
-def _agreement_rows(
-    system: Fittable, experiment: Experiment, run: Trajectory, free_run: Trajectory
-) -> list[dict[str, object]]:
-    units = {q.name: q.unit for q in system.outputs}
-    rows: list[dict[str, object]] = []
-    for channel in outputs_in_log(system, experiment):
-        figures, measured = agreement(experiment.trajectory[channel], run[channel]), experiment.trajectory[channel]
-        free = agreement(measured, free_run[channel])
-        free_figures = {f"free_run_{n}": free[n] for n in ("rmse", "nrmse")}
-        known = {"noise": experiment.noise[channel], "unit": units[channel]}
-        rows.append({"log": experiment.name, "channel": channel, **figures, **free_figures, **known})
-    return rows
-
-
-def _residual_diagnosis(system: Fittable, experiment: Experiment, run: Trajectory, channel: str) -> dict[str, object]:
-    """Whiteness of a channel's residuals, and their correlation with each input."""
-    log = experiment.trajectory
-    residuals = log[channel] - run[channel]
-    found: dict[str, object] = {"whiteness_p": ljung_box(residuals)[1]}
-    for name in (n for n in names(system.inputs) if n in log):
-        size, lag = cross_correlation(residuals, log[name])
-        found |= {f"correlation[{name}]": size, f"lag[{name}]": lag}
-    return found
 
 
 def _estimates(

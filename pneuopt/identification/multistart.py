@@ -15,11 +15,12 @@ from dataclasses import replace
 
 from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.excerpts import cut_excerpts, filter_states
+from pneuopt.identification.fit_order import are_alike, is_optimum, rank
 from pneuopt.identification.identifiability import rejects_held_values
 from pneuopt.identification.losses import Loss, fit_robustly, white_chi_square
 from pneuopt.identification.problem import REFIT_STAGES, EstimationProblem
 from pneuopt.quantities.status import Code, Status
-from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO
 from pneuopt.shooting.least_squares import solve_least_squares
 from pneuopt.shooting.search_end import ABANDONED_START, JOINED_SEARCH
 from pneuopt.shooting.solution import Fit
@@ -36,16 +37,23 @@ GUESS_BOUND_WIDTH = 1e-9
 ACCEPTED_CHI_SQUARE_RATIO = 1.05
 # iterations with tight gaps that long logs get before a part of them is tried: more cost time, fewer leave easy logs
 SHORT_ITERATIONS = 10
-SAME_COST_RATIO = 1.001  # costs of two fits up to which both are one optimum; lower, and rounding makes two of it
 
 # cost of a settled start over that of the first one after as many stages [1] up to which the guess is not what is
 # wrong: lower settles all starts of a wrong model, higher takes another basin for the same
 SAME_MISFIT_RATIO = 1.02
 
+MIN_DOUBTED = 2  # fits after which the problem is doubted: fewer doubt it for one bad start, more take time
+
 Candidate = tuple[EstimationProblem, Fit, str]
 
 
-def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, estimate_noise: bool = False) -> Candidate:
+def fit_from_starts(
+    problem: EstimationProblem,
+    loss: Loss | None = None,
+    *,
+    estimate_noise: bool = False,
+    gives_up: Callable[[EstimationProblem, Fit], bool] = lambda *_: False,
+) -> Candidate:
     """Fit from the first start that converges at the noise's level; else take the best of all that were tried.
 
     Parameters
@@ -53,6 +61,8 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
     problem : EstimationProblem
     loss : Loss, optional
     estimate_noise : bool
+    gives_up : callable
+        Called with the best fit so far, where it is an optimum or the second one: whether another start cannot help.
 
     Returns
     -------
@@ -90,8 +100,9 @@ def fit_from_starts(problem: EstimationProblem, loss: Loss | None = None, *, est
             if not interrupted and _is_at_noise(held, fit):
                 held, fit = fit_a_part(held, fit, start.label)
             fits.append((held, fit, start.label))
-            fits.sort(key=lambda each: _rank(each[1], tightest))
-            if interrupted or _are_enough(fits):
+            fits.sort(key=lambda each: rank(each[1], tightest))
+            is_end = interrupted or _are_enough(fits)
+            if is_end or ((is_optimum(fits[0][1]) or len(fits) == MIN_DOUBTED) and gives_up(*fits[0][:2])):
                 break
     except KeyboardInterrupt:
         if not fits:
@@ -347,35 +358,12 @@ def _only_needs_confirmation(fits: Sequence[Candidate]) -> bool:
     settling with wide gaps says little there.
     """
     best = fits[0][1]
-    return _is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
+    return is_optimum(best) and (len(fits) == 1 or best.jumps is not None)
 
 
 def _joinable_costs(fits: Sequence[Candidate]) -> tuple[tuple[float, float], ...]:
     """The costs at the end of the best search's stages, at which another one that joins it only confirms it."""
-    return fits[0][1].stage_costs if fits and _is_optimum(fits[0][1]) and not fits[0][0].held else ()
-
-
-def _is_optimum(fit: Fit) -> bool:
-    """Whether a search ended at an optimum, be it of a model so wrong that the gaps absorb its misfit."""
-    is_settled = not (fit.unsettled or fit.unidentifiable)
-    is_missed = fit.status.code is Code.NOT_CONVERGED and is_settled and fit.stats["gap_share"] > MAX_GAP_SHARE
-    is_missed &= fit.status is not ABANDONED_START
-    return fit.status.converged or is_missed
-
-
-def _rank(fit: Fit, tightest: float) -> tuple[int, float]:
-    """The order of fits: by cost among fits of one kind.
-
-    Noise of the states, or the wide gaps in which an interruption leaves a search, lower the cost of any model; such
-    fits come after those that explain the log without.
-    """
-    cost = fit.stats["cost"]
-    is_cut = fit.status is ABANDONED_START or fit.status.code is Code.INTERRUPTED
-    if is_cut and fit.stats["gap_deviation"] > tightest:
-        return 3, cost
-    if fit.jumps is not None:
-        return 1, cost
-    return 0 if 2 * cost <= MAX_CHI_SQUARE_RATIO * fit.count else 2, cost
+    return fits[0][1].stage_costs if fits and is_optimum(fits[0][1]) and not fits[0][0].held else ()
 
 
 def _are_enough(fits: Sequence[Candidate]) -> bool:
@@ -384,16 +372,5 @@ def _are_enough(fits: Sequence[Candidate]) -> bool:
         return False
     (held, best, _), (_, second, _) = fits[:2]
     # with noise of the states every estimate may be biased, and another optimum of it would not change that
-    is_wrong = best.jumps is not None and best.status.converged and _is_optimum(second)
-    return is_wrong or _are_alike(best, second) or _explains_to_noise(held, best)
-
-
-def _are_alike(best: Fit, second: Fit) -> bool:
-    """Whether both ended at an optimum, at the same cost."""
-    same = (best.jumps is None) == (second.jumps is None)
-    return (
-        _is_optimum(best)
-        and _is_optimum(second)
-        and same
-        and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
-    )
+    is_wrong = best.jumps is not None and best.status.converged and is_optimum(second)
+    return is_wrong or are_alike(best, second) or _explains_to_noise(held, best)

@@ -81,7 +81,7 @@ def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth
     RejectedWidth
         None where the model has no width, or gaps stand for noise of the states, whose costs are of other weights.
     """
-    names = _fixed_widths(problem)
+    names = fixed_widths(problem)
     if not names or fit.jumps is not None:
         return
     freed = replace(problem, parameters=problem.parameters.freed(*names))
@@ -100,7 +100,7 @@ def score_widths(problem: EstimationProblem, fit: Fit) -> Iterator[RejectedWidth
             yield RejectedWidth(name, fall, (scales * step)[own] / max(1.0, -change))
 
 
-def _fixed_widths(problem: EstimationProblem) -> list[str]:
+def fixed_widths(problem: EstimationProblem) -> list[str]:
     """The widths of the model that are not free; a free one is an estimate itself."""
     names = dict.fromkeys(n for w in problem.system.plant.excitation.widths for n in (w.name, *w.follows))
     return [n for n in names if n in problem.parameters and not problem.parameters[n].free]

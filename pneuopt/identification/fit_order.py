@@ -1,0 +1,42 @@
+"""`rank`: which of several fits of the same logs is the best; `are_alike`: whether two have found one optimum."""
+
+from pneuopt.quantities.status import Code
+from pneuopt.shooting.convergence import MAX_CHI_SQUARE_RATIO, MAX_GAP_SHARE
+from pneuopt.shooting.search_end import ABANDONED_START
+from pneuopt.shooting.solution import Fit
+
+SAME_COST_RATIO = 1.001  # costs of two fits up to which both are one optimum; lower, and rounding makes two of it
+
+
+def is_optimum(fit: Fit) -> bool:
+    """Whether a search ended at an optimum, be it of a model so wrong that the gaps absorb its misfit."""
+    is_settled = not (fit.unsettled or fit.unidentifiable)
+    is_missed = fit.status.code is Code.NOT_CONVERGED and is_settled and fit.stats["gap_share"] > MAX_GAP_SHARE
+    is_missed &= fit.status is not ABANDONED_START
+    return fit.status.converged or is_missed
+
+
+def rank(fit: Fit, tightest: float) -> tuple[int, float]:
+    """The order of fits: by cost among fits of one kind.
+
+    Noise of the states, or the wide gaps in which an interruption leaves a search, lower the cost of any model; such
+    fits come after those that explain the log without.
+    """
+    cost = fit.stats["cost"]
+    is_cut = fit.status is ABANDONED_START or fit.status.code is Code.INTERRUPTED
+    if is_cut and fit.stats["gap_deviation"] > tightest:
+        return 3, cost
+    if fit.jumps is not None:
+        return 1, cost
+    return 0 if 2 * cost <= MAX_CHI_SQUARE_RATIO * fit.count else 2, cost
+
+
+def are_alike(best: Fit, second: Fit) -> bool:
+    """Whether both ended at an optimum, at the same cost."""
+    same = (best.jumps is None) == (second.jumps is None)
+    return (
+        is_optimum(best)
+        and is_optimum(second)
+        and same
+        and second.stats["cost"] <= SAME_COST_RATIO * best.stats["cost"]
+    )
