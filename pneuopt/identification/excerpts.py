@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from pneuopt.dynamics.hooks import Start
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.logs.experiments import Experiment
-from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
+from pneuopt.shooting.integration_steps import choose_integration
+from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.state_filter import filter_nodes
 
 # segments of an excerpt: fewer may lack motion that a parameter needs, more cost time
@@ -52,7 +52,8 @@ def filter_states(problem: EstimationProblem, start: Start) -> Start:
     segments = segment(problem.transcription(start))
     q = np.array([p.value for p in segments.transcription.parameters.values()])
     nodes = filter_nodes(segments, start_nodes(segments), q)
-    run = segments.run(nodes, q, stable_substeps(segments, nodes, q, RK4_MAX_H_LAMBDA), states=True)
+    segments, substeps = choose_integration(segments, nodes, q)
+    run = segments.run(nodes, q, substeps, states=True)
     names = (e.name for e in problem.experiments)
     return replace(start, states=dict(zip(names, segments.trajectories(run), strict=True)))
 

@@ -25,9 +25,9 @@ from pneuopt.identification.widths import excerpts
 from pneuopt.logs.experiments import Experiment
 from pneuopt.quantities.arrays import Array, Mask
 from pneuopt.quantities.parameters import Parameter, ParameterSet
-from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS
+from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS, choose_integration
 from pneuopt.shooting.least_squares import LeastSquares
-from pneuopt.shooting.segments import Segments, segment, stable_substeps, start_nodes
+from pneuopt.shooting.segments import Segments, segment, start_nodes
 from pneuopt.shooting.solution import Fit
 
 if TYPE_CHECKING:
@@ -324,7 +324,7 @@ def _root_information(problem: EstimationProblem, start: Start) -> Array:
     q = np.array([p.value for p in parameters.values()])
     chain = np.array([p.value if p.log else 1.0 for p in parameters.values() if p.free])
     nodes = start_nodes(segments)
-    substeps = problem.method.substeps or stable_substeps(segments, nodes, q)
+    segments, substeps = choose_integration(segments, nodes, q, problem.method.substeps)
     if substeps > MAX_SEARCH_SUBSTEPS:
         return np.full((len(chain), len(chain)), np.nan)
     run = segments.run(nodes, q, substeps, sensitivities=True)

@@ -16,7 +16,6 @@ from math import inf, sqrt
 import numpy as np
 
 from pneuopt.dynamics.excitation import Width
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.repairs import known_runs
 from pneuopt.identification.result import ChosenWidth
@@ -25,9 +24,9 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.equations import weigh_gaps
-from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS
+from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS, choose_integration
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
+from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
@@ -290,8 +289,7 @@ def is_too_stiff(transcription: Transcription, method: LeastSquares) -> bool:
     """
     segments = segment(transcription)
     q = np.array([p.value for p in segments.transcription.parameters.values()])
-    needed = method.substeps or stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA)
-    return needed > MAX_SEARCH_SUBSTEPS
+    return choose_integration(segments, start_nodes(segments), q, method.substeps)[1] > MAX_SEARCH_SUBSTEPS
 
 
 def excerpts(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:

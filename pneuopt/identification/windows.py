@@ -25,6 +25,7 @@ from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.convergence import MAX_GAP_SHARE
 from pneuopt.shooting.free_run import close_gaps
+from pneuopt.shooting.integration_steps import choose_integration
 from pneuopt.shooting.segments import segment, start_nodes
 from pneuopt.shooting.solution import Fit
 
@@ -144,8 +145,9 @@ def run_freely(problem: EstimationProblem, fit: Fit) -> tuple[Trajectory, ...]:
         return fit.optimum.equations.segments.output_trajectories(y)
     whole = replace(problem, window=math.inf, method=replace(problem.method, segment_time=math.inf))
     segments = segment(whole.transcription(whole.start_from(fit)))
-    q = np.array([p.value for p in segments.transcription.parameters.values()])
-    return segments.trajectories(segments.run(start_nodes(segments), q, int(fit.stats["substeps"]), states=True))
+    nodes, q = start_nodes(segments), np.array([p.value for p in segments.transcription.parameters.values()])
+    segments, substeps = choose_integration(segments, nodes, q, int(fit.stats["substeps"]))
+    return segments.trajectories(segments.run(nodes, q, substeps, states=True))
 
 
 def _has_failed_by_gaps(problem: EstimationProblem, fit: Fit) -> bool:

@@ -24,7 +24,7 @@ from pneuopt.shooting.convergence import (
     assess_convergence,
 )
 from pneuopt.shooting.equations import correct_residuals, weigh_gaps
-from pneuopt.shooting.integration_steps import IntegrationSteps
+from pneuopt.shooting.integration_steps import IntegrationSteps, fine_steps
 from pneuopt.shooting.levenberg_marquardt import INITIAL_DAMPING, Descent, Iterate, Objective
 from pneuopt.shooting.scaling import ParameterScaling
 from pneuopt.shooting.search_end import (
@@ -78,14 +78,15 @@ class Search:
     """
 
     def __init__(self, segments: Segments, method: "LeastSquares") -> None:
-        self.segments, self.method = segments, method
+        self.method = method
         self.scaling = ParameterScaling(segments.transcription)
+        nodes = start_nodes(segments)
+        self.steps = IntegrationSteps(segments, nodes, self.scaling.values(self.scaling.start), method.substeps)
+        self.segments = segments = self.steps.segments
         self.gap_scales = gap_scales(segments, method.kinematic)
         self.iterations, self.stage_began, self.stage = 0, 0, method.stages[0]
         self.correction: IntegrationCorrection | None
         self.noisy_gaps, self.has_stalled, self.stage_ends = False, False, list[StageEnd]()
-        nodes = start_nodes(segments)
-        self.steps = IntegrationSteps(segments, nodes, self.scaling.values(self.scaling.start), method.substeps)
         self.substeps = self.output_substeps = self.steps.start
         self.correction, self.integration_change, self.is_coarse = None, math.nan, False
         self.current = self._evaluate(nodes, self.scaling.start)
@@ -146,6 +147,8 @@ class Search:
         stays = len(self.method.stages) < 3 or bool(self.method.known_costs)
         if stays or not self.is_noise(self.current.cost):
             return None
+        if self.segments.implicit_state is not None:  # the errors of coarse steps add up where no gaps take them
+            self._correct_residuals(fine_steps(self.segments, self.substeps, self.method.stages[-1].refine))
         count, (first, *between, last) = self.current.equations.count, self.method.stages
         if not self._promised_squares(last) > MAX_JUMP_MISFIT * count:
             return self._jump_to_last_stage()
@@ -155,8 +158,7 @@ class Search:
 
     def _promised_squares(self, stage: "Stage") -> float:
         """The squares, in noise variances, to which the gaps of a stage would lead by the linearised equations."""
-        slopes = self.current.equations.linearisation
-        equations = weigh_gaps(self.segments, slopes, stage.gap * self.gap_scales)
+        equations = weigh_gaps(self.segments, self.current.equations.linearisation, stage.gap * self.gap_scales)
         return equations.promised_squares(self.scaling.has_effect(equations) & ~self.scaling.held)
 
     def _jump_to_last_stage(self) -> Status | None:
@@ -210,11 +212,13 @@ class Search:
 
     def _restore(self, to: Snapshot) -> None:
         self.stage, self.current, self.correction, self.substeps, self.output_substeps = to
+        self.segments = self.current.equations.segments
 
     def _enter_stage(self, stage: "Stage", nodes: Array, z: Array) -> None:
         """Weigh the gaps as in a stage, with integration steps from the stiffness at these nodes."""
-        steps = self.steps.renew(nodes, self.scaling.values(z), self.substeps)
-        is_known = steps == self.substeps and self.correction is None and nodes is self.current.nodes
+        self.segments, steps = self.steps.renew(self.segments, nodes, self.scaling.values(z), self.substeps)
+        is_same = self.segments is self.current.equations.segments and nodes is self.current.nodes
+        is_known = is_same and steps == self.substeps and self.correction is None
         self.stage, self.substeps, self.output_substeps, self.correction = stage, steps, steps, None
         self.is_coarse = stage.refine > 1
         if is_known:
@@ -284,7 +288,7 @@ class Search:
         has_ended = self._run_stage(iterations)
         if self.stage.refine > 1 and self.correction is None:
             before = self._snapshot()
-            self._apply_finer_steps(self.stage.refine * self.substeps)
+            self._apply_finer_steps(fine_steps(self.segments, self.substeps, self.stage.refine))
             if math.isfinite(self.current.cost):
                 return self._run_stage(iterations)
             self._restore(before)
@@ -303,7 +307,7 @@ class Search:
             if self.method.budget is not None:
                 self.method.budget.check()
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
-                self._correct_residuals(self.stage.refine * self.substeps)
+                self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
                 descent.objective = self._objective()
             trial = descent.step(self.current)
             if trial is None:

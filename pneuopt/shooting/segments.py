@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pneuopt.dynamics.compiled.rollout import Gram, Rollout, RolloutResult
+from pneuopt.dynamics.compiled.rollout import Gram, Pieces, Rollout, RolloutResult
 from pneuopt.dynamics.system import DiscreteSystem, names
 from pneuopt.quantities.arrays import Array, Indices, Mask
 from pneuopt.quantities.errors import ModelError, require
@@ -68,6 +68,8 @@ class Segments:
         position under a logged speed) is held at its guess there.
     phase, lengths : ndarray of int, shape (m,)
         The phase of each segment, and its samples without padding.
+    implicit_state : int, optional
+        Position of the state in which the integration is implicit; None: all is explicit (RK4).
     """
 
     transcription: Transcription
@@ -81,6 +83,7 @@ class Segments:
     fixed_start: Array
     phase: Indices
     lengths: Indices
+    implicit_state: int | None = None
 
     @property
     def system(self) -> DiscreteSystem:
@@ -138,12 +141,20 @@ class Segments:
     @cached_property
     def sensitivities(self) -> Rollout:
         """The compiled run with sensitivities to start states and free parameters."""
-        return Rollout(self.system.pieces, wrt=self.columns.tolist(), start=True)
+        return Rollout(self._pieces, wrt=self.columns.tolist(), start=True)
 
     @cached_property
     def plain_rollout(self) -> Rollout:
         """The compiled run without sensitivities."""
-        return Rollout(self.system.pieces)
+        return Rollout(self._pieces)
+
+    def with_implicit_state(self, state: int | None) -> "Segments":
+        """The same segments, integrated implicitly in this state, or by RK4."""
+        return replace(self, implicit_state=state)
+
+    @property
+    def _pieces(self) -> Pieces:
+        return replace(self.system.pieces, implicit=self.implicit_state)
 
     def run(
         self, nodes: Array, q: Array, substeps: int, *, sensitivities: bool = False, states: bool = False
@@ -229,21 +240,50 @@ def stable_substeps(segments: Segments, nodes: Array, q: Array, step: float = 1.
     The stiffness is taken at nodes all along the start and at the extremes of every state and input; the result is
     `SUBSTEPS_CAP` at most, for a start may be absurd.
     """
+    return count_steps(segments, largest_rate(stiffness_jacobians(segments, nodes, q)), step) if nodes.shape[1] else 1
+
+
+def count_steps(segments: Segments, rate: float, step: float) -> int:
+    """Integration steps a sample that keep h times a rate [1/s] within `step`, `SUBSTEPS_CAP` at most."""
+    return min(max(1, math.ceil(float(segments.h.max()) * rate / step)), SUBSTEPS_CAP)
+
+
+def largest_rate(jacobians: Array) -> float:
+    """The largest eigenvalue of matrices of shape (k, n, n), by its absolute value [1/s]."""
+    return float(np.abs(np.linalg.eigvals(jacobians)).max(initial=0.0))
+
+
+def stiffness_jacobians(segments: Segments, nodes: Array, q: Array, speeds: tuple[int, Array] | None = None) -> Array:
+    """d(xdot)/dx at nodes all along, at the extremes of every state and input, and at rest there, where it is finite.
+
+    Parameters
+    ----------
+    segments : Segments
+    nodes : ndarray, shape (m, n)
+    q : ndarray
+        The problem's parameter values.
+    speeds : tuple of int and ndarray, optional
+        A state and values that it takes at each of these points, in place of its own and of rest.
+
+    Returns
+    -------
+    ndarray, shape (k, n, n)
+    """
     m, n = nodes.shape
-    if not n:
-        return 1
     given = np.concatenate([nodes, segments.inputs[:, 0]], axis=1)
     even = np.linspace(0, m - 1, min(m, MAX_STIFFNESS_NODES)).astype(int)
     rows = np.unique(np.concatenate([even, given.argmin(axis=0), given.argmax(axis=0)]))
     # the regularised friction is stiffest at rest, which a node may just miss
     points = np.concatenate([nodes[rows], nodes[rows] * 0])
+    if speeds is not None:
+        points = np.tile(nodes[rows], (len(speeds[1]), 1))
+        points[:, speeds[0]] = np.repeat(speeds[1], len(rows))
     p, u, t = (
-        np.concatenate([a, a])
+        np.concatenate([a] * (len(points) // len(rows)))
         for a in (q[segments.parameter_positions[rows]], segments.inputs[rows, 0], segments.t[rows, 0])
     )
     J = np.array(segments.jacobian.map(len(t))(t[None], points.T, u.T, p.T)).reshape(n, -1, n).transpose(1, 0, 2)
-    stiffness = np.abs(np.linalg.eigvals(J[np.isfinite(J).all(axis=(1, 2))])).max(initial=0.0)
-    return min(max(1, math.ceil(float(segments.h.max()) * float(stiffness) / step)), SUBSTEPS_CAP)
+    return np.asarray(J[np.isfinite(J).all(axis=(1, 2))])
 
 
 @functools.lru_cache(maxsize=64)

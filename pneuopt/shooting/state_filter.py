@@ -7,9 +7,9 @@ Cathey, IEEE Transactions on Automatic Control 38(2), 1993, for its iteration), 
 
 import numpy as np
 
-from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.quantities.arrays import Array, Indices
-from pneuopt.shooting.segments import Segments, stable_substeps
+from pneuopt.shooting.integration_steps import choose_integration
+from pneuopt.shooting.segments import Segments
 
 PIECE_SEGMENTS = (
     1000  # segments a piece: more take more steps one after the other, fewer waste more of them on the lead
@@ -41,7 +41,7 @@ def filter_nodes(segments: Segments, nodes: Array, q: Array) -> Array:
         Estimates from the measurements up to each segment's end.
     """
     first = np.arange(0, segments.count, PIECE_SEGMENTS)
-    substeps = stable_substeps(segments, nodes, q, RK4_MAX_H_LAMBDA)
+    segments, substeps = choose_integration(segments, nodes, q)
     rough, found = nodes / segments.nominal, nodes / segments.nominal
     heads = np.append(True, ~segments.linked[:-1])
     start = np.where(np.isfinite(segments.fixed_start), KNOWN_DEVIATION, START_DEVIATION) ** 2

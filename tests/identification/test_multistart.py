@@ -199,7 +199,7 @@ def test_a_start_that_is_too_stiff_to_be_searched_holds_nothing(monkeypatch: pyt
     monkeypatch.setattr(starting, "solve_least_squares", counted)
     problem = posed(Stribeck())
     start = problem.candidates()[0]
-    stiff = replace(start, parameters={**start.parameters, "friction.static": 5e4, VELOCITY: 0.5})
+    stiff = replace(start, parameters={**start.parameters, "friction.static": 5e4, VELOCITY: 0.004})
     held, fit = starting.fit_holding_unidentifiable(problem, stiff)
     assert "so stiff that a sample takes" in fit.status.verdict
     assert (dict(held.held), fit.unidentifiable, calls) == ({}, (), 1)

@@ -1,13 +1,14 @@
 """The pieces of a sampled system with their sensitivities, symbolically and as the C of a run over segments."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import casadi as ca
 
 from pneuopt.dynamics.compiled.c_writer import CFunction, write_c
 from pneuopt.dynamics.compiled.compiler import warn_once
+from pneuopt.dynamics.partitioned_step import OwnRate, partitioned_step
 from pneuopt.dynamics.runge_kutta import rk4
 
 C_SOURCE_FOLDER = Path(__file__).parent
@@ -23,7 +24,12 @@ STEP_INPUT_RATES = {"t": 2, "h": 1, "u": 1, "p": 0, "x": 2, "S": 2}
 
 
 def prepare_rollout(
-    step: ca.Function, update: ca.Function | None, ode: ca.Function | None, wrt: Sequence[int], start: bool
+    step: ca.Function,
+    update: ca.Function | None,
+    ode: ca.Function | None,
+    wrt: Sequence[int],
+    start: bool,
+    implicit: int | None = None,
 ) -> tuple[dict[str, ca.Function], str]:
     """The pieces of a sampled system (see `rollout.Pieces`) with their sensitivities, and the C of a run of them.
 
@@ -35,24 +41,27 @@ def prepare_rollout(
         Positions in the parameter vector of which sensitivities are wanted.
     start : bool
         Whether sensitivities to the start state are wanted.
+    implicit : int, optional
+        Position of the state in which the steps of an ODE are implicit (`partitioned_step`), in place of RK4's.
 
     Returns
     -------
     functions : dict of str to casadi.Function
         "step", "output" and, if there is one, "update": ``(..., x, u, p, S) -> (value, its sensitivity)``; of an ODE
-        "rate", too: ``(t, x, u, p) -> (xdot, its Jacobians to x and to the chosen parameters)``.
+        in RK4 steps "rate", too: ``(t, x, u, p) -> (xdot, its Jacobians to x and to the chosen parameters)``.
     source : str
         Empty where an operation has no form in C, which is said once.
     """
-    return prepare_by_content(str(step.serialize()), _serialize(update), _serialize(ode), tuple(wrt), start)
+    return prepare_by_content(str(step.serialize()), _serialize(update), _serialize(ode), tuple(wrt), start, implicit)
 
 
 @functools.lru_cache(maxsize=64)
 def prepare_by_content(
-    step: str, update: str | None, ode: str | None, wrt: tuple[int, ...], start: bool
+    step: str, update: str | None, ode: str | None, wrt: tuple[int, ...], start: bool, implicit: int | None
 ) -> tuple[dict[str, ca.Function], str]:
     """`prepare_rollout` of serialised Functions, cached by their content."""
-    functions = _with_sensitivities(ca.Function.deserialize(step), _deserialize(update), _deserialize(ode), wrt, start)
+    given = ca.Function.deserialize(step), _deserialize(update), _deserialize(ode)
+    functions = _with_sensitivities(*given, wrt, start, implicit)
     try:
         return functions, _rollout_source(functions, len(wrt), start)
     except NotImplementedError as missing:
@@ -69,7 +78,12 @@ def _deserialize(content: str | None) -> ca.Function | None:
 
 
 def _with_sensitivities(
-    step: ca.Function, update: ca.Function | None, ode: ca.Function | None, wrt: Sequence[int], start: bool
+    step: ca.Function,
+    update: ca.Function | None,
+    ode: ca.Function | None,
+    wrt: Sequence[int],
+    start: bool,
+    implicit: int | None,
 ) -> dict[str, ca.Function]:
     """Each piece with S = dx/d(columns) carried along: (..., x, u, p, S) -> (value, its sensitivity)."""
     t, h, x, u, p = (ca.SX.sym(k, step.size1_in(i)) for i, k in enumerate(("t", "h", "x", "u", "p")))
@@ -91,13 +105,13 @@ def _with_sensitivities(
         rate = ca.Function(
             "rate", [t, x, u, p, S], [ca.horzcat(*(f(ode(t, x, u, p)[0]) for f in (ca.densify, value_sensitivity)))]
         )
-        both = rk4(lambda at, z: rate(at, z[:, 0], u, p, z[:, 1:]), t, h, ca.horzcat(x, S))
+        both = _advance(lambda at, z: rate(at, z[:, 0], u, p, z[:, 1:]), ode, implicit, (t, h, x, u, p, S))
         x_next, S_next = both[:, 0], both[:, 1:]
     functions = {
         "step": piece_function("step", [t, h], x_next, S_next),
         "output": piece_function("output", [t], y, value_sensitivity(y)),
     }
-    if ode is not None:
+    if ode is not None and implicit is None:
         xdot = ode(t, x, u, p)[0]
         slopes = [ca.densify(xdot), ca.jacobian(xdot, x), ca.jacobian(xdot, p)[:, list(wrt)]]
         functions["rate"] = ca.Function("system_rate", [t, x, u, p], slopes, {"cse": True})
@@ -105,6 +119,25 @@ def _with_sensitivities(
         after = update(t, x, u, p)
         functions["update"] = piece_function("update", [t], after, value_sensitivity(after))
     return functions
+
+
+def _advance(
+    rate: Callable[[ca.SX, ca.SX], ca.SX], ode: ca.Function, implicit: int | None, symbols: tuple[ca.SX, ...]
+) -> ca.SX:
+    """The states and sensitivities, a column each, after a step of RK4 or one that is implicit in a state."""
+    t, h, x, u, p, S = symbols
+    both = ca.horzcat(x, S)
+    if implicit is None:
+        return rk4(rate, t, h, both)
+    row, xdot = implicit, ode(t, x, u, p)[0]
+    column = ca.jacobian(xdot, x)[:, row]
+    own = ca.Function("own", [t, x, u, p], [ca.densify(f) for f in (xdot[row], column[row], column)])
+
+    def value(at: ca.SX, there: ca.SX) -> tuple[ca.SX, ca.SX]:
+        found, slope, _ = own(at, there, u, p)
+        return found, slope
+
+    return partitioned_step(rate, OwnRate(row, value, lambda at, there: own(at, there, u, p)[2]), t, h, both)
 
 
 def _rollout_source(functions: dict[str, ca.Function], chosen: int, start: bool) -> str:

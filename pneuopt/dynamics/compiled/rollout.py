@@ -43,11 +43,14 @@ class Pieces:
         ``(t, x, u, p) -> x``.
     ode : casadi.Function or None
         ``(t, x, u, p) -> (xdot, y)``, of which `step` is the RK4 step: its sensitivities are cheaper stage by stage.
+    implicit : int, optional
+        Position of the state in which the ODE is integrated implicitly (`partitioned_step`), in place of RK4.
     """
 
     step: ca.Function
     update: ca.Function | None = None
     ode: ca.Function | None = None
+    implicit: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +128,7 @@ class Rollout:
         threads: int | None = None,
         lanes: int | None = None,
     ) -> None:
-        self._functions, source = prepare_rollout(pieces.step, pieces.update, pieces.ode, wrt, start)
+        self._functions, source = prepare_rollout(pieces.step, pieces.update, pieces.ode, wrt, start, pieces.implicit)
         step = self._functions["step"]
         self.n_states, self.n_inputs, self.n_parameters = (step.size1_in(i) for i in (2, 3, 4))
         self.n_outputs = self._functions["output"].size1_out(0)
