@@ -46,8 +46,9 @@ class LeastSquares:
     segment_time : float
         Time between two shooting nodes [s]; math.inf for one segment a log.
     substeps : int, optional
-        Integration steps a sample; default: from the stiffness at the start of each stage, h |lambda| <= 2 a step;
-        the last stage adds what finer steps change, halved until that moves no estimate.
+        Integration steps a sample; default: from the stiffness at the start of each stage, h |lambda| <= 2 a step of
+        RK4, or fewer that are implicit in the one state whose own rate asks for these (`choose_integration`); the last
+        stage adds what finer steps change, halved until that moves no estimate.
     tolerance : float
         Largest last undamped step of a parameter, in its standard deviations.
     kinematic : float
