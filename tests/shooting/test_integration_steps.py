@@ -17,7 +17,8 @@ def sliding(mass: float, stribeck_velocity: float = 0.02) -> tuple[Segments, Arr
     """Segments of a mass at .2 m/s on 50 N of friction, smooth over 1 mm/s; their nodes, and the parameters' values."""
     system, n = ForceDrive(Stribeck()).system(), 40
     guess = np.tile([0.1, 0.2], (n, 1))
-    phase = Phase("a", 1e-3 * np.arange(n), np.full(n, 1e-3), np.zeros((n, 1)), regular_nodes(n, 10), guess=guess)
+    t: Array = 1e-3 * np.arange(n, dtype=float)
+    phase = Phase("a", t, np.full(n, 1e-3), np.zeros((n, 1)), regular_nodes(n, 10), guess=guess)
     values = {"load.mass": mass, "friction.coulomb": 50.0, "friction.static": 70.0}
     values |= {"friction.stribeck_velocity": stribeck_velocity, "friction.smoothing": 1e-3}
     parameters = system.parameters.freed("friction.coulomb").with_values(values)
