@@ -23,6 +23,7 @@ from pneuopt.quantities.source import read_toml_source
 from pneuopt.quantities.status import Code
 
 FMU = "fmu"  # the form that is the plant, not the controller
+SHOWN_METRICS = ("SettlingTime", "Overshoot", "MaxSensitivity")
 NOT_CERTIFIED = "NOT CERTIFIED: no independent simulation stands behind these gains."
 
 
@@ -96,12 +97,11 @@ def _metric_lines(metrics: Any) -> list[str]:
     """Of a tuned.toml: its references, and the certified settling time and overshoot of each."""
     if not isinstance(metrics, Mapping):
         return []
-    rows = {k: row for k, row in metrics.items() if isinstance(row, Mapping)}
     lines = []
-    for metric in ("SettlingTime", "Overshoot"):
-        shown = (f"{v:.4g} ({step})" for step, v in rows.get(metric, {}).items() if isinstance(v, int | float))
-        text = ", ".join(shown)
-        lines += [f"{metric} {text}"] if text else []
+    for step, row in metrics.items():
+        known = row if isinstance(row, Mapping) else {}
+        shown = [f"{n} {known[n]:.4g}" for n in SHOWN_METRICS if isinstance(known.get(n), int | float)]
+        lines += [f"{step}: {', '.join(shown)}"] if shown else []
     return lines
 
 

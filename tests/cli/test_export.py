@@ -43,7 +43,7 @@ amplitude = "0.5 V"
 step = "0.1 m/s"
 horizon = "1 s"
 [certified]
-SettlingTime = { "0 to 0.1" = 0.0849 }
+"0 to 0.1" = { SettlingTime = 0.0849, Overshoot = 4.9, Ripple = 0.01 }
 [status]
 code = "converged"
 message = "certified */ *)"
@@ -75,7 +75,11 @@ def test_files_are_written_with_where_they_come_from(place: Path, to: str, files
     assert result.exit_code == 0, result.stderr
     assert sorted(p.name for p in (place / "made" / "here").iterdir()) == files
     text = (place / "made" / "here" / files[0]).read_text("ascii")
-    for said in ("from tuned.toml, sha256 ", "plant fit.toml, sha256 ", "Certified: SettlingTime 0.0849 (0 to 0.1)"):
+    for said in (
+        "from tuned.toml, sha256 ",
+        "plant fit.toml, sha256 ",
+        "Certified: 0 to 0.1: SettlingTime 0.0849, Overshoot 4.9",
+    ):
         assert said in text
     assert "The output runs from 0 V to 10 V; lower and upper count from the centre." in text
     assert "NOT CERTIFIED" not in text
