@@ -34,7 +34,7 @@ COMMAND_HELP = {
         "Tune PID and dither together, and certify them.",
         (
             "pneuopt tune fit.toml tuning.toml -o tuned.toml --plot tuned.png",
-            "pneuopt tune fit.toml tuning.toml --rig rig.toml",
+            "pneuopt tune fit.toml tuning.toml --rig rig.toml --report tuned.html",
         ),
         "Then: pneuopt simulate fit.toml tuned.toml, pneuopt study, pneuopt export",
     ),
@@ -51,8 +51,12 @@ COMMAND_HELP = {
         "What a study.toml may ask: pneuopt keys study",
     ),
     "export": CommandHelp(
-        "Write the tuned controller as C, structured text, Python.",
-        ("pneuopt export fit.toml tuned.toml --to st -o plc",),
+        "Write the tuned controller for a PLC, or as C or Python.",
+        (
+            "pneuopt export fit.toml tuned.toml --to st -o plc",
+            "pneuopt export fit.toml tuned.toml --to siemens",
+        ),
+        "--to fmu writes the plant, to be simulated with it elsewhere",
     ),
     "next-experiment": CommandHelp(
         "Plan the run that makes the estimates most certain.",
