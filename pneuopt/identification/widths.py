@@ -16,6 +16,7 @@ from math import inf, sqrt
 import numpy as np
 
 from pneuopt.dynamics.excitation import Width
+from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.repairs import known_runs
 from pneuopt.identification.result import ChosenWidth
@@ -26,7 +27,7 @@ from pneuopt.shooting.budget import BudgetSpentError
 from pneuopt.shooting.equations import weigh_gaps
 from pneuopt.shooting.integration_steps import MAX_SEARCH_SUBSTEPS, choose_integration
 from pneuopt.shooting.least_squares import LeastSquares, Stage, solve_least_squares
-from pneuopt.shooting.segments import segment, start_nodes
+from pneuopt.shooting.segments import segment, stable_substeps, start_nodes
 from pneuopt.shooting.solution import Fit
 from pneuopt.shooting.transcription import Transcription
 
@@ -254,6 +255,9 @@ class _Race:
         # an empty last stage: the last one of a method would iterate to its end
         method = replace(problem.method, stages=(*stages, replace(stages[-1], iterations=0)))
         transcription = problem.transcription(problem.candidates()[0])
+        is_narrower = any(v < self._problem.parameters.value(n) for n, v in widths.items())
+        if is_narrower and needs_implicit_steps(transcription, method):
+            return _Trial(widths, inf, inf, 0, problem.parameters, too_stiff=True)
         fit = solve_least_squares(transcription, method)
         if fit.status.code is Code.INTERRUPTED:
             if method.budget is not None:
@@ -273,6 +277,24 @@ def _foresee(fit: Fit, gap: float) -> float:
     equations = fit.optimum.equations
     tight = weigh_gaps(equations.segments, equations.linearisation, sigma)
     return 0.5 * max(0.0, tight.promised_squares(fit.optimum.keep))
+
+
+def needs_implicit_steps(transcription: Transcription, method: LeastSquares) -> bool:
+    """Whether Runge-Kutta steps, by which a fit is simulated and tuned afterwards, would be too many for a search.
+
+    Parameters
+    ----------
+    transcription : Transcription
+    method : LeastSquares
+
+    Returns
+    -------
+    bool
+    """
+    segments = segment(transcription)
+    q = np.array([p.value for p in segments.transcription.parameters.values()])
+    needed = method.substeps or stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA)
+    return needed > MAX_SEARCH_SUBSTEPS
 
 
 def is_too_stiff(transcription: Transcription, method: LeastSquares) -> bool:

@@ -137,6 +137,20 @@ def test_a_width_too_narrow_for_the_log_rate_is_widened_in_place_of_a_refusal(mo
     assert choose_widths(problem(system, log, light))[1][0].value > 1e-3
 
 
+def test_a_width_is_narrowed_no_further_than_simulation_and_tuning_by_runge_kutta_follow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Implicit steps would take it to 10 um/s on data/own_rig, at which no loop could be tuned."""
+    system, log = po.ForceDrive(po.Stribeck()).system(), sticking()
+    posed = problem(system, log, system.parameters.with_values({"load.mass": 5.0}).freed(*FREE))
+    monkeypatch.setattr(widths, "MAX_SEARCH_SUBSTEPS", 20)
+    chosen, (found,) = choose_widths(posed)
+    steps = 45.0 / (found.value * 5.0) * 1e-3 / 2.785  # of RK4 a sample, by hand
+    assert 1 < steps < 20
+    assert found.too_stiff
+    assert not widths.needs_implicit_steps(chosen.transcription(chosen.candidates()[0]), chosen.method)
+
+
 def test_an_edge_that_hides_the_dead_zone_is_narrowed() -> None:
     drive = po.PneumaticDrive(po.ProportionalValve(spool=po.Spool.RIGID), po.Viscous())
     t = np.arange(400) * 2e-3
