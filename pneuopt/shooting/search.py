@@ -171,14 +171,8 @@ class Search:
                 self._finish_stage(JUMP_ITERATIONS)
                 if (found := self._convergence_status(self.current)).converged and self.is_noise(self.current.cost):
                     return found
-            elif (found := self._convergence_status(self.current)).converged and self._is_near():
-                return found
         self._restore(before)
         return None
-
-    def _is_near(self) -> bool:
-        """Whether a model with some misfit has led here: what is farther off may be a wrong basin."""
-        return 2 * self.current.cost <= MAX_JUMP_MISFIT * self.current.equations.count
 
     def _gaps_absorb_misfit(self) -> bool:
         """Whether the gaps absorb the misfit of the model in a stalled search: tighter gaps cost more."""

@@ -92,7 +92,7 @@ def test_a_slow_residual_below_the_noise_widens_the_intervals() -> None:
     assert np.mean([covers(r, truth) for r in results]) >= 0.85
     assert {mark for r in results for mark in r.estimates["mark"]} >= {Mark.WIDENED}
     assert np.mean([r.stats["variance_inflation"] for r in results]) > 3
-    assert all(r.stats["chi_square_ratio"] < 1.5 for r in results)  # seed 2 draws 1.42 where no gap takes a part of it
+    assert all(r.stats["chi_square_ratio"] < 1.35 for r in results)
     widened = next(r for r in results if r.stats["variance_inflation"] > 3)
     assert_allclose(np.diag(widened.covariance), widened.estimates["stderr"] ** 2)
     assert widened.estimates["dof"].max() < 50
