@@ -13,9 +13,6 @@ from pneuopt.shooting.scaling import UNIDENTIFIABLE_PRIOR_RATIO, ParameterScalin
 
 # share of the cost [1] that the gaps may carry: above it they absorb the misfit of a model; lower refuses good fits
 MAX_GAP_SHARE = 0.05
-# the same of gaps so tight that they are no states of their own [1], where the model misses the log anyway, and the
-# residuals say so: lower refuses an optimum that windows do not better, higher one whose run drifts from the log
-MAX_TIGHT_GAP_SHARE, TIGHT_GAP = 0.25, 1e-5
 # squared residuals a sample, in noise variances [1], up to which a fit explains the log to its noise: lower takes
 # chance for misfit, higher passes a wrong model
 MAX_CHI_SQUARE_RATIO = 1.2
@@ -34,14 +31,7 @@ class ConvergenceTest(NamedTuple):
 
 
 def assess_convergence(
-    equations: NormalEquations,
-    space: ParameterScaling,
-    z: Array,
-    tolerance: float,
-    message: str,
-    *,
-    noisy_gaps: bool,
-    gap: float,
+    equations: NormalEquations, space: ParameterScaling, z: Array, tolerance: float, message: str, *, noisy_gaps: bool
 ) -> ConvergenceTest:
     """Test an iterate: converged means that a full undamped step would move no parameter noticeably.
 
@@ -57,8 +47,6 @@ def assess_convergence(
         The first sentence of a converged status.
     noisy_gaps : bool
         Whether the gaps stand for noise of the states.
-    gap : float
-        Standard deviation of a gap, as a fraction of the state's nominal size.
 
     Returns
     -------
@@ -94,8 +82,7 @@ def assess_convergence(
         return ConvergenceTest(status, _least_certain(own, noise * spread, space), own[[worst]])
     bounded = np.flatnonzero(space.at_bound(z) & ~space.held)
     return ConvergenceTest(
-        _optimum_status(equations, message, noisy_gaps=noisy_gaps, gap=gap),
-        _least_sensitive(bounded, space, reduced, noise),
+        _optimum_status(equations, message, noisy_gaps=noisy_gaps), _least_sensitive(bounded, space, reduced, noise)
     )
 
 
@@ -109,16 +96,14 @@ def largest_parameter_step(
     return float(np.max(np.abs(step.parameters[keep]) / spread, initial=0.0))
 
 
-def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: bool, gap: float) -> Status:
+def _optimum_status(equations: NormalEquations, message: str, *, noisy_gaps: bool) -> Status:
     """The status of an optimum: converged, unless its gaps absorb the misfit of the model."""
-    largest, misfit = equations.largest_gap, 2 * equations.cost / max(1, equations.count)
-    is_missed = gap <= TIGHT_GAP and equations.chi_square > MAX_CHI_SQUARE_RATIO * equations.count
-    allowed = MAX_TIGHT_GAP_SHARE if is_missed else MAX_GAP_SHARE
-    if equations.gap_share > allowed and not (noisy_gaps and misfit <= MAX_CHI_SQUARE_RATIO):
+    gap, misfit = equations.largest_gap, 2 * equations.cost / max(1, equations.count)
+    if equations.gap_share > MAX_GAP_SHARE and not (noisy_gaps and misfit <= MAX_CHI_SQUARE_RATIO):
         verdict = f"the gaps between segments carry {equations.gap_share:.0%} of the cost"
-        detail = f"the largest is {largest:.1g} of a state's nominal size: the model cannot follow the log"
+        detail = f"the largest is {gap:.1g} of a state's nominal size: the model cannot follow the log"
         return Status(Code.NOT_CONVERGED, (verdict, detail, "check its terms, inputs and units"))
-    verdict = f"{message}, largest gap {largest:.1g} of a state's nominal size"
+    verdict = f"{message}, largest gap {gap:.1g} of a state's nominal size"
     misfit_sentences = describe_misfit(equations, MAX_CHI_SQUARE_RATIO, noisy_gaps=noisy_gaps)
     return Status(Code.CONVERGED, (verdict, *misfit_sentences))
 

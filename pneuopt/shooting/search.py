@@ -122,7 +122,7 @@ class Search:
                 return self._refine_steps(found)
         status = self._convergence_status(self.current)
         # gaps that absorb the misfit of the model: the answer depends on their weight
-        gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None and not status.converged
+        gaps_absorb = self.current.equations.gap_share > MAX_GAP_SHARE and allowed is None
         return self._refine_steps(self._allow_state_noise(status) if gaps_absorb else status)
 
     def _early_end(self, stage: "Stage") -> Status | None:
@@ -346,8 +346,9 @@ class Search:
     def assess(self, current: Iterate) -> ConvergenceTest:
         """The convergence test of an iterate."""
         message, tolerance = f"{self.iterations} iterations", self.method.tolerance
-        given = current.equations, self.scaling, current.z, tolerance, message
-        return assess_convergence(*given, noisy_gaps=self.noisy_gaps, gap=self.stage.gap)
+        return assess_convergence(
+            current.equations, self.scaling, current.z, tolerance, message, noisy_gaps=self.noisy_gaps
+        )
 
     def largest_change(self, change: Array) -> float:
         """The largest change of a measured output [noise standard deviations], of all that are given."""

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pneuopt.shooting import convergence, stage_end
-from pneuopt.shooting.convergence import MAX_GAP_SHARE, MAX_TIGHT_GAP_SHARE, TIGHT_GAP
+from pneuopt.shooting import stage_end
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.stage_end import PATIENT_ITERATIONS, is_negligible_step
 
@@ -62,24 +61,3 @@ def test_a_quick_search_goes_to_the_optimum(monkeypatch: pytest.MonkeyPatch) -> 
     few = PATIENT_ITERATIONS - 1
     assert not negligible(monkeypatch, misfit=49.0, step=0.015 * 7, promised=0.3, iterations=few)
     assert negligible(monkeypatch, misfit=49.0, step=0.015 * 7, promised=0.3)
-
-
-@pytest.mark.parametrize(
-    ("misfit", "share", "gap", "converged"),
-    [
-        (2.0, MAX_GAP_SHARE + 0.1, TIGHT_GAP, True),
-        (2.0, MAX_TIGHT_GAP_SHARE + 0.01, TIGHT_GAP, False),
-        (2.0, MAX_GAP_SHARE + 0.1, 1e-3, False),  # wide gaps follow any log
-        (1.0, MAX_GAP_SHARE + 0.1, TIGHT_GAP, False),  # it would be the gaps that explain the log to its noise
-        (1.0, MAX_GAP_SHARE - 0.01, TIGHT_GAP, True),
-    ],
-)
-def test_tight_gaps_may_carry_a_part_of_a_misfit(
-    misfit: float, share: float, gap: float, converged: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(convergence, "describe_misfit", lambda *_, **__: ())
-    chi_square = 1000 * misfit
-    equations: Any = SimpleNamespace(
-        gap_share=share, largest_gap=1e-4, chi_square=chi_square, cost=chi_square / 2 / (1 - share), count=1000
-    )
-    assert convergence._optimum_status(equations, "5 iterations", noisy_gaps=False, gap=gap).converged == converged
