@@ -256,7 +256,7 @@ class _Race:
         method = replace(problem.method, stages=(*stages, replace(stages[-1], iterations=0)))
         transcription = problem.transcription(problem.candidates()[0])
         is_narrower = any(v < self._problem.parameters.value(n) for n, v in widths.items())
-        if is_narrower and needs_implicit_steps(transcription, method):
+        if is_narrower and is_too_stiff(transcription, method, implicit=False):
             return _Trial(widths, inf, inf, 0, problem.parameters, too_stiff=True)
         fit = solve_least_squares(transcription, method)
         if fit.status.code is Code.INTERRUPTED:
@@ -279,39 +279,25 @@ def _foresee(fit: Fit, gap: float) -> float:
     return 0.5 * max(0.0, tight.promised_squares(fit.optimum.keep))
 
 
-def needs_implicit_steps(transcription: Transcription, method: LeastSquares) -> bool:
-    """Whether Runge-Kutta steps, by which a fit is simulated and tuned afterwards, would be too many for a search.
+def is_too_stiff(transcription: Transcription, method: LeastSquares, *, implicit: bool = True) -> bool:
+    """Whether a start takes more integration steps than a search allows.
 
     Parameters
     ----------
     transcription : Transcription
     method : LeastSquares
+    implicit : bool
+        Whether steps may be implicit in a state, as a search's may; those of simulation and tuning are Runge-Kutta's.
 
     Returns
     -------
     bool
     """
     segments = segment(transcription)
-    q = np.array([p.value for p in segments.transcription.parameters.values()])
-    needed = method.substeps or stable_substeps(segments, start_nodes(segments), q, RK4_MAX_H_LAMBDA)
-    return needed > MAX_SEARCH_SUBSTEPS
-
-
-def is_too_stiff(transcription: Transcription, method: LeastSquares) -> bool:
-    """Whether a search refuses its start for the integration steps that it takes.
-
-    Parameters
-    ----------
-    transcription : Transcription
-    method : LeastSquares
-
-    Returns
-    -------
-    bool
-    """
-    segments = segment(transcription)
-    q = np.array([p.value for p in segments.transcription.parameters.values()])
-    return choose_integration(segments, start_nodes(segments), q, method.substeps)[1] > MAX_SEARCH_SUBSTEPS
+    nodes, q = start_nodes(segments), np.array([p.value for p in segments.transcription.parameters.values()])
+    if implicit:
+        return choose_integration(segments, nodes, q, method.substeps)[1] > MAX_SEARCH_SUBSTEPS
+    return (method.substeps or stable_substeps(segments, nodes, q, RK4_MAX_H_LAMBDA)) > MAX_SEARCH_SUBSTEPS
 
 
 def excerpts(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:

@@ -148,7 +148,8 @@ def test_a_width_is_narrowed_no_further_than_simulation_and_tuning_by_runge_kutt
     steps = 45.0 / (found.value * 5.0) * 1e-3 / 2.785  # of RK4 a sample, by hand
     assert 1 < steps < 20
     assert found.too_stiff
-    assert not widths.needs_implicit_steps(chosen.transcription(chosen.candidates()[0]), chosen.method)
+    start = chosen.transcription(chosen.candidates()[0])
+    assert not widths.is_too_stiff(start, chosen.method, implicit=False)
 
 
 def test_an_edge_that_hides_the_dead_zone_is_narrowed() -> None:
