@@ -57,7 +57,7 @@ def write_loop_javascript(loop: ClosedLoop) -> str:
     ``simulateLoop(p, x0, reference, horizon, points)`` gives ``{t, states, outputs}``, an array a state and an output
     at ``points + 1`` equal instants; null where the loop is too stiff or leaves what its model describes. Parameters,
     states and outputs are those of the loop, in its order, which ``LOOP`` names. The reference is ``{at, initial,
-    final}``; other inputs are zero.
+    final, inputs}``, the last one optional: what other inputs are from that instant on, ``[[place, value], ...]``.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 // The part of a page that moves: sliders set parameters, the loop is integrated at once, and redrawn.
-// Uses LOOP, makeLoop and simulateLoop of the loop, and DATA: values, sliders, references, limits, band, units.
+// Uses LOOP, makeLoop and simulateLoop of the loop, findRest, and DATA: values, sliders, references, limits, band, units.
 const POINTS = 600; // instants of a response: fewer show corners, more cost time in a frame
 const AGREEMENT = 0.02; // share by which a figure of the design may differ from its certificate and count as the same
 const LEAST = { SettlingTime: 2e-3, Overshoot: 0.1, PeakControl: 0 }; // the same near zero, in the figures' units
@@ -43,17 +43,18 @@ function ditherPeriod(p) {
   return value("dither.amplitude") ? 1 / value("dither.frequency") : 0;
 }
 
+// Of a disturbance alone, as the certificate: either side of the reference, as a share of the reference's own scale.
 function readMetrics(run, p, reference) {
   const t = run.t;
   const y = ditherMean(t, run.outputs[DATA.measured], ditherPeriod(p));
-  const size = reference.final - reference.initial;
+  const { size } = reference;
   const control = run.outputs[run.outputs.length - 1];
   let over = 0;
   let settled = reference.at;
   for (let i = 0; i < y.length; i++) {
     if (t[i] < reference.at) continue;
     const off = (y[i] - reference.final) / size;
-    over = Math.max(over, off);
+    over = Math.max(over, reference.isStep ? off : Math.abs(off));
     if (Math.abs(off) > DATA.band) settled = i + 1 < y.length ? t[i + 1] : Infinity;
   }
   const peak = control.reduce((most, v) => Math.max(most, Math.abs(v)), 0);
@@ -148,12 +149,16 @@ function startPage() {
 
   function draw() {
     const reference = DATA.references[chosen];
-    const run = simulateLoop(p, reference.x0, reference, reference.horizon, POINTS);
+    const begin = findRest(p, reference);
+    const run = begin && simulateLoop(p, begin, reference, reference.horizon, POINTS);
     first ||= simulateLoop(Float64Array.from(DATA.values), reference.x0, reference, reference.horizon, POINTS);
     text.value = tuningText(p);
     lamps.replaceChildren();
     if (!run || !first) {
-      lamps.append(element("span", { class: "bad" }, "the loop leaves what its model describes, or is too stiff for a page"));
+      const why = begin
+        ? "the loop leaves what its model describes, or is too stiff for a page"
+        : "the plant has no rest or steady motion to begin at: it cannot hold this, or its command would be clipped";
+      lamps.append(element("span", { class: "bad" }, why));
       return;
     }
     const design = readMetrics(first, DATA.values, reference);
@@ -169,7 +174,7 @@ function startPage() {
     const pair = (of, get, unit) => (of ? [{ x: of.t, y: get(of), colour: unit }] : []);
     const signal = (r) => r.outputs[DATA.measured];
     const control = (r) => r.outputs[r.outputs.length - 1];
-    const size = DATA.band * Math.abs(reference.final - reference.initial);
+    const size = DATA.band * Math.abs(reference.size);
     const wanted = { x: [0, reference.at, reference.at, reference.horizon], colour: COLOURS.wanted, width: 1 };
     wanted.y = [reference.initial, reference.initial, reference.final, reference.final];
     const both = (get) => [...pair(first, get, COLOURS.was), ...pair(run, get, COLOURS.now)];

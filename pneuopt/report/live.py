@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Step, disturbance_input
 from pneuopt.evaluation.report import relevant_units
 from pneuopt.export.javascript import write_loop_javascript
+from pneuopt.models.load import GRAVITY
 from pneuopt.quantities.errors import ConvergenceError, InputError
-from pneuopt.quantities.parameters import Parameter, ParameterSet
+from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.unit_algebra import difference_unit
+from pneuopt.report.live_rest import RestFinder, is_refused
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +28,12 @@ NOT_MOVED = ("pid.Tt", "pid.lower", "pid.upper", "friction.smoothing")
 """Parameters without a slider: limits of hardware, and what makes a loop too stiff for a page."""
 RANGE = 3.0
 """A slider goes from a third to three times its value where no bounds say more: less hides what changes."""
+RANGES = {"supply.pressure": 1.5}
+"""The same where hardware varies less: no shop's air has three times its pressure."""
+INCLINE = 0.5
+"""Share of the load's weight, either way, that a load's force is moved by: as if its axis were tilted by 30 degrees."""
+SHRINKAGES = 4
+"""How often the way to a slider's end is halved where the loop cannot rest there; beyond it is hardly a way."""
 LOG_RANGE = 20.0
 """Ratio of a slider's ends from which it is logarithmic: else most of its way is one value."""
 
@@ -42,14 +49,14 @@ def live_script(
 ) -> str:
     """The script of a loop, which fills the page's element "live"; empty where the loop cannot move in a page.
 
-    It begins each response at the rest that the design has: a parameter on which that depends, a load's force or a
-    supply's pressure, has no slider.
+    Where a parameter moves the rest, or steady motion, at which a response begins (a load's force, a supply's
+    pressure), the script finds it anew; it has no slider where the script could not.
 
     Parameters
     ----------
     loop : ClosedLoop
     references : sequence of Step
-        Those that are steps from rest without a disturbance are offered.
+        Those that begin at rest or in steady motion are offered, with their disturbances.
     parameters : ParameterSet
         Every parameter of the loop.
     band : float
@@ -59,21 +66,22 @@ def live_script(
     certified : DataFrame, optional
         Metrics of the references, one a column, in their order; a limit is watched where the script agrees with them.
     """
-    steps = [r for r in references if r.is_step and r.initial == 0 and not r.disturbance]
-    if not steps:
-        return ""
+    loop = add_disturbances(loop, references)
+    finders = [RestFinder(loop, r, parameters) for r in references]
     try:
         code = write_loop_javascript(loop)
-        starts = [loop.initial(parameters, reference=r.initial, start=r.start) for r in steps]
+        starts = [finder.start.tolist() for finder in finders]
     except (NotImplementedError, ConvergenceError, InputError):
         return ""
     units = relevant_units(loop)
+    sliders, rests = _sliders(finders)
+    places = {q.name: k for k, q in enumerate(loop.inputs)}
     data = {
         "values": loop.parameter_vector(parameters).tolist(),
-        "sliders": [s for n in loop.parameters if (s := _slider(loop, steps, starts, parameters, n))],
+        "sliders": sliders,
         "references": [
-            _reference(r, x0.tolist(), loop.feedback.unit) | {"certified": _figures(certified, references.index(r))}
-            for r, x0 in zip(steps, starts, strict=True)
+            _reference(r, places, loop.feedback.unit) | {"x0": x0, "rest": rest, "certified": _figures(certified, k)}
+            for k, (r, x0, rest) in enumerate(zip(references, starts, rests, strict=True))
         ],
         "limits": {n: limit for n, limit in (limits or {}).items() if n in LIVE_METRICS},
         "units": {n: units.get(n, "") for n in LIVE_METRICS},
@@ -82,8 +90,8 @@ def live_script(
         "labels": [f"{q.name} [{q.unit}]" for q in (loop.feedback, loop.outputs[-1])],
         "controller": list(loop.tunable_sections),
     }
-    own = resources.files(__package__).joinpath("live.js").read_text("utf-8")
-    return f"{code}\nconst DATA = {to_script(data)};\n{own}"
+    rest, page = (resources.files(__package__).joinpath(n).read_text("utf-8") for n in ("live_rest.js", "live.js"))
+    return f"{code}\nconst DATA = {to_script(data)};\n{rest}{page}"
 
 
 def to_script(value: Any) -> str:
@@ -99,39 +107,66 @@ def _figures(certified: "pd.DataFrame | None", column: int) -> dict[str, float]:
     return {n: own[n] for n in LIVE_METRICS if n in own and not math.isnan(own[n])}
 
 
-def _reference(reference: Step, x0: list[float], unit: str) -> dict[str, Any]:
-    ends = {"at": reference.at, "initial": reference.initial, "final": reference.final}
-    label = f"{reference.initial:g} to {reference.final:g} {unit}"
-    return {**ends, "horizon": reference.horizon, "x0": x0, "label": label}
+def _reference(reference: Step, places: Mapping[str, int], unit: str) -> dict[str, Any]:
+    """What the page's `simulateLoop` and `readMetrics` read of a reference; `places` are those of the inputs."""
+    return {
+        "at": reference.at,
+        "initial": reference.initial,
+        "final": reference.final,
+        "inputs": [[places[disturbance_input(n)], value] for n, value in reference.disturbance.items()],
+        "size": reference.nominal_size,
+        "isStep": reference.is_step,
+        "horizon": reference.horizon,
+        "label": f"{reference.label} {unit}",
+    }
 
 
-def _slider(
-    loop: ClosedLoop, references: Sequence[Step], starts: Sequence[Any], parameters: ParameterSet, name: str
-) -> dict[str, Any] | None:
-    """Of a parameter that may move; None where the rest depends on it, or where its ends cannot run."""
+def _sliders(finders: Sequence[RestFinder]) -> tuple[list[dict[str, Any]], list[dict[str, Any] | None]]:
+    """The sliders, and of each reference what its rest is found from; None of those of which no slider moves it."""
+    loop, parameters = finders[0].loop, finders[0].parameters
+    every = {n: s for n in loop.parameters if (s := _slider(finders, parameters, n))}
+    ends = {n: [(n, s["low"]), (n, s["high"])] for n, s in every.items()}
+    moved = [{n: finder.moved_states(pair) for n, pair in ends.items()} for finder in finders]
+    unknown = [sorted({k for states in own.values() for k in states}) for own in moved]
+    if any(finder.is_singular(states) for finder, states in zip(finders, unknown, strict=True)):
+        every = {n: s for n, s in every.items() if not any(own[n] for own in moved)}
+        return list(every.values()), [None] * len(finders)
+    places = [[every[n]["place"] for n, states in own.items() if states] for own in moved]
+    found = zip(finders, unknown, places, strict=True)
+    return list(every.values()), [f.data(states, own) if states else None for f, states, own in found]
+
+
+def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) -> dict[str, Any] | None:
+    """Of a parameter that may move; None where its ends cannot run."""
+    loop = finders[0].loop
     sections = (*PLANT_SECTIONS, *loop.tunable_sections)
     if name in NOT_MOVED or name.partition(".")[0] not in sections:
         return None
     p = parameters[name]
-    low, high = _ends(p)
+    low, high = (_runnable_end(finders, name, p.value, end) for end in _ends(parameters, name))
     if not low < high:
         return None
-    for value in (low, high):
-        try:
-            moved = parameters.with_values({name: value})
-            begun = [loop.initial(moved, reference=r.initial, start=r.start) for r in references]
-        except (InputError, ConvergenceError):
-            return None
-        if not all(np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in zip(begun, starts, strict=True)):
-            return None
     is_log = low > 0 and high / low > LOG_RANGE
     place = list(loop.parameters).index(name)
     return {"name": name, "place": place, "unit": difference_unit(p.unit), "low": low, "high": high, "isLog": is_log}
 
 
-def _ends(p: Parameter) -> tuple[float, float]:
+def _runnable_end(finders: Sequence[RestFinder], name: str, value: float, end: float) -> float:
+    """The end, or one nearer to the value where the loop cannot rest at it."""
+    for _ in range(SHRINKAGES):
+        if not any(is_refused(finder, name, end) for finder in finders):
+            return end
+        end = (value + end) / 2
+    return value
+
+
+def _ends(parameters: ParameterSet, name: str) -> tuple[float, float]:
     """From where to where a slider goes: the bounds of what is tuned, else around its value."""
+    p = parameters[name]
     if p.free and math.isfinite(p.lower) and math.isfinite(p.upper):
         return p.lower, p.upper
-    ends = sorted((p.value / RANGE, p.value * RANGE))
+    ends = sorted((p.value / (ratio := RANGES.get(name, RANGE)), p.value * ratio))
+    if name == "load.force" and "load.mass" in parameters:
+        reach = INCLINE * GRAVITY * parameters.value("load.mass")
+        ends = [p.value - reach, p.value + reach]
     return max(ends[0], p.lower), min(ends[1], p.upper)

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
@@ -28,15 +30,18 @@ from pneuopt.models.friction import Stribeck
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.report.fit_page import Source
 from pneuopt.report.live import live_script, to_script
+from pneuopt.report.live_rest import RestFinder
 from pneuopt.report.page import render_page
 from pneuopt.report.tuning_page import LoopView, simulation_page
 from tests.report.reading import HOSTILE, read_page
 
 NODE = shutil.which("node")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_node = pytest.mark.skipif(NODE is None, reason="node runs the script")
 POINTS = 300
 AGREEMENT = 1e-6  # of each signal's largest value
 STEP = Step(0.2, horizon=0.4)
+HELD = Step(0.0, initial=0.2, at=0.05, horizon=0.3, disturbance={"load.force": 30.0})
 AXIS = {"load.mass": 6.0, "friction.coulomb": 25.0, "friction.static": 35.0, "friction.viscous": 40.0}
 
 
@@ -94,6 +99,123 @@ def test_responses_are_those_of_simulate(options: dict[str, Any], tmp_path: Path
     assert largest_difference(loop, [p], replace(STEP, at=0.05), tmp_path) < AGREEMENT
 
 
+def live_data(script: str) -> Any:
+    """What the page's script knows of its loop."""
+    return json.loads(script.partition("const DATA = ")[2].partition(";\n")[0])
+
+
+def settings(data: Any, parameters: ParameterSet, count: int) -> list[ParameterSet]:
+    """Random places of all sliders at once, as the page moves them."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(count):
+        shares = ((s, rng.uniform()) for s in data["sliders"])
+        found.append(parameters.with_values({s["name"]: slider_value(s, share) for s, share in shares}))
+    return found
+
+
+def slider_value(slider: Any, share: float) -> float:
+    low, high = slider["low"], slider["high"]
+    return float(low * (high / low) ** share if slider["isLog"] else low + (high - low) * share)
+
+
+def compare_settings(
+    loop: ClosedLoop, parameters: ParameterSet, references: list[Step], count: int, run: Callable[[str], Any]
+) -> float:
+    """The largest difference between a page at random settings and `simulate` there, from the rest that each finds."""
+    script, worst = live_script(loop, references, parameters), 0.0
+    loop, data = add_disturbances(loop, references), live_data(script)
+    cases = settings(data, parameters, count)
+    for k, reference in enumerate(references):
+        jobs = to_script([loop.parameter_vector(p).tolist() for p in cases])
+        call = f"const r = DATA.references[{k}]; const b = findRest(p, r);"
+        call += f" const f = b && simulateLoop(p, b, r, r.horizon, {POINTS});"
+        call += " return f && [...f.states, ...f.outputs].map((a) => Array.from(a));"
+        found = run(f"{script}\nconst told = {jobs}.map((a) => {{ const p = Float64Array.from(a); {call} }});")
+        for p, signals in zip(cases, found, strict=True):
+            assert signals is not None, reference.label
+            worst = max(worst, difference(loop, reference, p, signals))
+    return worst
+
+
+def difference(loop: ClosedLoop, reference: Step, p: ParameterSet, signals: list[list[float]]) -> float:
+    """Of a page's signals to `simulate`, each as a share of its largest value."""
+    x0 = loop.initial(p, reference=reference.initial, start=reference.start)
+    inputs = loop_inputs(loop, reference, sample_spacing(loop, reference, p))
+    t, worst = np.linspace(0, reference.horizon, POINTS + 1), 0.0
+    run = simulate(loop, inputs, p, initial=x0, t_out=t, max_steps=np.inf)
+    names = [q.name for q in (*loop.states, *loop.outputs)]
+    for name, signal in zip(names, signals, strict=True):
+        size = max(float(np.abs(run[name]).max()), 1e-9)
+        worst = max(worst, float(np.abs(run[name] - np.array(signal)).max()) / size)
+    return worst
+
+
+@needs_node
+@pytest.mark.parametrize("reference", [STEP, replace(STEP, size=0.1, initial=0.1), HELD], ids=lambda r: r.label)
+@pytest.mark.parametrize("pid", [PID(), PID(sample_time=1e-3)], ids=["continuous", "sampled"])
+def test_each_setting_begins_at_its_own_rest(reference: Step, pid: PID, tmp_path: Path) -> None:
+    loop, p = axis_loop(pid=pid)
+
+    def run(script: str) -> Any:
+        return run_script(f"{script}console.log(JSON.stringify(told));", tmp_path)
+
+    assert compare_settings(loop, p, [reference], 4, run) < AGREEMENT
+
+
+@needs_node
+def test_a_drive_s_rest_moves_with_supply_and_load(tmp_path: Path) -> None:
+    loop, p = t32_loop()
+    starts = [Step(0.2), Step(0.2, start={"position": 0.05, "pressure_b": 3.5e5}), replace(HELD, horizon=1.0)]
+    script = live_script(loop, starts, p)
+    data, disturbed = live_data(script), add_disturbances(loop, starts)
+    assert {"supply.pressure", "load.force", "friction.coulomb"} <= {s["name"] for s in data["sliders"]}
+    cases = settings(data, p, 20)
+    jobs = to_script([disturbed.parameter_vector(q).tolist() for q in cases])
+    call = f"{jobs}.map((p) => DATA.references.map((r) => Array.from(findRest(Float64Array.from(p), r))))"
+    found = run_script(f"{script}console.log(JSON.stringify({call}));", tmp_path)
+    nominal = np.array([q.nominal for q in disturbed.states])
+    for p_case, rests in zip(cases, found, strict=True):
+        for r, x0 in zip(starts, rests, strict=True):
+            expected = disturbed.initial(p_case, reference=r.initial, start=r.start)
+            assert np.abs((np.array(x0) - expected) / nominal).max() < 1e-8
+
+
+@needs_node
+def test_a_setting_that_no_command_holds_has_no_rest(tmp_path: Path) -> None:
+    loop, p = axis_loop()
+    script = live_script(loop, [STEP], p)
+    heavy = to_script(loop.parameter_vector(p.with_values({"load.force": 200.0})).tolist())
+    told = f"console.log(JSON.stringify(findRest(Float64Array.from({heavy}), DATA.references[0])));"
+    assert run_script(script + told, tmp_path) is None
+
+
+def run_in_chromium(script: str, folder: Path) -> Any:
+    """What the script leaves as ``told``, from a page in a headless browser."""
+    page = folder / "settings.html"
+    text = f'<!DOCTYPE html><meta charset="utf-8"><pre id="told"></pre><section id="live"></section><script>{script}'
+    text += 'document.getElementById("told").textContent = JSON.stringify(told);</script>'
+    page.write_text(text, encoding="utf-8")
+    profile = folder / "profile"
+    options = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --dump-dom"
+    call = [CHROMIUM or "chromium", *options.split(), f"--user-data-dir={profile}", page.as_uri()]
+    done = subprocess.run(call, capture_output=True, text=True, check=False)
+    return json.loads(done.stdout.partition('<pre id="told">')[2].partition("</pre>")[0])
+
+
+def t32_loop() -> tuple[ClosedLoop, ParameterSet]:
+    drive, hardware = t32()
+    loop = ClosedLoop(drive.system(), PID(sample_time=1e-3), Dither(160.0))
+    own = {"pid.Kp": 4.0, "pid.Ki": 20.0, "pid.lower": -5.0, "pid.upper": 5.0, "dither.amplitude": 0.3}
+    return loop, loop.complete(hardware).with_values(own)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium shows the page")
+@pytest.mark.slow
+def test_fifty_settings_of_every_slider_in_a_browser(tmp_path: Path) -> None:
+    loop, p = t32_loop()
+    assert compare_settings(loop, p, [Step(0.2)], 50, lambda script: run_in_chromium(script, tmp_path)) < AGREEMENT
+
+
 @needs_node
 @pytest.mark.slow
 def test_fifty_settings_of_t32_are_those_of_simulate(tmp_path: Path) -> None:
@@ -135,18 +257,29 @@ def test_what_is_copied_is_read_back(folder: Path) -> None:
     assert read_tuning(folder / "copied.toml", loop.plant).parameters.value("pid.Ki") == 5000.0
 
 
-def test_sliders_are_of_what_leaves_the_rest_as_it_is() -> None:
+def test_a_load_force_has_a_slider_and_hardware_has_none() -> None:
     loop, p = axis_loop()
-    data = json.loads(live_script(loop, [STEP], p).partition("const DATA = ")[2].partition(";\n")[0])
+    data = live_data(live_script(loop, [STEP], p))
     names = {s["name"] for s in data["sliders"]}
-    assert {"pid.Kp", "pid.Ki", "load.mass", "friction.coulomb", "friction.viscous"} <= names
-    assert not {"load.force", "pid.lower", "pid.upper", "friction.smoothing"} & names
+    assert {"pid.Kp", "pid.Ki", "load.mass", "load.force", "friction.coulomb", "friction.viscous"} <= names
+    assert not {"pid.lower", "pid.upper", "friction.smoothing"} & names
     assert all(s["low"] <= p.value(s["name"]) <= s["high"] for s in data["sliders"])
+    hung = p.with_values({"load.force": 148.0})
+    (force,) = (s for s in live_data(live_script(loop, [STEP], hung))["sliders"] if s["name"] == "load.force")
+    assert force["high"] < 150.0, "beyond the controller's limit the loop has no rest"
 
 
-def test_a_loop_that_starts_in_motion_has_no_script() -> None:
+def test_a_loop_without_a_start_has_no_script() -> None:
     loop, p = axis_loop()
-    assert live_script(loop, [replace(STEP, initial=0.1)], p) == ""
+    assert live_script(loop, [replace(STEP, initial=10.0)], p) == "", "its limit of 150 N holds no such speed"
+
+
+def test_what_a_rest_leaves_undetermined_has_no_slider() -> None:
+    loop, p = axis_loop()
+    finder = RestFinder(loop, STEP, p)
+    order = [q.name for q in loop.states]
+    assert not finder.is_singular([order.index("pid.integral"), order.index("pid.command")])
+    assert finder.is_singular([order.index("position")]), "an axis under speed control rests anywhere"
 
 
 def test_a_page_runs_our_script_and_no_other() -> None:
