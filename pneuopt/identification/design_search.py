@@ -10,7 +10,7 @@ import numpy as np
 from pneuopt.dynamics.system import names
 from pneuopt.identification.criteria import Criterion
 from pneuopt.identification.experiment_design import ExperimentDesign, tabulate_design
-from pneuopt.identification.planned_run import MIN_SUBSTEPS, NODE_NOISE, PREDICTED_NODE_NOISE, PlannedRun
+from pneuopt.identification.planned_run import MIN_SUBSTEPS, PlannedRun
 from pneuopt.identification.waveforms import CYCLES_A_SAMPLE, Block, join_blocks, library, vary
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, require
@@ -82,7 +82,7 @@ class DesignSearch:
         signals = np.stack([self._signal(blocks) for blocks in chosen])
         nominal, fine = self.plants[0], 2 * self.substeps
         shown = self.run.simulate(signals, nominal, fine)
-        gained = self.run.information(shown, nominal, fine, PREDICTED_NODE_NOISE).sum(axis=0)
+        gained = self.run.information(shown, nominal, fine).sum(axis=0)
         every = [self.run.violations(self.run.simulate(signals, p, self.substeps), p) for p in self.plants]
         room = {n: float(max(np.max(v[n]) for v in every)) for n in every[0]}
         channels = names(self.run.channels)
@@ -202,7 +202,7 @@ class DesignSearch:
                 keeps[rows] &= beyond <= 0
         for i, (rows, found) in shown.items():
             kept = keeps[rows]
-            gains[i, rows[kept]] = self.run.information(found[kept], self.plants[i], self.substeps, NODE_NOISE)
+            gains[i, rows[kept]] = self.run.information(found[kept], self.plants[i], self.substeps)
         return gains, keeps
 
     def _signal(self, blocks: Sequence[Block]) -> Array:

@@ -16,6 +16,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.dynamics.system import System, names, parameter_vector
+from pneuopt.identification.linked_information import linked_information
 from pneuopt.identification.logged_loop import REFERENCE_CHANNELS
 from pneuopt.quantities.arrays import Array, Indices
 from pneuopt.quantities.errors import ModelError, require
@@ -26,13 +27,6 @@ from pneuopt.shooting.transcription import Phase, Transcription
 
 BATCH_SAMPLES = 400_000  # samples simulated at once: more take memory (100 bytes a sample and signal), fewer lanes
 MIN_SUBSTEPS = 8  # integration steps a sample: fewer miss how a bristle lets go
-NODE_NOISE = 1e-4
-"""Jump of a state between two segments [1, of its nominal size] that counts in a search, where the state's rate holds a
-free parameter: less trusts hypersensitive runs, whose gaps no fit closes; more throws away what runs tell."""
-PREDICTED_NODE_NOISE = 1e-5  # that of a prediction: the gaps of a fit that has converged, the last stage of a search
-STATE_RIDGE = 1e-6  # information about a node's state that is always there, in nominal sizes: only keeps it invertible
-SINGULAR = 1e-13
-"""Share of the largest information about a start state [1] below which it is rounding: more keeps what is none."""
 Limits = Mapping[str, tuple[float, float]]
 
 
@@ -161,17 +155,18 @@ class PlannedRun:
             out[limit.state] = (low, min(high, end)) if limit.side > 0 else (max(low, end), high)
         return out
 
-    def information(self, runs: Array, parameters: ParameterSet, substeps: int, jump: float) -> Array:
-        """Fisher information of each run about the free parameters, in their units; shape (m, k, k)."""
+    def information(self, runs: Array, parameters: ParameterSet, substeps: int) -> Array:
+        """What `identify` will know of the free parameters from the log of each run, in their units; (m, k, k)."""
         m, n = runs.shape[:2]
         size = max(1, BATCH_SAMPLES // n)
-        parts = [self._information(runs[i : i + size], parameters, substeps, jump) for i in range(0, m, size)]
+        parts = [self._information(runs[i : i + size], parameters, substeps) for i in range(0, m, size)]
         k = len(self.free)
         return np.concatenate(parts) if parts else np.zeros((0, k, k))
 
-    def _information(self, runs: Array, parameters: ParameterSet, substeps: int, jump: float) -> Array:
+    def _information(self, runs: Array, parameters: ParameterSet, substeps: int) -> Array:
         m, n = runs.shape[:2]
-        length = max(2, round(LeastSquares().segment_time / self.sample_time))  # as `identify` places its nodes
+        method = LeastSquares()  # as `identify` places its nodes and weighs its gaps in the end
+        length = max(2, round(method.segment_time / self.sample_time))
         count = -(-n // length)
         padded = np.pad(runs, ((0, 0), (0, count * length - n), (0, 0)), mode="edge")
         cut = padded.reshape(m * count, length, -1)
@@ -187,29 +182,13 @@ class PlannedRun:
         ends = found.dx_end.reshape(m, count, *found.dx_end.shape[1:])
         good = np.isfinite(grams).all(axis=(1, 2, 3)) & np.isfinite(ends).all(axis=(1, 2, 3))
         own = self._parameter_sizes(parameters)
-        scale = np.concatenate([np.ones(ends.shape[2]), own])
+        nominal = np.array([q.nominal for q in self.plant.states])
+        scale, jumps = np.concatenate([nominal, own]), method.stages[-1].gap * self._jumps(parameters)
         out = np.zeros((m, len(self.free), len(self.free)))
         kept = own[len(self.per_log) :]
-        given = grams[good] * np.outer(scale, scale), ends[good] * scale
-        out[good] = self._chain(*given, jump * self._jumps(parameters)) / np.outer(kept, kept)
+        given = grams[good] * np.outer(scale, scale), ends[good] * scale / nominal[:, None]
+        out[good] = linked_information(*given, jumps, len(self.per_log)) / np.outer(kept, kept)
         return out
-
-    def _chain(self, grams: Array, ends: Array, jumps: Array) -> Array:
-        """The information of linked segments about the parameters: a filter in information form, from node to node.
-
-        The state at each node is eliminated, and a jump of `NODE_NOISE` allowed there, as a fit allows gaps. Without
-        it a hypersensitive run (an axis about to break away) would promise what no fit of a real log delivers.
-        """
-        m, count, nx, width = ends.shape
-        scale = np.concatenate([[q.nominal for q in self.plant.states], np.ones(width - nx)])
-        grams = grams * np.outer(scale, scale)
-        moves = ends * scale / scale[:nx, None]
-        found = np.zeros((m, width, width))
-        for j in range(count):
-            found = found + grams[:, j]
-            if j < count - 1:
-                found = _advance(found, moves[:, j], 1 / jumps**2)
-        return _eliminate(found, nx + len(self.per_log))
 
     def stable_substeps(self, parameters: ParameterSet) -> int:
         """Integration steps a sample that are stable about the rest, at every state's usual size."""
@@ -254,34 +233,3 @@ class PlannedRun:
 
 
 _SEVERAL_INPUTS = "a planned run excites one input, the plant has {}; plan it with a friction model that needs one"
-
-
-def _advance(information: Array, move: Array, weight: Array) -> Array:
-    """The information about the next node's state and the parameters, from that about this node's; (m, k, k).
-
-    In nominal sizes: x_next = move (x, p) + w, with w of variances 1 / `weight`, shape (n_states,).
-    """
-    nx = len(weight)
-    own, by_p = move[:, :, :nx], move[:, :, nx:]
-    heavy = np.swapaxes(own, 1, 2) * weight
-    inner = information[:, :nx, :nx] + heavy @ own + STATE_RIDGE * np.eye(nx)
-    mixed = np.concatenate([-heavy, information[:, :nx, nx:] + heavy @ by_p], axis=2)
-    out = np.zeros_like(information)
-    out[:, :nx, :nx] = np.diag(weight)
-    out[:, :nx, nx:] = -weight[:, None] * by_p
-    out[:, nx:, :nx] = np.swapaxes(out[:, :nx, nx:], 1, 2)
-    out[:, nx:, nx:] = information[:, nx:, nx:] + (np.swapaxes(by_p, 1, 2) * weight) @ by_p
-    out = out - np.swapaxes(mixed, 1, 2) @ np.linalg.solve(inner, mixed)
-    return np.asarray((out + np.swapaxes(out, 1, 2)) / 2)
-
-
-def _eliminate(information: Array, count: int) -> Array:
-    """The information about the others where the first `count` unknowns are not known; shape (m, k, k)."""
-    if not count:
-        return information
-    own = information[:, :count, :count]
-    size = np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 1e-300))
-    scaled = own / (size[:, :, None] * size[:, None, :])
-    inverse = np.linalg.pinv(scaled, rcond=SINGULAR, hermitian=True) / (size[:, :, None] * size[:, None, :])
-    mixed = information[:, :count, count:]
-    return np.asarray(information[:, count:, count:] - np.swapaxes(mixed, 1, 2) @ inverse @ mixed)
