@@ -21,6 +21,7 @@ from .control.friction_feedforward import Direction, FrictionFeedforward
 from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
+from .control.motion_feedforward import MotionFeedforward
 from .control.pid import PID, AntiWindup
 from .control.reference import Step
 from .control.sensor import Encoder, SensorLag
@@ -237,6 +238,7 @@ __all__ = [
     "MaxSensitivity",
     "ModelSelection",
     "MotionDrive",
+    "MotionFeedforward",
     "NoiseGain",
     "Normal",
     "Overshoot",

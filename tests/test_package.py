@@ -106,6 +106,7 @@ PUBLIC_NAMES = [
     "Karnopp",
     "Knocker",
     "Language",
+    "MotionFeedforward",
     "export_controller",
     "export_fmu",
     "export_settings",

@@ -8,6 +8,7 @@ from pneuopt.control.compensation import Compensator, Instant, compensate
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.pid import PID
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
 from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.parameters import with_prefix, without_prefix
@@ -38,7 +39,7 @@ class CommandParts(Protocol):
 
 
 def added_command(
-    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, p: Symbols
+    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
 ) -> tuple[Signals, ca.SX]:
     """What feedforward, compensators and dither, in this order, add to the PID's command.
 
@@ -50,6 +51,8 @@ def added_command(
         The loop's states, inputs and parameters.
     measured : casadi.SX
         The measured signal, as the controller sees it.
+    y : mapping of str to casadi.SX
+        The plant's outputs that compensators read.
 
     Returns
     -------
@@ -58,19 +61,20 @@ def added_command(
     added : casadi.SX
         [the command's unit]
     """
-    moved, terms = added_terms(parts, t, x, u, measured, p)
+    moved, terms = added_terms(parts, t, x, u, measured, y, p)
     return moved, terms["dither"] + (terms["feedforward"] + terms["compensation"])
 
 
 def added_terms(
-    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, p: Symbols
+    parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
 ) -> tuple[Signals, Signals]:
     """The terms of `added_command`, "feedforward", "compensation" and "dither", in place of their sum."""
     moved, lead = _feedforward_terms(parts, x, u, p)
     bent = ca.SX(0)
     if parts.compensators:
         v = parts.pid.output(without_prefix(x, "pid"), u["reference"], measured, without_prefix(p, "pid"))
-        seen = Instant(t, u["reference"], measured, v + lead, parts.pid.sample_time)
+        rates = {n: u[n] for n in (REFERENCE_SPEED, REFERENCE_ACCELERATION) if n in u}
+        seen = Instant(t, u["reference"], measured, v + lead, parts.pid.sample_time, rates, y)
         own, bent = compensate(parts.compensators, seen, x, p)
         moved = moved | own
     return moved, {"feedforward": lead, "compensation": bent, "dither": _dither_command(parts, t, p)}

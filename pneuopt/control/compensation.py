@@ -1,11 +1,11 @@
-"""`Compensator`: a part that adds to the PID's command against friction or a dead zone, and how several act.
+"""`Compensator`: a part that adds to the PID's command, feedforward or feedback of its own, and how several act.
 
 They act in the order in which the loop has them, each on the command of those before it, after feedforward and before
 dither and clip: what they add counts for the limits, and back-calculation unwinds it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import casadi as ca
@@ -30,14 +30,17 @@ MAX_DOUBLINGS = 60  # of a bracket from 1 [command's unit] on: fewer than some 2
 class Instant:
     """What a compensator sees: the time [s], reference and measured signal, and the command so far.
 
-    `sample_time` [s] is the controller's, None of a continuous one.
+    `sample_time` [s] is the controller's, None of a continuous one. `rates` are the motion inputs that the part asks
+    for ("reference_speed", "reference_acceleration"), `readings` the plant's outputs, by name.
     """
 
-    t: ca.SX
-    reference: ca.SX
-    measured: ca.SX
-    command: ca.SX
+    t: Any
+    reference: Any
+    measured: Any
+    command: Any
     sample_time: float | None
+    rates: Mapping[str, Any] = field(default_factory=dict)
+    readings: Mapping[str, Any] = field(default_factory=dict)
 
 
 @runtime_checkable
@@ -55,6 +58,8 @@ class Compensator(Protocol):
         include; a pulse is not, and is left out of them, as a dither is.
     without_gradient : tuple of str
         Parameters on which the response does not depend smoothly.
+
+    A part with states is linear in them and in the signals that it remembers: `start` gives those of a loop at rest.
     """
 
     section: ClassVar[str]
@@ -70,12 +75,20 @@ class Compensator(Protocol):
         """Its parameters for a signal and a command's unit; a value outside their bounds cannot run."""
         ...
 
-    def states(self, command: Quantity) -> tuple[Quantity, ...]:
+    def reads(self, on: SensedSignal) -> tuple[str, ...]:
+        """Outputs of the plant that it reads beside the loop's own signal."""
+        ...
+
+    def motion_inputs(self, on: SensedSignal) -> tuple[str, ...]:
+        """Rates of the reference that it uses: names of the loop's inputs."""
+        ...
+
+    def states(self, on: SensedSignal, command: Quantity) -> tuple[Quantity, ...]:
         """What it remembers."""
         ...
 
-    def start(self, command: Any) -> list[Any]:
-        """The states in a loop that so far rests on a command of the PID."""
+    def start(self, seen: Instant) -> list[Any]:
+        """The states in a loop whose signals have been constant so far, or with a sampled PID since the last sample."""
         ...
 
     def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
@@ -97,6 +110,11 @@ class CompensatedLoop(Protocol):
         ...
 
     @property
+    def readings(self) -> tuple[str, ...]:
+        """The outputs of the plant that compensators read."""
+        ...
+
+    @property
     def compensation(self) -> ca.Function:
         """Of `compensation_function`."""
         ...
@@ -111,6 +129,10 @@ def check_compensators(given: object, on: SensedSignal, axis: Axis | None) -> No
         same = any(part.section == other.section for other in parts[:n])
         require(not same, f"compensators has {type(part).__name__} twice; leave one out", ModelError)
         part.check(on, axis)
+        absent = ", ".join(n for n in part.reads(on) if n not in on.outputs)
+        had = f"the plant's outputs are {', '.join(on.outputs)}"
+        told = f"{type(part).__name__} reads {absent}, which the plant does not have: {had}; leave it out"
+        require(not absent, told, ModelError)
 
 
 def check_values(compensators: Sequence[Compensator], known: ParameterSet, value: Mapping[str, float]) -> None:
@@ -147,21 +169,26 @@ def compensate(compensators: Sequence[Compensator], seen: Instant, x: Symbols, p
     return moved, added
 
 
-def compensation_function(compensators: Sequence[Compensator], parameters: ParameterSet) -> ca.Function:
-    """Those that act always, as a function of the PID's command.
+def compensation_function(loop: CompensatedLoop, on: SensedSignal, command: Quantity) -> ca.Function:
+    """The compensators that act always, under constant signals and a reference at rest, of the PID's command.
 
     Returns
     -------
     casadi.Function
-        ``(command, reference, measured, p) -> [compensated, slope, feedback]``: the command that they make of the
-        PID's, and its derivatives to the PID's command and to the measured signal.
+        ``(command, reference, measured, readings, p) -> [compensated, slope, feedback]``: the command that they make
+        of the PID's, and its derivatives to the PID's command and to the measured signal.
     """
     v, r, y = (ca.SX.sym(n) for n in ("command", "reference", "measured"))
-    p: Signals = {n: ca.SX.sym(n) for n in parameters}
-    seen = Instant(ca.SX(0), r, y, v, None)
-    made = v + compensate([c for c in compensators if c.acts_always], seen, {}, p)[1]
+    p: Signals = {n: ca.SX.sym(n) for n in loop.parameters}
+    shown: Signals = {n: ca.SX.sym(n) for n in loop.readings}
+    made = v
+    for part in acting_always(loop):
+        rates = dict.fromkeys(part.motion_inputs(on), ca.SX(0))
+        seen = Instant(ca.SX(0), r, y, made, None, rates, shown)
+        x = dict(zip((q.name for q in part.states(on, command)), map(ca.SX, part.start(seen)), strict=True))
+        made = made + part.act(seen, x, without_prefix(p, part.section))[1]
     slopes = (ca.densify(ca.jacobian(made, signal)) for signal in (v, y))
-    return ca.Function("compensation", [v, r, y, stack(p)], [made, *slopes])
+    return ca.Function("compensation", [v, r, y, stack(shown), stack(p)], [made, *slopes])
 
 
 def acting_always(loop: CompensatedLoop) -> tuple[Compensator, ...]:
@@ -169,7 +196,9 @@ def acting_always(loop: CompensatedLoop) -> tuple[Compensator, ...]:
     return tuple(c for c in loop.compensators if c.acts_always)
 
 
-def uncompensated_command(loop: CompensatedLoop, p: Array, reference: Any, measured: Any, command: ArrayLike) -> Array:
+def uncompensated_command(
+    loop: CompensatedLoop, p: Array, reference: Any, measured: Any, command: ArrayLike, readings: ArrayLike = ()
+) -> Array:
     """The PID's command of which the compensators that act always make another one.
 
     Parameters
@@ -180,6 +209,8 @@ def uncompensated_command(loop: CompensatedLoop, p: Array, reference: Any, measu
         The signals at that instant.
     command : float or array_like, shape (m,)
         What the compensators make, which grows with the PID's command.
+    readings : array_like, shape (n_readings,) or (n_readings, m)
+        The outputs ``loop.readings``.
 
     Returns
     -------
@@ -188,7 +219,8 @@ def uncompensated_command(loop: CompensatedLoop, p: Array, reference: Any, measu
     wanted = np.atleast_1d(np.asarray(command, dtype=float))
     if not acting_always(loop):
         return wanted
-    return invert_increasing(lambda v: _evaluate_compensation(loop, p, reference, measured, v)[0], wanted)
+    shown = np.asarray(readings, dtype=float)
+    return invert_increasing(lambda v: _evaluate_compensation(loop, p, reference, measured, v, shown)[0], wanted)
 
 
 def compensation_slopes(
@@ -217,9 +249,13 @@ def compensation_slopes(
     return slope, feedback
 
 
-def _evaluate_compensation(loop: CompensatedLoop, p: Array, reference: Any, measured: Any, v: Array) -> list[Array]:
+def _evaluate_compensation(
+    loop: CompensatedLoop, p: Array, reference: Any, measured: Any, v: Array, readings: ArrayLike = ()
+) -> list[Array]:
     """What `CompensatedLoop.compensation` gives for m points at once, shape (m,) each."""
-    rows = (np.broadcast_to(a, v.shape)[None] for a in (v, reference, measured))
+    rows = [np.broadcast_to(a, v.shape)[None] for a in (v, reference, measured)]
+    shown = np.asarray(readings, dtype=float)
+    rows.append(np.broadcast_to(shown[:, None] if shown.ndim == 1 else shown, (len(loop.readings), len(v))))
     given = p if np.ndim(p) > 1 else np.repeat(np.reshape(p, (-1, 1)), len(v), axis=1)
     return [np.asarray(found, dtype=float).ravel() for found in loop.compensation(*rows, given)]
 

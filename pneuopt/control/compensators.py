@@ -6,8 +6,11 @@ from types import MappingProxyType
 from pneuopt.control.dead_zone_inverse import DeadZoneInverse
 from pneuopt.control.friction_feedforward import FrictionFeedforward
 from pneuopt.control.knocker import Knocker
+from pneuopt.control.motion_feedforward import MotionFeedforward
+
+Kind = type[MotionFeedforward] | type[FrictionFeedforward] | type[Knocker] | type[DeadZoneInverse]
 
 # A file's compensators act in this order: the one that inverts the valve comes last, where it sees all but the dither.
-COMPENSATORS: Mapping[str, type[FrictionFeedforward] | type[Knocker] | type[DeadZoneInverse]] = MappingProxyType(
-    {part.section: part for part in (FrictionFeedforward, Knocker, DeadZoneInverse)}
+COMPENSATORS: Mapping[str, Kind] = MappingProxyType(
+    {part.section: part for part in (MotionFeedforward, FrictionFeedforward, Knocker, DeadZoneInverse)}
 )

@@ -48,11 +48,19 @@ class DeadZoneInverse:
             }
         )
 
-    def states(self, _command: Quantity) -> tuple[Quantity, ...]:
+    def reads(self, _on: SensedSignal) -> tuple[str, ...]:
+        """Nothing."""
+        return ()
+
+    def motion_inputs(self, _on: SensedSignal) -> tuple[str, ...]:
         """None."""
         return ()
 
-    def start(self, _command: Any) -> list[Any]:
+    def states(self, _on: SensedSignal, _command: Quantity) -> tuple[Quantity, ...]:
+        """None."""
+        return ()
+
+    def start(self, _seen: Instant) -> list[Any]:
         """No states."""
         return []
 

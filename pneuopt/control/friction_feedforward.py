@@ -7,13 +7,12 @@ from typing import Any, ClassVar
 import casadi as ca
 
 from pneuopt.control.compensation import LEAST_SMOOTHING, Instant
-from pneuopt.control.sensor import SensedSignal
+from pneuopt.control.sensor import REFERENCE_SPEED, SensedSignal
 from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.unit_algebra import difference_unit
 
 DIRECTION_SMOOTHING = 1e-3  # [measured unit] default: m/s or rad/s; a small one chatters about rest, a large one gives
 # slow motions too little
@@ -34,6 +33,7 @@ class FrictionFeedforward:
     far as to slip. The reference's direction is known without noise and leaves the loop as it was, but pushes a
     reference of zero nowhere; the measured one follows every reversal, and is positive feedback with the gain
     level/smoothing at rest, which the margins count: more than the friction's own slope there, and the loop hunts.
+    In a loop of the position the reference's direction is that of the input "reference_speed".
     H. Olsson, K. J. Åström, C. Canudas de Wit, M. Gäfvert & P. Lischinsky, Friction models and friction compensation,
     Eur. J. Control 4 (1998) 176-195, section 5.
 
@@ -55,10 +55,10 @@ class FrictionFeedforward:
             f"FrictionFeedforward: direction is one of {known}, got {self.direction!r}",
         )
 
-    def check(self, on: SensedSignal, axis: Axis | None) -> None:
-        """Refuse a loop of the position, whose signals have no direction of motion."""
-        told = "FrictionFeedforward takes the sign of a speed, and this loop controls the position; control the speed"
-        require(axis is None or on.measured.name != axis.position, told, ModelError)
+    def check(self, on: SensedSignal, _axis: Axis | None) -> None:
+        """Refuse the measured direction in a loop whose PID sees a position, which has no direction of motion."""
+        told = "FrictionFeedforward: a PID of the position measures no direction of motion; take Direction.REFERENCE"
+        require(self.direction is Direction.REFERENCE or on.order != 0, told, ModelError)
 
     def parameters(self, on: SensedSignal, unit: str) -> ParameterSet:
         """The level [unit], zero by default, and the speed within which the sign turns over [measured unit].
@@ -71,7 +71,7 @@ class FrictionFeedforward:
         """
         within = Parameter(
             DIRECTION_SMOOTHING,
-            difference_unit(on.measured.unit),
+            on.speed_unit,
             lower=LEAST_SMOOTHING,
             meaning="speed within which the added command turns its sign",
         )
@@ -82,15 +82,24 @@ class FrictionFeedforward:
             }
         )
 
-    def states(self, _command: Quantity) -> tuple[Quantity, ...]:
+    def reads(self, _on: SensedSignal) -> tuple[str, ...]:
+        """Nothing."""
+        return ()
+
+    def motion_inputs(self, on: SensedSignal) -> tuple[str, ...]:
+        """The reference's speed where it is a position and its direction counts."""
+        return on.speed_input if self.direction is Direction.REFERENCE else ()
+
+    def states(self, _on: SensedSignal, _command: Quantity) -> tuple[Quantity, ...]:
         """None."""
         return ()
 
-    def start(self, _command: Any) -> list[Any]:
+    def start(self, _seen: Instant) -> list[Any]:
         """No states."""
         return []
 
     def act(self, seen: Instant, _x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """No states, and u_f [the command's unit]."""
-        speed = seen.measured if self.direction is Direction.MEASURED else seen.reference
+        wanted = seen.rates.get(REFERENCE_SPEED, seen.reference)
+        speed = seen.measured if self.direction is Direction.MEASURED else wanted
         return {}, p["level"] * ca.tanh(speed / p["smoothing"])

@@ -65,13 +65,21 @@ class Knocker:
             }
         )
 
-    def states(self, command: Quantity) -> tuple[Quantity, ...]:
+    def reads(self, _on: SensedSignal) -> tuple[str, ...]:
+        """Nothing."""
+        return ()
+
+    def motion_inputs(self, _on: SensedSignal) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    def states(self, _on: SensedSignal, command: Quantity) -> tuple[Quantity, ...]:
         """The command and the direction at the last onset."""
         return replace(command, name="command"), Quantity("direction", "1")
 
-    def start(self, command: Any) -> list[Any]:
+    def start(self, seen: Instant) -> list[Any]:
         """The command so far, and no direction."""
-        return [command, 0.0]
+        return [seen.command, 0.0]
 
     def act(self, seen: Instant, x: Symbols, p: Symbols) -> tuple[Signals, ca.SX]:
         """The states after a sample, and the pulse [the command's unit]."""

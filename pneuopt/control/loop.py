@@ -20,16 +20,16 @@ from pneuopt.control.compensation import (
     check_compensators,
     check_values,
     compensation_function,
-    uncompensated_command,
 )
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
+from pneuopt.control.loop_start import start_state
 from pneuopt.control.pid import PID
-from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.control.sampled import controller_update
-from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
-from pneuopt.control.wiring import Signals, check_algebraic_loop, check_initial_command, evaluate_plant, select_signal
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag
+from pneuopt.control.wiring import Signals, check_algebraic_loop, evaluate_plant, select_signal
+from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (
     DiscreteSystem,
@@ -46,6 +46,7 @@ from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import ParameterSet, Quantity, with_prefix, without_prefix
+from pneuopt.quantities.unit_algebra import unit_ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +102,10 @@ class ClosedLoop:
         doubled = isinstance(self.sensor, SensorLag) and "sensor.lag" in self.plant.parameters
         require(not doubled, "the plant has a sensor.lag of its own; leave sensor= out", ModelError)
         check_compensators(self.compensators, self.sensed_signal, self.plant.axis)
+        for name in self.readings:
+            check_algebraic_loop(self.plant, self.command.name, name)
+        twice = [q.name for q in self.motion_inputs if q.name in names(self.plant.inputs)]
+        require(not twice, f"the plant has inputs {', '.join(twice)} of its own; rename them", ModelError)
         _ = self.parameters
 
     def __repr__(self) -> str:
@@ -142,7 +147,7 @@ class ClosedLoop:
             "sensor": self.sensor.states(self.sensed_signal) if self.sensor else (),
             "pid": self.pid.states(self.feedback, self.command),
             "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
-            **{c.section: c.states(self.command) for c in self.compensators},
+            **{c.section: c.states(self.sensed_signal, self.command) for c in self.compensators},
         }
         own = (replace(q, name=f"{name}.{q.name}") for name, quantities in parts.items() for q in quantities)
         return (*self.plant.states, *own)
@@ -154,9 +159,23 @@ class ClosedLoop:
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
-        """The reference, then the plant's inputs that the controller does not drive."""
+        """The reference, its rates that a compensator uses, then the plant's inputs that no controller drives."""
         reference = replace(self.feedback, name="reference")
-        return (reference, *(q for q in self.plant.inputs if q.name != self.command.name))
+        return (reference, *self.motion_inputs, *(q for q in self.plant.inputs if q.name != self.command.name))
+
+    @property
+    def motion_inputs(self) -> tuple[Quantity, ...]:
+        """Of "reference_speed" and "reference_acceleration" those that a compensator uses."""
+        on = self.sensed_signal
+        units = {REFERENCE_SPEED: on.speed_unit, REFERENCE_ACCELERATION: unit_ratio(on.speed_unit, "s")}
+        used = {n for part in self.compensators for n in part.motion_inputs(on)}
+        return tuple(Quantity(n, unit) for n, unit in units.items() if n in used)
+
+    @cached_property
+    def readings(self) -> tuple[str, ...]:
+        """The plant's outputs that compensators read, in its order."""
+        used = {n for part in self.compensators for n in part.reads(self.sensed_signal)}
+        return tuple(n for n in names(self.plant.outputs) if n in used)
 
     @property
     def outputs(self) -> tuple[Quantity, ...]:
@@ -258,7 +277,7 @@ class ClosedLoop:
     @cached_property
     def compensation(self) -> ca.Function:
         """The compensators that act always, and their slopes: see `compensation_function`."""
-        return compensation_function(self.compensators, self.parameters)
+        return compensation_function(self, self.sensed_signal, self.command)
 
     def parallel_form(self, parameters: ParameterSet) -> ParallelForm:
         """The gains in the parallel form, from the parameters of any `Form`."""
@@ -326,27 +345,12 @@ class ClosedLoop:
             or `start` names what this plant does not start from.
         """
         self.check(parameters)
-        parameters = set_sliding_direction(self, self.complete(parameters), reference)
-        p = self.parameter_vector(parameters)
-        value = dict(zip(self.parameters, p, strict=True))
-        if x_plant is None:
-            x, command = find_rest(self, parameters, reference, start or {})
-        else:
-            x, shape = np.asarray(x_plant, dtype=float), (len(self.plant.states),)
-            require(x.shape == shape, f"x_plant has shape {x.shape}, the plant's state has {shape}")
-        check_initial_command(command, value, self.command.unit)
-        shown = self.plant.ode(0, x, np.zeros(len(self.plant.inputs)), [value[n] for n in self.plant.parameters])[1]
-        y = dict(zip(names(self.plant.outputs), shown.full().ravel().tolist(), strict=True))
-        sensor = self.sensor.start(y, self.sensed_signal, without_prefix(value, "sensor")) if self.sensor else []
-        seen = sensor[0] if sensor else y[self.feedback.name]
-        v = float(uncompensated_command(self, p, reference, seen, command)[0])
-        own = self.pid.start(reference, seen, v, {**without_prefix(value, "pid"), "Kp": float(self.gains(p)[0])})
-        others = [remembered for part in self.compensators for remembered in part.start(v)]
-        return np.concatenate([x, sensor, own, [reference] if self.feedforward else [], others])
+        return start_state(self, parameters, x_plant, reference, command, start or {})
 
     def _continuous_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        seen = x["sensor.reading"] if self.sensor else self._plant_rates(t, x, u, p, ca.SX(0))[1][self.feedback.name]
-        moved, added = added_command(self, t, x, u, seen, p)
+        shown = self._plant_rates(t, x, u, p, ca.SX(0))[1]
+        seen = x["sensor.reading"] if self.sensor else shown[self.feedback.name]
+        moved, added = added_command(self, t, x, u, seen, shown, p)
         rates, command = self.pid.rates(
             without_prefix(x, "pid"),
             u["reference"],
@@ -381,7 +385,9 @@ class ClosedLoop:
     @cached_property
     def sensed_signal(self) -> SensedSignal:
         """What the sensor reads."""
-        return SensedSignal(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time)
+        axis = self.plant.axis or Axis()
+        order = {axis.position: 0, axis.speed: 1}.get(self.feedback.name, None if self.plant.axis else 1)
+        return SensedSignal(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time, order)
 
 
 def check_closed_loop(loop: object) -> None:

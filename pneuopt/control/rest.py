@@ -54,8 +54,13 @@ class WiredLoop(Protocol):
         ...
 
     @property
+    def readings(self) -> tuple[str, ...]:
+        """The outputs of the plant that compensators read."""
+        ...
+
+    @property
     def compensation(self) -> ca.Function:
-        """``(command, reference, measured, p) -> compensated`` command, and its slopes."""
+        """``(command, reference, measured, readings, p) -> compensated`` command, and its slopes."""
         ...
 
 
@@ -146,11 +151,12 @@ def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSe
 
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
-        y = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1][loop.feedback.name]
+        shown = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1]
+        y, read = shown[loop.feedback.name], ca.vertcat(*(shown[n] for n in loop.readings))
         every = ca.vertcat(*p.values())
         gains = loop.gains(every)
         command = gains[0] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL_STATE, 0.0)
-        command = loop.compensation(command, u["reference"], y, every)[0]
+        command = loop.compensation(command, u["reference"], y, read, every)[0]
         rates, outputs = evaluate_plant(plant, loop.command.name, t, moving, u, p, command)
         rates |= {INTEGRAL_STATE: gains[1] * (u["reference"] - y)}
         return {n: rates[n] for n in x}, outputs | {"control": command}

@@ -56,9 +56,9 @@ def controller_update(
     t : casadi.SX
         [s]
     x, u, p : mapping of str to casadi.SX
-        The loop's states, inputs (the "reference") and parameters.
+        The loop's states, inputs (the "reference", and its rates where a part uses them) and parameters.
     y : mapping of str to casadi.SX
-        The plant's outputs: the measured one, or what an `Encoder` counts.
+        The plant's outputs: the measured one, or what an `Encoder` counts, and those that compensators read.
     """
     seen = (
         loop.sensor.update(without_prefix(x, "sensor"), y, loop.sensed_signal, without_prefix(p, "sensor"))
@@ -66,10 +66,10 @@ def controller_update(
         else {}
     )
     measured = seen["reading"] if seen else y[loop.sensed_signal.measured.name]
-    moved, added = added_command(loop, t, x, u, measured, p)
+    moved, added = added_command(loop, t, x, u, measured, y, p)
     arguments = without_prefix(x, "pid"), u["reference"], measured
     own = without_prefix(p, "pid")
     after = with_prefix(seen, "sensor") | with_prefix(loop.pid.update(*arguments, added, own), "pid") | moved
-    terms = loop.pid.terms(*arguments, own) | added_terms(loop, t, x, u, measured, p)[1]
+    terms = loop.pid.terms(*arguments, own) | added_terms(loop, t, x, u, measured, y, p)[1]
     sum_before_clip = loop.pid.output(*arguments, own) + added
     return ControllerUpdate(after, {"error": u["reference"] - measured, **terms, "unlimited": sum_before_clip})

@@ -10,8 +10,10 @@ import casadi as ca
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
-from pneuopt.quantities.unit_algebra import unit_ratio
+from pneuopt.quantities.unit_algebra import difference_unit, unit_ratio
 
+REFERENCE_SPEED, REFERENCE_ACCELERATION = "reference_speed", "reference_acceleration"
+"""The loop's inputs with the rates of the motion that its reference describes; a loop has those that it uses."""
 MIN_SENSOR_LAG = 1e-6  # [s]; below, the loop is too stiff to integrate; above, fast sensors are refused
 
 
@@ -27,11 +29,25 @@ class SensedSignal:
         All of the plant's.
     sample_time : float, optional
         The controller's [s].
+    order : int, optional
+        Of the reference as a derivative of the axis's position: 0 a position, 1 a speed; None of any other signal.
     """
 
     measured: Quantity
     outputs: Mapping[str, Quantity]
     sample_time: float | None
+    order: int | None = 1
+
+    @property
+    def speed_unit(self) -> str:
+        """Unit of the speed of the motion that the reference describes; the measured one of any other signal."""
+        unit = difference_unit(self.measured.unit)
+        return unit_ratio(unit, "s") if self.order == 0 else unit
+
+    @property
+    def speed_input(self) -> tuple[str, ...]:
+        """The loop's input with the reference's speed; none where the reference is that speed."""
+        return (REFERENCE_SPEED,) if self.order == 0 else ()
 
     @property
     def h(self) -> float:

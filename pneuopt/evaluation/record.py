@@ -146,20 +146,23 @@ class _CommandPlayer:
 
 
 class _SampledController:
-    """The loop's controller, run on a stand-in plant whose only state is the latest reading."""
+    """The loop's controller, run on a stand-in plant whose only states are the latest readings."""
 
     def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, log_inputs: Trajectory, x: Array) -> None:
         loop.check(parameters)
         signal = loop.feedback
+        others = [q for q in loop.plant.outputs if q.name in loop.readings and q != signal]
+        shown, self._others = [signal, *others], names(others)
         echo_plant = define(
-            [signal], [loop.command], [signal], loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y)
+            shown, [loop.command], shown, loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y)
         )
         echo_loop = replace(loop, plant=echo_plant, sensor=None)
         self._update, self._p = compile_function(echo_loop.update), echo_loop.parameter_vector(parameters)
-        plant_state, controller_state = x[: len(rig.plant.states)], x[1 - len(echo_loop.states) :]
+        plant_state, controller_state = x[: len(rig.plant.states)], x[len(shown) - len(echo_loop.states) :]
         self._rig, self._loop, self._inputs, self._x = rig, loop, log_inputs, controller_state
         self._command = names(echo_loop.states).index("pid.command")
-        self.initial_command = float(controller_state[self._command - 1])
+        self.initial_command = float(controller_state[self._command - len(shown)])
+        self._references = log_inputs.matrix(names(echo_loop.inputs))
         no_input = np.zeros(len(rig.plant.inputs))
         self._first_reading = _plant_outputs(
             rig, log_inputs.t[0], plant_state, no_input, parameter_vector(rig.plant.parameters, parameters)
@@ -170,9 +173,9 @@ class _SampledController:
     def act(self, k: int, readings: Mapping[str, float]) -> float:
         """Return the command at sample k, and advance the controller by one sample."""
         self._feedback_values.append(self._feedback(readings))
-        t, reference = self._inputs.t[k], self._inputs["reference"][k]
-        after = self._update(t, np.append(self._feedback_values[-1], self._x), [reference], self._p)[0]
-        self._x = after[1:]
+        t, seen = self._inputs.t[k], [self._feedback_values[-1], *(readings[n] for n in self._others)]
+        after = self._update(t, np.append(seen, self._x), self._references[k], self._p)[0]
+        self._x = after[len(seen) :]
         self._commands.append(float(after[self._command]))
         return self._commands[-1]
 
@@ -182,6 +185,7 @@ class _SampledController:
         reference = f"{name}_reference" if f"{name}_reference" in CHANNELS else "reference"
         return {
             reference: self._inputs["reference"],
+            **{q.name: self._inputs[q.name] for q in self._loop.motion_inputs},
             self._loop.command.name: self._commands,
             "feedback": self._feedback_values,
         }

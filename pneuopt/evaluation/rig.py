@@ -132,6 +132,8 @@ class Rig:
             _check_loop(self.loop)
             message = f"the controller needs {self.feedback!r}, which no sensor measures; add it to sensors"
             require(self.feedback in self.sensors, message, ModelError)
+            absent = ", ".join(n for n in self.loop.readings if n not in self.sensors)
+            require(not absent, f"the controller reads {absent}, which no sensor measures; add to sensors", ModelError)
 
     @property
     def loop(self) -> ClosedLoop | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from pneuopt.control.compensation import Compensator
+from pneuopt.control.compensation import Compensator, Instant
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form, parallel_gains
@@ -164,18 +164,21 @@ def _law(loop: ClosedLoop) -> _Law:
     known = loop.states[len(loop.plant.states) :]
     x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}
     p: Signals = {n: ca.SX.sym(n) for n in (*loop.parameters, CENTRE)}
-    u: Signals = {n: ca.SX.sym(n) for n in ("reference", "measured", "output")}
+    more = (*(q.name for q in loop.motion_inputs), *loop.readings)
+    u: Signals = {n: ca.SX.sym(n) for n in ("reference", "measured", *more, "output")}
     t = (loop.pid.sample_time or 0.0) * x[SAMPLE]
-    found = controller_update(parts, t, x, u, {measured.name: u["measured"]}, p)
+    shown = {n: u[n] for n in loop.readings} | {measured.name: u["measured"]}
+    found = controller_update(parts, t, x, u, shown, p)
     own = without_prefix(p, "pid")
     gains = dict(zip(Form.PARALLEL.gains, parallel_gains(loop.pid.form, own), strict=True))
-    more = {} if loop.pid.form is Form.PARALLEL else {f"{n}_parallel": value for n, value in gains.items()}
+    converted = {} if loop.pid.form is Form.PARALLEL else {f"{n}_parallel": value for n, value in gains.items()}
     after = {**found.states, SAMPLE: x[SAMPLE] + 1}
-    terms = {f"{n}_term" if n in ADDED_TERMS else n: v for n, v in found.terms.items()} | more
-    return _Law(u, x, p, measured, after, _start(parts, u, {**own, "Kp": gains["Kp"]}, p[CENTRE]), terms)
+    terms = {f"{n}_term" if n in ADDED_TERMS else n: v for n, v in found.terms.items()} | converted
+    begun = _start(parts, u, shown, {**own, "Kp": gains["Kp"]}, p[CENTRE])
+    return _Law(u, x, p, measured, after, begun, terms)
 
 
-def _start(parts: _ComputedParts, u: Signals, p: Symbols, centre: ca.SX) -> Signals:
+def _start(parts: _ComputedParts, u: Signals, shown: Signals, p: Symbols, centre: ca.SX) -> Signals:
     """The first states, as `ClosedLoop.initial` has them, from what the actuator has got so far."""
     command, unit = u["output"] - centre, Quantity("command", "1")
     seen = ca.SX(0) if parts.sensor else u["measured"]  # a position says no speed: the start is at rest
@@ -184,7 +187,8 @@ def _start(parts: _ComputedParts, u: Signals, p: Symbols, centre: ca.SX) -> Sign
     begun |= {f"pid.{q.name}": v for q, v in zip(parts.pid.states(unit, unit), pid, strict=True)}
     begun["feedforward.filter"] = u["reference"]
     for part in parts.compensators:
-        own = zip(part.states(unit), part.start(command), strict=True)
+        known = Instant(ca.SX(0), u["reference"], seen, command, parts.pid.sample_time, {}, shown)
+        own = zip(part.states(parts.sensed_signal, unit), part.start(known), strict=True)
         begun |= {f"{part.section}.{q.name}": v for q, v in own}
     return {**begun, SAMPLE: ca.SX(0)}
 
@@ -199,26 +203,37 @@ def _assemble(law: _Law, loop: ClosedLoop, parameters: ParameterSet, centre: flo
     given = [n for n, s in law.parameters.items() if ca.depends_on(everything, s)]
     terms = {n: v for n, v in law.terms.items() if not (v.is_symbolic() or v.is_constant())}
     x, p = (ca.vertcat(*(own[n] for n in chosen)) for own, chosen in ((law.states, states), (law.parameters, given)))
-    signals = ca.vertcat(law.inputs["reference"], law.inputs["measured"])
+    signals = ca.vertcat(*(v for n, v in law.inputs.items() if n != "output"))
     begin = ca.vertcat(signals, law.inputs["output"])
     value = dict(zip(loop.parameters, loop.parameter_vector(parameters).tolist(), strict=True))
     value[CENTRE] = centre
     unit, wanted = loop.command.unit, Variable("setpoint", loop.feedback.unit, f"the {loop.feedback.name} wanted")
     measured = Variable("measured", law.measured.unit, f"the {law.measured.name}, as the controller's input shows it")
+    inputs = (wanted, measured, *_more_inputs(loop))
     declared = {n: (q.unit, q.meaning) for n, q in loop.parameters.items()}
     declared[CENTRE] = (unit, "output while the command is zero: where the valve is closed")
     units = {q.name: q.unit for q in loop.states} | {SAMPLE: "1"}
     return ControllerProgram(
         loop.pid.sample_time or 0.0,
         tuple(Variable(short_name(n), *declared[n], value[n]) for n in given),
-        (wanted, measured),
+        inputs,
         tuple(Variable(short_name(n), units[n], STATE_MEANINGS.get(n, "")) for n in states),
         tuple(Variable(n, unit, what) for n, (_, what) in outputs.items()),
-        (wanted, measured, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
+        (*inputs, Variable("start_output", unit, "what the actuator has got so far, from which it goes on")),
         ca.Function("start", [begin, p], [first]),
         ca.Function("step", [signals, x, p], [ca.densify(results), ca.densify(ca.vertcat(*terms.values()))]),
         tuple(terms),
     )
+
+
+def _more_inputs(loop: ClosedLoop) -> tuple[Variable, ...]:
+    """The rates of the reference and the readings that compensators use, as their parts name them."""
+    units = {q.name: q.unit for q in (*loop.motion_inputs, *loop.plant.outputs)}
+    rates = (
+        Variable(q.name.replace("reference", "setpoint"), q.unit, f"the {q.name.partition('_')[2]} of the setpoint")
+        for q in loop.motion_inputs
+    )
+    return (*rates, *(Variable(n, units[n], f"{n.replace('_', ' ')}, as its sensor shows it") for n in loop.readings))
 
 
 def _outputs(law: _Law, loop: ClosedLoop, centre: float) -> dict[str, tuple[ca.SX, str]]:

@@ -30,12 +30,16 @@ class ReferenceRun:
 
 
 def make_reference_run(program: ControllerProgram) -> ReferenceRun:
-    """A step of the reference, half of which drives the output to its limits, with a measured signal that swings in."""
+    """A step of the reference, half of which drives the output to its limits, with a measured signal that swings in.
+
+    What else the controller gets, rates of the reference and further readings, are waves.
+    """
     k = np.arange(RUN_SAMPLES)
     size = _step_size(program)
     reference = np.where((k >= 5) & (k < 150), size, -0.3 * size)
     measured = size * (1 - np.exp(-np.maximum(k - 5, 0) / _RISE)) + 0.02 * size * np.sin(0.9 * k)
-    inputs = np.column_stack([reference, measured])
+    others = [size * np.sin(0.1 * (n + 1) * k) for n in range(len(program.inputs) - 2)]
+    inputs = np.column_stack([reference, measured, *others])
     return ReferenceRun(inputs, run_program(program, inputs)[:, 0])
 
 

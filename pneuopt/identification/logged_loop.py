@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from scipy.signal import savgol_filter
 
+from pneuopt.control.compensation import Instant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.rest import unobservable_states
 from pneuopt.control.sensor import Encoder
@@ -58,6 +59,9 @@ class LoggedLoop:
         require(self.loop.pid.sample_time is not None, message, ModelError)
         message = "an identification has no derivatives through an Encoder; give SensorLag(filter + half a sample)"
         require(not isinstance(self.loop.sensor, Encoder), message, ModelError)
+        more = [*self.loop.readings, *names(self.loop.motion_inputs)]
+        message = f"a log's loop is one of a PID and its own signal, and this controller also gets {', '.join(more)}"
+        require(not more, f"{message}; identify the plant alone (loop.plant) with the logged command", ModelError)
 
     @property
     def states(self) -> tuple[Quantity, ...]:
@@ -123,7 +127,11 @@ class LoggedLoop:
         a compensator remembers soon passes.
         """
         held = {"pid.command", "pid.previous_error"}
-        held |= {f"{c.section}.{q.name}" for c in self.loop.compensators for q in c.states(self.loop.command)}
+        held |= {
+            f"{c.section}.{q.name}"
+            for c in self.loop.compensators
+            for q in c.states(self.loop.sensed_signal, self.loop.command)
+        }
         acting = {"pid.Kd": "pid.derivative", "pid.Td": "pid.derivative", "feedforward.gain": "feedforward.filter"}
         for gain, state in acting.items():
             idle = gain in parameters and not (parameters[gain].free or parameters[gain].value)
@@ -181,7 +189,8 @@ class LoggedLoop:
         x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.feedback, alone.command), own, strict=True)}
         x0 |= {"sensor.reading": seen[0], "feedforward.filter": reference[0]}
         for part in alone.compensators:
-            remembered = zip(part.states(alone.command), part.start(0.0), strict=True)
+            begun = part.start(Instant(0.0, reference[0], seen[0], 0.0, pid.sample_time))
+            remembered = zip(part.states(alone.sensed_signal, alone.command), begun, strict=True)
             x0 |= {f"{part.section}.{q.name}": v for q, v in remembered}
         x0 |= {} if was_at_rest else {"pid.integral": 0.0}
         start = np.array([[x0[n] for n in names(discrete.states)]])

@@ -151,8 +151,9 @@ def _draw_plant(sheet: Sheet, loop: ClosedLoop) -> float:
     high = max(BLOCK_HEIGHT / 2, OUTPUT_SPACING * (len(outputs) - 1) + 0.2)
     text = fill(f"plant: {', '.join(parts)}", 23, break_long_words=False)
     centre = sheet.draw_block(text, PLANT_WIDTH, low=-BLOCK_HEIGHT / 2, high=high)
-    for k, signal in enumerate(loop.inputs[1:]):
-        x = centre + 0.7 * (k - (len(loop.inputs) - 2) / 2)
+    driven = loop.inputs[1 + len(loop.motion_inputs) :]
+    for k, signal in enumerate(driven):
+        x = centre + 0.7 * (k - (len(driven) - 1) / 2)
         sheet.draw_line([(x, high + 0.45), (x, high)])
         sheet.write(x, high + 0.48, "\n".join(signal_lines(signal)), va="bottom")
     return _draw_outputs(sheet, outputs)
@@ -189,10 +190,16 @@ def _draw_feedback(sheet: Sheet, loop: ClosedLoop, outlet: float, error: float) 
 
 
 def _list_states(sheet: Sheet, loop: ClosedLoop) -> None:
-    """All states in small print below."""
-    text = "States: " + ", ".join(" ".join(signal_lines(q)).replace(" [", "\u00a0[") for q in loop.states)
+    """All states in small print below, and what else the controller gets."""
+    outputs = {q.name: q for q in loop.plant.outputs}
+    seen = [*loop.motion_inputs, *(outputs[n] for n in loop.readings)]
+    listed = {"States": loop.states, "The controller also gets": seen}
     letters = max(40, int(sheet.right / LEGEND_LETTER_WIDTH))
-    sheet.write(0.0, sheet.low - 0.12, fill(text, letters, break_on_hyphens=False), ha="left", va="top", color="0.35")
+    lines = []
+    for title, own in ((title, own) for title, own in listed.items() if own):
+        signals = ", ".join(" ".join(signal_lines(q)).replace(" [", "\u00a0[") for q in own)
+        lines.append(fill(f"{title}: {signals}", letters, break_on_hyphens=False))
+    sheet.write(0.0, sheet.low - 0.12, "\n".join(lines), ha="left", va="top", color="0.35")
 
 
 def _has_generator(loop: ClosedLoop) -> bool:

@@ -13,8 +13,8 @@ from pneuopt.control.pid import PID, AntiWindup
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
 from pneuopt.export.program import controller_program, short_name
-from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Viscous
+from pneuopt.models.pneumatic.drive import PneumaticDrive
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -38,6 +38,8 @@ RANGES = {
     "gain": (-2.0, 5.0),
     "time": (0.01, 0.2),
     "level": (0.0, 1.0),
+    "speed": (0.0, 3.0),
+    "acceleration": (0.0, 0.3),
     "smoothing": (1e-3, 0.05),
     "width": (0.004, 0.02),
     "period": (0.02, 0.08),
@@ -70,15 +72,15 @@ def random_loop(seed: int) -> tuple[ClosedLoop, ParameterSet, float]:
     dither = [Dither(), Dither(waveform=Waveform.TRIANGLE), Dither(analogue=True), None][int(g.integers(4))]
     lead = Feedforward() if g.integers(2) else None
     measured = "position" if seed % 4 == 1 else "speed"
-    kinds = [k for k in COMPENSATORS.values() if g.integers(2) and not (k.size == "level" and measured == "position")]
+    kinds = [k for k in COMPENSATORS.values() if g.integers(2)]
     loop = ClosedLoop(
-        ForceDrive(Viscous()), pid, dither, measured=measured, sensor=sensor, feedforward=lead,
+        PneumaticDrive(friction=Viscous()), pid, dither, measured=measured, sensor=sensor, feedforward=lead,
         compensators=tuple(k() for k in kinds),
     )  # fmt: skip
     values = {
         n: g.uniform(*RANGES[n.split(".")[1]])
         for n in loop.parameters
-        if n.split(".")[1] in RANGES and n.partition(".")[0] not in ("load", "friction")
+        if n.split(".")[1] in RANGES and n not in loop.plant.parameters
     }
     values |= {"pid.lower": -g.uniform(0.5, 4.0), "pid.upper": g.uniform(0.5, 4.0)} if pid.limits else {}
     return loop, loop.parameters.with_values(values), float(g.choice([0.0, 5.0]))
@@ -92,17 +94,20 @@ def run_library(seed: int) -> Run:
     program = controller_program(loop, parameters, centre)
     motion = 0.05 * np.cumsum(g.normal(size=(SAMPLES, 2)), axis=0) * [0.02, 0.2]
     reference = 0.3 * np.repeat(g.normal(size=SAMPLES // 50), 50)
-    inputs, outputs = np.empty((SAMPLES, 2)), np.empty(SAMPLES)
-    begun = program.start([reference[0], _shown(loop, motion[0]), centre], program.values).full().ravel()
+    more = g.normal(size=(SAMPLES, len(loop.motion_inputs))) * 0.1
+    air = 5e5 + 1e4 * np.cumsum(g.normal(size=(SAMPLES, len(loop.readings))), axis=0)
+    shown = np.array([_shown(loop, row) for row in motion])
+    inputs, outputs = np.column_stack([reference, shown, more, air]), np.empty(SAMPLES)
+    begun = program.start([*inputs[0], centre], program.values).full().ravel()
     first = dict(zip((v.name for v in program.states), begun, strict=True))
     x = np.array([first.get(short_name(n), 0.0) for n in order])
     for k in range(SAMPLES):
         x[[plant.index("position"), plant.index("speed")]] = motion[k]
         if isinstance(loop.sensor, SensorLag):
             x[order.index("sensor.reading")] = motion[k, int(loop.feedback.name == "speed")]
-        x = loop.update(k * h, x, [reference[k]], p).full().ravel()
+        x[[plant.index(n) for n in loop.readings]] = air[k]
+        x = loop.update(k * h, x, [reference[k], *more[k]], p).full().ravel()
         by_name = dict(zip(order, x, strict=True))
-        inputs[k] = reference[k], _shown(loop, motion[k])
         outputs[k] = by_name["pid.pending" if loop.pid.delay else "pid.command"] + centre
     return Run(loop, parameters, centre, inputs, outputs)
 

@@ -59,9 +59,18 @@ class Row:
     section: str
     smooth: tuple[str, float, float]
     continuous: bool = True
+    signed: bool = False
 
 
 ROWS: Mapping[str, Row] = {
+    "motion_feedforward": Row(
+        {"speed": "V*s/m", "acceleration": "V*s^2/m"},
+        {"speed": 90.0, "acceleration": 4.0},
+        'speed = { value = "0.2 V*s/m", lower = "0 V*s/m", upper = "9 V*s/m", free = true }\n'
+        'acceleration = "0.1 V*s^2/m"',
+        ("speed", 0.0, 200.0),
+        signed=True,
+    ),
     "friction_feedforward": Row(
         {"level": "V", "smoothing": "m/s"},
         {"level": 18.0, "smoothing": 0.02},
@@ -115,14 +124,14 @@ def test_parameters_are_declared_with_units_and_bounds(section: str) -> None:
     found = kind.parameters(SPEED, "V")
     assert {n: q.unit for n, q in found.items()} == dict(row.units)
     assert set(kind.without_gradient) <= set(found)
-    assert (found[kind.size].value, found[kind.size].lower) == (0.0, 0.0)
+    assert (found[kind.size].value, found[kind.size].lower) == (0.0, -np.inf if row.signed else 0.0)
     assert all(unit_ratio(q.unit, "1") for q in found.values())
-    for name in found:
+    for name in found if not row.signed else ():
         bad = ParameterSet({f"{section}.{name}": Parameter(-1.0, found[name].unit)})
         loop = ClosedLoop(SecondOrder().system(), PID(H), compensators=(kind,))
         with pytest.raises(InputError, match=rf"{section}\.{name} must lie within"):
             loop.check(loop.parameters | bad)
-    assert f"{section}.{kind.size}" in repr(loop)
+    assert f"{section}.{kind.size}" in repr(ClosedLoop(SecondOrder().system(), PID(H), compensators=(kind,)))
 
 
 @EVERY_SETTING
@@ -145,17 +154,18 @@ def test_of_size_zero_it_changes_nothing(section: str, sample_time: float | None
 def test_derivatives_agree_with_finite_differences(section: str) -> None:
     kind, values = part(section), ROWS[section].acting
     r, y, v = (ca.SX.sym(n) for n in "ryv")
-    x = {q.name: ca.SX.sym(q.name) for q in kind.states(Quantity("u", "V"))}
+    x = {q.name: ca.SX.sym(q.name) for q in kind.states(SPEED, Quantity("u", "V"))}
     p = {n: ca.SX.sym(n) for n in kind.parameters(SPEED, "V")}
-    moved, added = kind.act(Instant(ca.SX(0.0), r, y, v, H), x, p)
+    rates, read = ({n: ca.SX.sym(n) for n in own} for own in (kind.motion_inputs(SPEED), kind.reads(SPEED)))
+    moved, added = kind.act(Instant(ca.SX(0.0), r, y, v, H, rates, read), x, p)
     assert list(moved) == list(x)
     smooth = [n for n in p if n not in kind.without_gradient]
-    z = ca.vertcat(r, y, v, *x.values(), *p.values())
+    z = ca.vertcat(r, y, v, *rates.values(), *read.values(), *x.values(), *p.values())
     f = ca.Function("f", [z], [ca.vertcat(added, *moved.values())])
     slope = ca.Function("J", [z], [ca.jacobian(f(z), z)])
-    at = np.array([0.02, 0.01, 0.4, *[0.3] * len(x), *(values[n] for n in p)])
-    own = slice(0, 3 + len(x)), [3 + len(x) + list(p).index(n) for n in smooth]
-    columns = [*range(own[0].stop), *own[1]]
+    at = np.array([0.02, 0.01, 0.4, *[0.3] * (len(rates) + len(read) + len(x)), *(values[n] for n in p)])
+    signals = len(at) - len(p)
+    columns = [*range(signals), *(signals + list(p).index(n) for n in smooth)]
     nudges = [1e-6 * max(1e-3, abs(at[k])) * (np.arange(len(at)) == k) for k in columns]
     found = [(np.array(f(at + e)) - np.array(f(at - e))).ravel() / (2 * e.sum()) for e in nudges]
     np.testing.assert_allclose(np.array(slope(at))[:, columns], np.column_stack(found), rtol=1e-5, atol=1e-7)
@@ -195,7 +205,7 @@ def test_a_moving_drive_goes_on_as_it_was(section: str, sample_time: float | Non
     """The valve's command in steady motion is not zero; the controller takes it over through the compensator."""
     drive, hardware = catalog.t32()
     loop = ClosedLoop(drive.system(), PID(sample_time), compensators=(part(section),))
-    values = {"level": 0.3, "smoothing": 0.05, "width": 0.4, "amplitude": 0.3, "period": 0.02}
+    values = {"level": 0.3, "smoothing": 0.05, "width": 0.4, "amplitude": 0.3, "period": 0.02, "speed": 2.0}
     own = {f"{section}.{n}": v for n, v in values.items() if f"{section}.{n}" in loop.parameters}
     p = (hardware | loop.parameters.select(n for n in loop.parameters if n not in hardware)).with_values(own)
     p = p.with_values({"pid.Ki": 3.0})
@@ -238,7 +248,8 @@ def test_a_rigs_controller_runs_it(section: str) -> None:
     """On a rig without imperfections the recorded command is that of the loop."""
     loop, given = friction_loop(section, H)
     t = np.arange(101) * H
-    step = Trajectory(t, {"reference": np.where(t > 0, 0.1, 0.0)})
+    rates = {q.name: 0.2 * np.sin(20 * t) for q in loop.motion_inputs}
+    step = Trajectory(t, {"reference": np.where(t > 0, 0.1, 0.0), **rates})
     log = record(Rig(loop, {"speed": Sensor()}), step, given, rtol=1e-9).experiment.trajectory
     sent = simulate(loop, step, given, rtol=1e-9)["control"]
     np.testing.assert_allclose(log["force"], sent, atol=1e-3)
@@ -291,7 +302,7 @@ def test_several_act_one_on_the_others_command(section: str, second_order: Syste
     after = dict(
         zip(names(loop.states), np.array(loop.update(0.0, x, [0.1], loop.parameter_vector(p))).ravel(), strict=True)
     )
-    v = 2.0 * 0.1 + 0.1 * 0.05 / 0.052
+    v = 2.0 * 0.1 + 0.1 * 0.05 / 0.052 + 0.3 * 0.1
     v += 0.3 * np.tanh(0.1 / 0.05)
     pulse = 0.3 * np.tanh(v / 0.01)
     w = v + pulse + 0.3 * np.tanh((v + pulse) / 0.02)
@@ -351,9 +362,18 @@ def test_margins_count_slopes_at_the_operating_point(
         ),
         (
             lambda _: ClosedLoop(
-                ForceDrive(Stribeck()).system(), PID(), measured="position", compensators=(FrictionFeedforward(),)
+                ForceDrive(Stribeck()).system(),
+                PID(),
+                measured="position",
+                compensators=(FrictionFeedforward(Direction.MEASURED),),
             ),
-            "takes the sign of a speed",
+            "take Direction.REFERENCE",
+        ),
+        (
+            lambda _: ClosedLoop(
+                catalog.t32()[0].system(), PID(), measured="pressure_a", compensators=(part("motion_feedforward"),)
+            ),
+            "neither a position nor a speed",
         ),
         (
             lambda _: FrictionFeedforward("measured"),  # type: ignore[arg-type]
