@@ -62,6 +62,7 @@ from .evaluation.requirements import (
     SteadyStateError,
     StepEnvelope,
 )
+from .evaluation.rest_check import RestCase, RestCheck, RestKind, check_rest
 from .evaluation.rig import Actuator, Rig, Sensor
 from .evaluation.sampling import Sampling
 from .evaluation.scenarios import Factor, apply_scenario, corners, draws, samples, tolerances
@@ -263,6 +264,9 @@ __all__ = [
     "Racing",
     "Recording",
     "Report",
+    "RestCase",
+    "RestCheck",
+    "RestKind",
     "Rig",
     "Ripple",
     "RiseTime",
@@ -302,6 +306,7 @@ __all__ = [
     "catalog",
     "certificate",
     "check",
+    "check_rest",
     "coarse_delay",
     "compare_logs",
     "contacts",

@@ -246,6 +246,10 @@ PUBLIC_NAMES = [
     "write_fit",
     "write_report",
     "write_tuned",
+    "RestCase",
+    "RestCheck",
+    "RestKind",
+    "check_rest",
 ]
 PUBLIC_MODULES = ("catalog", "plotting")
 
