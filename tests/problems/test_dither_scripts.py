@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from problems.dither import averaged_dither, dither_map, margins_under_dither
-from problems.friction import stiction_windup
+from problems.friction import hunting, stiction_windup
 
 
 def test_friction_makes_the_papers_gains_overshoot_by_40_percent() -> None:
@@ -70,3 +70,12 @@ def test_averaged_dither(tmp_path: Path) -> None:
     rows = averaged_dither.main(runs)
     assert list(rows.loc[~rows["holds"].astype(bool), "name"]) == []
     averaged_dither.over_frequency(runs).savefig(tmp_path / "error.png")
+
+
+def test_hunting(tmp_path: Path) -> None:
+    """One of the script's PIDs, the one that it draws: it hunts where static friction falls at once, and only there."""
+    gains = list(hunting.random_pids(hunting.SHOWN + 1))[hunting.SHOWN]
+    ends = {n: [hunting.watch(gains | hunting.FRICTIONS[n])] for n in ("coulomb", "static")}
+    rows = hunting.main(hunting.Job(ends, [gains])).set_index("name")["value"]
+    assert (rows["static.hunting"], rows["coulomb.hunting"], rows["coulomb.resting"]) == (1, 0, 1)
+    hunting.figure(hunting.Job(ends, [gains])).savefig(tmp_path / "hunting.png")
