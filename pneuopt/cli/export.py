@@ -1,7 +1,7 @@
 """`pneuopt export`: a tuned controller in the form that another machine takes."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from pneuopt.quantities.status import Code
 
 FMU = "fmu"  # the form that is the plant, not the controller
 SHOWN_METRICS = ("SettlingTime", "Overshoot", "MaxSensitivity")
+PLC_WORDS = ("plc", "sps", "iec", "iec61131", "scl", "structured_text", "structured-text")  # what people call `st`
+MAKERS = {"tia": "siemens", "step7": "siemens", "s7": "siemens", "logix": "rockwell", "allen-bradley": "rockwell"}
+MAKERS |= {"twincat": "beckhoff", "matlab": "simulink", "py": "python", "c99": "c", "fmi": "fmu"}
 NOT_CERTIFIED = "NOT CERTIFIED: no independent simulation stands behind these gains."
 
 
@@ -44,7 +47,7 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
         Whether old files may be replaced.
     """
     languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
-    check_names("form", [to], {**languages, **blocks, FMU: None}, "export --to")
+    _check_form(to, [*languages, *blocks, FMU])
     task, parameters = read_fit_and_tuning(fit, tuned)
     origin = [*_certificate_lines(tuned, uncertified), *_source_lines(fit, tuned)]
     given = (task.loop, parameters)
@@ -61,6 +64,18 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
         typer.echo("".join(files.values()))
     show_output_files(make_console(), list(placed))
     return EXIT_SUCCESS
+
+
+def _check_form(to: str, forms: Sequence[str]) -> None:
+    """Refuse an unknown form, with the one that is meant by what it is called elsewhere."""
+    word = to.casefold()
+    lead = f"export --to: unknown form {to!r}"
+    blocks = ", ".join(kind.value for kind in Block)
+    told = f"a PLC runs the controller as structured text, --to st; settings for its own PID block: {blocks}"
+    require(to in forms or word not in PLC_WORDS, f"{lead}; {told}")
+    meant = word if word in forms else MAKERS.get(word, to)
+    require(to in forms or meant == to, f"{lead}; it is called {meant!r} here")
+    check_names("form", [to], forms, "export --to")
 
 
 def _write_fmu(path: Path, content: bytes, force: bool) -> int:

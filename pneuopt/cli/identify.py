@@ -112,6 +112,19 @@ def run_identify(
         page=lambda: fit_page(
             source, result, experiments, system, held_out=others, findings=found.findings, trial=trial
         ),
+        hints=_hints(outputs),
+    )
+
+
+def _hints(outputs: Outputs) -> list[str]:
+    """What to do with a fit: tune its drive, and show it."""
+    fit = outputs.output
+    first = "-o fit.toml with this command keeps the fit, for pneuopt tune"
+    told = [
+        first if fit is None else f"pneuopt tune {fit} tuning.toml -o tuned.toml    (pneuopt init writes a tuning.toml)"
+    ]
+    return (
+        told if outputs.report is not None else [*told, "--report FILE.html with this command makes a page to hand on"]
     )
 
 

@@ -3,14 +3,14 @@
 import os
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import typer
 
 from pneuopt.cli.exit_status import EXIT_SUCCESS
-from pneuopt.files.first_files import first_channels, first_files, first_kinds, sidecar_name
+from pneuopt.files.first_files import first_channels, first_files, first_kinds, sidecar_name, unused_channels
 from pneuopt.files.loop_parameters import SAMPLE_TIME
 from pneuopt.logs.budget import read_bytes
 from pneuopt.logs.guess import LogGuess, Question, guess_channels, guess_log
@@ -67,14 +67,18 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         Whether old files may be replaced; without it those that stand beside another log's sidecar are kept.
     """
     table = None if log is None else read_table(log, read_bytes(log))
-    kind = kind if table is None or kind is not None else _guess_kind(table)
-    require(kind is not None, f"say what drives the load: pneuopt init KIND, one of {', '.join(first_kinds())}")
-    name = str(kind)
+    guessed = None if table is None or kind is not None else _guess_kind(table)
+    message = f"say what drives the load: pneuopt init KIND, one of {', '.join(first_kinds())}"
+    require(
+        kind is not None or guessed is not None, f"{message}; or pneuopt init --from LOG, whose columns may show it"
+    )
+    name = str(kind or guessed)
     check_names("kind", [name], first_kinds(), "init")
     known, source = _read_catalogue(name, parts)
     ask = Asker(sys.stdin.isatty() and sys.stdout.isatty())
     guess = LogGuess((), (), SAMPLE_TIME) if table is None else _guess_log(table, name, ask)
-    columns = {column.channel: column.entry for column in guess.columns}
+    unused = unused_channels(name)
+    columns = {c.channel: "false" if c.channel in unused else c.entry for c in guess.columns}
     least, most = _SAMPLE_TIMES
     sample_time = guess.sample_time if least <= guess.sample_time <= most else SAMPLE_TIME
     files = first_files(
@@ -92,7 +96,10 @@ def run_init(kind: str | None, folder: Path, parts: Mapping[str, str | None], lo
         [] if log is None or force else [path for path in placed if path != log.with_suffix(".toml") and path.exists()]
     )
     write_files({path: text for path, text in placed.items() if path not in kept}, force)
-    _show_files(folder, [name for name in files if folder / name not in kept], guess, ask.assumed, log)
+    if guessed is not None:
+        _say(f"the log's columns are those of a {name} drive; pneuopt init KIND --from LOG for another")
+    written = [n for n in files if folder / n not in kept]
+    _show_files(folder, written, guess, unused, ask.assumed, log)
     return EXIT_SUCCESS
 
 
@@ -127,8 +134,9 @@ def _guess_kind(table: Table) -> str:
     found = guess_channels(table.names, channels)
     if "torque" in found or "angle" in found:
         return "rotary"
-    if "valve_voltage" in found:
-        return "pneumatic" if {"pressure_a", "pressure_b"} & found.keys() else "linear"
+    pressures = {"pressure_a", "pressure_b"} & found.keys()
+    if "valve_voltage" in found and (pressures or "force" not in found):
+        return "pneumatic" if pressures else "linear"
     message = f"{table.path}: its columns do not say what drives the load; say it before --from"
     require("force" in found, f"{message}: pneuopt init KIND, one of {', '.join(first_kinds())}")
     return "force"
@@ -162,7 +170,12 @@ def _read_catalogue(kind: str, parts: Mapping[str, str | None]) -> tuple[Paramet
 
 
 def _show_files(
-    folder: Path, written: Sequence[str], guess: LogGuess, assumed: Sequence[str], log: Path | None
+    folder: Path,
+    written: Sequence[str],
+    guess: LogGuess,
+    unused: Container[str],
+    assumed: Sequence[str],
+    log: Path | None,
 ) -> None:
     """Say what was written, what was assumed, and what comes next."""
     names = [name for name in written if name.endswith(".toml")]
@@ -173,7 +186,10 @@ def _show_files(
             unit = f" [{column.unit}]" if column.unit else ", time stamps"
             centre = f", less {column.centre}" if column.centre else ""
             note = "; its centre, near 5 V, is estimated by identify" if column.centre_is_estimated else ""
-            _say(f"{column.channel}: column {column.column!r}{unit}{centre}{note}", "  ")
+            text = f"column {column.column!r}{unit}{centre}{note}"
+            if column.channel in unused:
+                text = f"left out, column {column.column!r}: this kind of drive does not use it"
+            _say(f"{column.channel}: {text}", "  ")
         if guess.unused:
             _say(f"not read: {', '.join(guess.unused)}", "  ")
         _say(f"a row every {write_value(guess.sample_time, 's')}", "  ")

@@ -12,7 +12,7 @@ import numpy as np
 
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.interruption import interruption_status, without_interruption
-from pneuopt.cli.terminal import make_console, show_output_files, show_report, show_sentence
+from pneuopt.cli.terminal import make_console, show_hints, show_output_files, show_report, show_sentence
 from pneuopt.files.drive import read_drive, read_marks, read_status
 from pneuopt.files.tuning import Tuning, read_tuning
 from pneuopt.identification.result import IdentificationResult, Mark
@@ -74,6 +74,7 @@ def finish(
     figures: Figures | None = None,
     report: Report | None = None,
     page: Callable[[], Page] | None = None,
+    hints: Sequence[str] = (),
 ) -> int:
     """Write all files, then show the result and say which are written; returns the exit status.
 
@@ -94,6 +95,8 @@ def finish(
         What is shown of the result.
     page : callable, optional
         Makes the page that --report writes; of an interrupted command without figures.
+    hints : sequence of str
+        What may come next, a command a line; shown where the command has met what was asked.
 
     Raises
     ------
@@ -117,6 +120,7 @@ def finish(
     if failures:
         raise InputError("; ".join(map(str, failures)))
     if status is None or status.code in (Code.CONVERGED, Code.PARTIAL):
+        show_hints(make_console(), hints)
         return EXIT_SUCCESS
     return EXIT_INTERRUPTED if interrupted else EXIT_FAILURE
 

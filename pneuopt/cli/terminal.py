@@ -101,6 +101,12 @@ def show_output_files(console: Console, paths: Sequence[Any]) -> None:
         console.print(f"wrote {path}", soft_wrap=True)
 
 
+def show_hints(console: Console, hints: Sequence[str]) -> None:
+    """Commands that may come next, a line each."""
+    for k, hint in enumerate(hints):
+        console.print(Text(f"{'' if k else 'Next:':<5} {hint}"), soft_wrap=True)
+
+
 def show_pairs(console: Console, pairs: Mapping[str, object]) -> None:
     """Names and their values, a line each."""
     width = max(len(n) for n in pairs)

@@ -41,6 +41,7 @@ from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.status import Code, ProgressCallback
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.fit_page import Source
+from pneuopt.report.gains import report_exports
 from pneuopt.report.loop_figures import simulate_responses
 from pneuopt.report.page import Page
 from pneuopt.report.tuning_page import LoopView, simulation_page, tuning_page
@@ -79,12 +80,28 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
     show_output_files(console, saved)
     view = _view(task, result.parameters, parameters if result.status.converged else None)
     source = Source(f"Tuning of {fit.name} by {tuning.name}", warnings=describe_status(fit))
-    page = partial(tuning_page, source, result, view, stands=f"the gains of {tuning}", was=was, dither=dither)
+    place = outputs.output if result.status.converged else None
+    exports = Report() if place is None else report_exports(task.loop, fit, place)
+    page = partial(
+        tuning_page, source, result, view, stands=f"the gains of {tuning}", was=was, dither=dither, exports=exports
+    )
     tables = _tuning_tables(result) | shown | stats_and_provenance(result)
-    status = finish(outputs, {}, tables, result.status, figures=view.figures, page=page)
+    status = finish(
+        outputs, {}, tables, result.status, figures=view.figures, page=page, hints=_hints(task, fit, outputs)
+    )
     if failures:
         raise failures[0]
     return status
+
+
+def _hints(task: Tuning, fit: Path, outputs: Outputs) -> list[str]:
+    """What to do with a design: take it to a controller, and show it."""
+    told = [] if outputs.report is not None else ["--report FILE.html with this command makes a page to hand on"]
+    if outputs.output is None:
+        return ["-o tuned.toml with this command keeps the gains, pneuopt export takes them to a controller", *told]
+    command = f"pneuopt export {fit} {outputs.output}"
+    exports = [] if task.loop.pid.sample_time is None else [f"{command} --to st    (for a PLC; pneuopt export --help)"]
+    return [*exports, *told]
 
 
 def _tune_task(

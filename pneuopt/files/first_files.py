@@ -8,6 +8,7 @@ from pathlib import Path
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.excitation import DEFAULT_WIDTH
+from pneuopt.dynamics.system import System
 from pneuopt.files.drive import FIT_SECTIONS
 from pneuopt.files.drive_keys import default_parameters, drive_keys
 from pneuopt.files.json_outputs import output_schema
@@ -102,9 +103,19 @@ def first_files(
 
 def first_channels(name: str) -> dict[str, str]:
     """The channels that a log of such a drive may hold, and their SI units."""
+    return {**CHANNELS, **plant_channels(_first_plant(name))}
+
+
+def unused_channels(name: str) -> frozenset[str]:
+    """Channels that such a drive has no use for, as a valve's voltage where a force drives; a log leaves them out."""
+    plant = _first_plant(name)
+    references = (n for n in CHANNELS if n.endswith("_reference"))  # they may stay: no plant reads them
+    return frozenset(CHANNELS) - {"time", *references, *plant_channels(plant)}
+
+
+def _first_plant(name: str) -> System:
     kind, first = DRIVE_KINDS[name], first_kinds()[name]
-    plant = kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
-    return {**CHANNELS, **plant_channels(plant)}
+    return kind.build(Structure(first.options, kind.sections, lambda *_: "")).system()
 
 
 def sidecar_name(log: str) -> str:

@@ -139,7 +139,8 @@ def _check_channels(system: Fittable, experiment: Experiment, name: str, known: 
         needed = f"{name}: the model needs the channel {q.name!r} [{q.unit}] as input; the log has "
         require(q.name in trajectory, f"{needed}{', '.join(trajectory.names)}; {NEEDED['inputs']}", LogError)
     for channel in trajectory:
-        remedy = "leave it out (Experiment.select, or the sidecar's [columns]), or accept = ['channels']"
+        out = f"{channel} = false under [columns] of the log's sidecar, or Experiment.select"
+        remedy = f"leave it out ({out}), or accept = ['channels']"
         reads = ", ".join(sorted(n for n in known if not n.endswith("_reference")))
         message = f"{name}: the model cannot use channel {channel!r}, it reads {reads}; {remedy}"
         require(channel in known, message, LogError)

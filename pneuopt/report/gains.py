@@ -1,9 +1,11 @@
 """`report_forms`: a loop's gains in every form that controllers take, and its settings that are not tuned."""
 
 import math
+from pathlib import Path
 
 from pneuopt.control.forms import ParallelForm, to_series, to_standard
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.export.vendor_blocks import Block
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, text_columns
@@ -18,6 +20,14 @@ LAW_TEXTS = {
     "series": "K (1~+~1/(Ti~s)) (1~+~Td~s/(Tf~s~+~1))~e",
 }
 """The forms and their laws; no line ends at a tilde."""
+EXPORTS = {
+    "st": "a PLC (IEC 61131-3 structured text)",
+    "c": "a microcontroller (C99, with a test)",
+    "python": "a Python program",
+    **{block.value: f"the PID block of {block.value.capitalize()}" for block in Block},
+    "fmu": "a simulation tool (the plant as FMU)",
+}
+"""The forms of `pneuopt export`, and who takes them."""
 N_NOTE = "N of the standard form is ISA's ratio Td/Tf. Simulink's N is the filter's pole in rad/s, 1/Tf."
 
 
@@ -44,6 +54,21 @@ def report_forms(loop: ClosedLoop, parameters: ParameterSet) -> Report:
             gains = {**gains, "N": math.nan} if "N" in gains else gains  # of no derivative there is no ratio
         rows.append((name, *(_cell(n, value, units.get(n, "s")) for n, value in gains.items()), law.replace("~", TIED)))
     return Report((Table(text_columns("form", "", "", "", "", "law"), tuple(rows)), *refused, Line(N_NOTE)))
+
+
+def report_exports(loop: ClosedLoop, fit: Path, tuned: Path) -> Report:
+    """The commands that take a design to a controller.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    fit, tuned : Path
+        The files of the plant and of the design.
+    """
+    if loop.pid.sample_time is None:
+        return Report((Line("A continuous controller has no export: give it a sample_time, and tune it so."),))
+    rows = tuple((what, f"pneuopt export {fit} {tuned} --to {form}") for form, what in EXPORTS.items())
+    return Report((Table(text_columns("what it takes", "command"), rows),))
 
 
 def report_settings(loop: ClosedLoop, parameters: ParameterSet) -> Report:

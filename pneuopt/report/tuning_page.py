@@ -89,6 +89,7 @@ def tuning_page(
     stands: str = "the given gains",
     was: "pd.DataFrame | None" = None,
     dither: Report | None = None,
+    exports: Report | None = None,
 ) -> Page:
     """The page of a tuning, of a design that was found or of gains that stand.
 
@@ -104,6 +105,8 @@ def tuning_page(
         Metrics with the gains before.
     dither : Report, optional
         The verdict on the dither.
+    exports : Report, optional
+        How the design gets to a controller, of `report_exports`.
     """
     found, certificate, tried = result.status.converged, result.certificate, result.validation
     verdict = report_status(result.status)
@@ -116,6 +119,7 @@ def tuning_page(
     sections = (
         *outcome,
         _form_section(view),
+        Section("To the controller", (exports,) if exports else ()),
         _margin_section(certificate, bode),
         Section("Other plants", (report_validation(tried),) if tried is not None and found else ()),
         Section("Dither", (dither,) if dither else ()),

@@ -156,3 +156,19 @@ def test_the_plant_is_written_as_an_fmu(place: Path) -> None:
     assert "is there already" in run("export fit.toml tuned.toml --to fmu --name axis -o made").stderr
     result = run("export fit.toml tuned.toml --to fmu -o fit.toml/below")
     assert (result.exit_code, "the folder cannot be made" in result.stderr) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("plc", "structured text, --to st; settings for its own PID block: siemens, rockwell"),
+        ("SCL", "--to st"),
+        ("TwinCAT", "it is called 'beckhoff' here"),
+        ("C", "it is called 'c' here"),
+        ("cc", "did you mean 'c'?"),
+    ],
+)
+def test_a_form_by_another_name_is_understood(place: Path, word: str, told: str) -> None:
+    result = run(f"export fit.toml tuned.toml --to {word}")
+    assert (result.exit_code, told in result.stderr) == (2, True), result.stderr
+    assert not (place / "controller.c").exists()

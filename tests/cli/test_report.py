@@ -107,11 +107,16 @@ def test_hostile_names_of_files_and_columns_are_text(folder: Path) -> None:
 
 
 def test_a_tuning_has_its_page(folder: Path) -> None:
-    result = run("tune", "drive.toml", "tuning.toml", "--report", "page.html", "-q")
+    result = run("tune", "drive.toml", "tuning.toml", "-o", "tuned.toml", "--report", "page.html", "-q")
     assert result.exit_code == 0, result.output
+    assert result.stdout.endswith(
+        "Next: pneuopt export drive.toml tuned.toml --to st    (for a PLC; pneuopt export --help)\n"
+    )
     read = page()
+    assert ("td", "pneuopt export drive.toml tuned.toml --to siemens") in read.words
     assert verdict(read).startswith("converged: ")
-    wanted = ["Gains", "Before and after", "Gains in every form", "Margins", "Other plants", "The loop", "Provenance"]
+    wanted = ["Gains", "Before and after", "Gains in every form", "To the controller", "Margins", "Other plants"]
+    wanted += ["The loop", "Provenance"]
     assert headings(read) == [*wanted, "Try it"]
     for words in ("holds on ", "standard (ISA)", "series", "at rest", "Ms", "was"):
         assert words in read.text

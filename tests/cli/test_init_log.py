@@ -1,0 +1,105 @@
+"""`pneuopt init --from LOG`: what a log's columns show fills its sidecar, and what was assumed is said."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pneuopt.files.drive import read_drive
+from pneuopt.files.tuning import read_tuning
+from pneuopt.identification.checks import check_logs
+from pneuopt.logs.read_log import read_log
+from tests.cli.test_init import run
+
+
+def write_foreign_log(path: Path, columns: str = "t_ms;U Ventil;x ist;p1 [bar];p2 [bar]") -> Path:
+    t = np.arange(0.0, 400.0, 2.0)
+    kinds = {
+        "t_ms": t, "U Ventil": 5 + np.sign(np.sin(t / 30)), "x ist": 150 + 20 * np.sin(t / 60),
+        "p1 [bar]": 4 + np.sin(t / 40), "p2 [bar]": 4 - np.sin(t / 40), "Kraft [N]": t, "M [N*m]": t, "v [m/s]": t,
+    }  # fmt: skip
+    rows = np.column_stack([kinds[name] for name in columns.split(";")])
+    path.write_text("\n".join([columns, *(";".join(f"{v:.6g}" for v in row) for row in rows)]), encoding="utf-8")
+    return path
+
+
+def test_a_log_fills_its_sidecar_and_says_what_was_assumed(tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv")
+    code, output = run("init", "--from", str(log), "-o", str(tmp_path / "files"))
+    assert code == 0, output
+    assert max(map(len, output.replace(str(tmp_path), "").splitlines())) <= 80
+    said = " ".join(output.split())
+    assert "valve_voltage: column 'U Ventil' [V], less 5 V" in said
+    assert "assumed, check it in [columns] of run.toml: position: 'x ist' reaches 170. In which unit? Taken: mm" in said
+    assert "# Assumed, check it: position:" in (tmp_path / "run.toml").read_text("utf-8")
+    drive, _ = read_drive(tmp_path / "files/drive.toml")
+    read = read_log(log, plant=drive.system()).trajectory
+    assert drive.kind == "pneumatic"
+    assert [float(read[n].max()) for n in ("position", "pressure_a")] == pytest.approx([0.17, 5e5], rel=1e-3)
+    tuning = read_tuning(tmp_path / "files/tuning.toml", drive.system())
+    assert tuning.loop.pid.sample_time == 2e-3
+    place = re.match("#:schema (.*)\n", (tmp_path / "run.toml").read_text("utf-8"))
+    assert place is not None
+    assert (tmp_path / place[1]).resolve() == (tmp_path / "files/schemas/sidecar.json").resolve()
+
+
+def test_a_valve_of_0_to_10_v_gets_the_limits_of_its_wire(tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv")
+    assert run("init", "--from", str(log), "-o", str(tmp_path / "five"))[0] == 0
+    assert 'limits = ["-5 V", "5 V"]' in (tmp_path / "five" / "tuning.toml").read_text("utf-8")
+    log.write_text(log.read_text("utf-8").replace(";6;", ";5.5;").replace(";4;", ";4.6;"), encoding="utf-8")
+    code, output = run("init", "--from", str(log), "-o", str(tmp_path / "wire"), "--force")
+    assert (code, "its centre, near 5 V, is estimated" in " ".join(output.split())) == (0, True)
+    assert 'limits = ["0 V", "10 V"]' in (tmp_path / "wire" / "tuning.toml").read_text("utf-8")
+
+
+def test_a_second_log_gets_its_sidecar_beside_files_that_were_edited(tmp_path: Path) -> None:
+    logs = [write_foreign_log(tmp_path / f"run_{k}.csv") for k in (1, 2)]
+    assert run("init", "--from", str(logs[0]), "-o", str(tmp_path))[0] == 0
+    (tmp_path / "drive.toml").write_text("# mine\n", encoding="utf-8")
+    code, output = run("init", "--from", str(logs[1]), "-o", str(tmp_path))
+    assert code == 0, output
+    assert "wrote run_2.toml in" in output
+    assert (tmp_path / "drive.toml").read_text("utf-8") == "# mine\n"
+    (tmp_path / "run_2.toml").write_text("# mine\n", encoding="utf-8")
+    code, output = run("init", "--from", str(logs[1]), "-o", str(tmp_path))
+    assert (code, "run_2.toml: is there already" in output) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("columns", "kind"),
+    [
+        ("t_ms;Kraft [N];x ist", "force"),
+        ("t_ms;Kraft [N];U Ventil;x ist", "force"),
+        ("t_ms;M [N*m]", "rotary"),
+        ("t_ms;U Ventil;v [m/s]", "linear"),
+    ],
+)
+def test_a_log_says_what_drives_the_load(columns: str, kind: str, tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv", columns)
+    code, output = run("init", "--from", str(log), "-o", str(tmp_path))
+    assert code == 0
+    assert f"columns are those of a {kind} drive" in " ".join(output.split())
+    assert read_drive(tmp_path / "drive.toml")[0].kind == kind
+
+
+def test_a_channel_that_the_drive_does_not_use_is_left_out(tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv", "t_ms;Kraft [N];U Ventil;x ist;p1 [bar]")
+    code, output = run("init", "force", "--from", str(log), "-o", str(tmp_path))
+    assert code == 0, output
+    assert "valve_voltage: left out, column 'U Ventil': this kind of drive does not use it" in output
+    drive, _ = read_drive(tmp_path / "drive.toml")
+    system = drive.system()
+    check_logs(system, read_log(log, plant=system), system.parameters)
+    assert "valve_voltage = false" in log.with_suffix(".toml").read_text("utf-8")
+
+
+def test_a_log_that_does_not_is_met_with_a_question(tmp_path: Path) -> None:
+    log = write_foreign_log(tmp_path / "run.csv", "t_ms;x ist")
+    code, output = run("init", "--from", str(log))
+    assert (code, "do not say what drives the load; say it before --from" in output) == (2, True)
+    log = write_foreign_log(tmp_path / "drive.csv")
+    code, output = run("init", "--from", str(log), "-o", str(tmp_path))
+    assert (code, "rename it; drive.toml is the name of another file" in output) == (2, True)
+    assert not (tmp_path / "drive.toml").exists()
