@@ -23,7 +23,7 @@ from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
 from .control.motion_feedforward import MotionFeedforward
 from .control.pid import PID, AntiWindup
-from .control.reference import Step
+from .control.reference import Reference, Step
 from .control.sensor import Encoder, SensorLag
 from .dynamics.python_control import from_control, to_control
 from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
@@ -263,6 +263,7 @@ __all__ = [
     "Quantity",
     "Racing",
     "Recording",
+    "Reference",
     "Report",
     "RestCase",
     "RestCheck",

@@ -186,6 +186,7 @@ PUBLIC_NAMES = [
     "Racing",
     "read_cases",
     "Recording",
+    "Reference",
     "Report",
     "resample",
     "respond",

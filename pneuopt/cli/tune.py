@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pneuopt.cli.interruption import interruption_status
 from pneuopt.cli.shared import (
     Columns,
@@ -284,8 +282,7 @@ def _loop_columns(loop: ClosedLoop) -> Columns:
 def _as_logged(response: Response, centre: float) -> Trajectory:
     """The response with its reference, and with the command that is on the wire."""
     run, reference = response.run, response.reference
-    wanted = np.where(run.t >= reference.at, reference.final, reference.initial)
-    return run.with_columns({"reference": wanted, "control": run["control"] + centre})
+    return run.with_columns({"reference": reference.values(run.t), "control": run["control"] + centre})
 
 
 def _tuning_tables(result: TuningResult) -> dict[str, Any]:

@@ -6,13 +6,13 @@ from dataclasses import replace
 import casadi as ca
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbance_input
+from pneuopt.control.reference import Reference, disturbance_input
 from pneuopt.dynamics.system import System, names
 from pneuopt.quantities.errors import check_names
 from pneuopt.quantities.parameters import Quantity
 
 
-def add_disturbances(loop: ClosedLoop, references: Iterable[Step]) -> ClosedLoop:
+def add_disturbances(loop: ClosedLoop, references: Iterable[Reference]) -> ClosedLoop:
     """Give the plant an input for each disturbance of the references, named by `disturbance_input`.
 
     A parameter becomes its value plus that input, an input of the plant likewise; so 0 is the plant as it was.
@@ -25,7 +25,7 @@ def add_disturbances(loop: ClosedLoop, references: Iterable[Step]) -> ClosedLoop
     wanted = dict.fromkeys(n for reference in references for n in reference.disturbance)
     new = [n for n in wanted if disturbance_input(n) not in names(loop.plant.inputs)]
     known = [*names(loop.plant.inputs), *loop.plant.parameters]
-    check_names("parameter or input of the plant", new, known, "Step: disturbance")
+    check_names("parameter or input of the plant", new, known, "disturbance")
     if not new:
         return loop
     plant = _add_plant_disturbances(loop.plant, new)

@@ -1,14 +1,77 @@
-"""References that a loop shall follow, and disturbances against which it shall hold them."""
+"""`Reference`: what a loop shall follow, and disturbances against which it shall hold it; `Step`, the plainest one."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pneuopt.quantities.arguments import as_tuple
+from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
+
+
+@runtime_checkable
+class Reference(Protocol):
+    """What a loop is asked to do in one experiment: its reference over time, its start, and what disturbs it.
+
+    Metrics count from `at` on. They are about `final`, and their fractions are of `nominal_size`.
+    """
+
+    @property
+    def at(self) -> float:
+        """Instant at which the reference begins to change, or the disturbance comes [s]."""
+
+    @property
+    def initial(self) -> float:
+        """Value until then [unit of the measured signal]."""
+
+    @property
+    def final(self) -> float:
+        """Value at the end [unit of the measured signal]."""
+
+    @property
+    def size(self) -> float:
+        """``final - initial``, 0 for a disturbance alone [unit of the measured signal]."""
+
+    @property
+    def horizon(self) -> float:
+        """End of the experiment [s]."""
+
+    @property
+    def start(self) -> Mapping[str, float]:
+        """What else is known of the plant at time 0, by output [SI]."""
+
+    @property
+    def disturbance(self) -> Mapping[str, float]:
+        """By how much parameters or inputs of the plant change at the instant `at` [their units]."""
+
+    @property
+    def changes(self) -> bool:
+        """Whether the reference itself changes; otherwise a disturbance comes alone."""
+
+    @property
+    def nominal_size(self) -> float:
+        """What fractions are of, with the sign of the change [unit of the measured signal]."""
+
+    @property
+    def label(self) -> str:
+        """How a table heads it."""
+
+    def values(self, t: Array) -> Array:
+        """The reference itself at any instants [s], not held between samples."""
+
+    def trajectory(self, step: float) -> Trajectory:
+        """The columns "reference" and of each disturbance on the grid 0, step, 2 step, ... to the horizon [s].
+
+        A reference with derivatives has the columns "reference_speed" and "reference_acceleration", too.
+        """
+
+    def with_horizon(self, horizon: float) -> Self:
+        """The same with another end of the experiment [s]."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +133,7 @@ class Step:
         return self.initial + self.size
 
     @property
-    def is_step(self) -> bool:
+    def changes(self) -> bool:
         """Whether the reference itself steps."""
         return self.size != 0
 
@@ -90,9 +153,12 @@ class Step:
         >>> Step(0.0, initial=0.2, disturbance={"load.force": 50.0}).label
         '0.2 held, load.force +50'
         """
-        lead = f"{self.initial:g} to {self.final:g}" if self.is_step else f"{self.initial:g} held"
-        told = [f"{n} {v:g}" for n, v in self.start.items()] + [f"{n} {v:+g}" for n, v in self.disturbance.items()]
-        return ", ".join([lead, *told])
+        lead = f"{self.initial:g} to {self.final:g}" if self.changes else f"{self.initial:g} held"
+        return ", ".join([lead, *describe_circumstances(self)])
+
+    def values(self, t: Array) -> Array:
+        """The value before and after the step at any instants, shape (n,) [s]."""
+        return np.where(t >= self.at, self.final, self.initial)
 
     def trajectory(self, step: float) -> Trajectory:
         """The column "reference" on the grid 0, step, 2 step, ... to the horizon, held from sample to sample.
@@ -118,21 +184,48 @@ class Step:
         >>> Step(0.2, at=0.1, horizon=0.3).trajectory(0.1)["reference"].tolist()
         [0.0, 0.2, 0.2, 0.2]
         """
-        require(0 < step < self.horizon, f"the grid's spacing {step:g} s must lie between 0 and {self.horizon:g} s")
-        first = round(self.at / step)
-        require(
-            abs(first * step - self.at) <= 1e-9 * max(self.at, step),
-            f"Step: at = {self.at:g} s falls between two samples of {step:g} s; use {first * step:g} s",
-        )
-        k = np.arange(int(np.ceil(self.horizon / step - 1e-9)) + 1)
-        columns = {"reference": np.where(k >= first, self.final, self.initial)}
-        columns |= {disturbance_input(n): np.where(k >= first, v, 0.0) for n, v in self.disturbance.items()}
-        return Trajectory(k * step, columns)
+        k, first = reference_samples(self, step)
+        values = {"reference": np.where(k >= first, self.final, self.initial)}
+        return Trajectory(k * step, values | disturbance_columns(self, k >= first))
+
+    def with_horizon(self, horizon: float) -> Self:
+        """The same with another end of the experiment [s]."""
+        return replace(self, horizon=horizon)
 
 
-def as_steps(references: Step | Iterable[Step]) -> tuple[Step, ...]:
-    """One Step as well as several, as a tuple; an `InputError` where something else came."""
-    return as_tuple("references", references, Step, "a Step or several, such as Step(0.1)")
+def describe_circumstances(reference: Reference) -> list[str]:
+    """What a label says of the start and the disturbance, ["position 0.25", "load.force +50"]."""
+    begun = [f"{n} {v:g}" for n, v in reference.start.items()]
+    return begun + [f"{n} {v:+g}" for n, v in reference.disturbance.items()]
+
+
+def reference_samples(reference: Reference, step: float) -> tuple[NDArray[np.int_], int]:
+    """Numbers of the samples of a grid with spacing `step` [s], and of the one at which the reference changes.
+
+    Raises
+    ------
+    InputError
+        If that instant lies between two samples, or the grid is coarser than the horizon.
+    """
+    kind, at, horizon = type(reference).__name__, reference.at, reference.horizon
+    require(0 < step < horizon, f"the grid's spacing {step:g} s must lie between 0 and {horizon:g} s")
+    first = round(at / step)
+    require(
+        abs(first * step - at) <= 1e-9 * max(at, step),
+        f"{kind}: at = {at:g} s falls between two samples of {step:g} s; use {first * step:g} s",
+    )
+    return np.arange(int(np.ceil(horizon / step - 1e-9)) + 1), first
+
+
+def disturbance_columns(reference: Reference, since: NDArray[np.bool_]) -> dict[str, Array]:
+    """Inputs of a reference's disturbances, named by `disturbance_input`, where they act since some samples."""
+    return {disturbance_input(n): np.where(since, v, 0.0) for n, v in reference.disturbance.items()}
+
+
+def as_references(references: Reference | Iterable[Reference]) -> tuple[Reference, ...]:
+    """One reference as well as several, as a tuple; an `InputError` where something else came."""
+    meant = "a Step or a Move, or several, such as Step(0.1)"
+    return as_tuple("references", references, Reference, meant)  # type: ignore[type-abstract]
 
 
 def disturbance_input(name: str) -> str:

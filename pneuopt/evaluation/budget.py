@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.simulate import MAX_STEPS, SECONDS_A_STEP
 from pneuopt.evaluation.response import (
     SAMPLES_A_DITHER_PERIOD,
@@ -23,7 +23,7 @@ POINTS_PER_READING = 4
 
 def check_steps(
     loop: ClosedLoop,
-    references: Sequence[Step],
+    references: Sequence[Reference],
     parameters: ParameterSet,
     *,
     plants: int = 1,
@@ -34,7 +34,7 @@ def check_steps(
     Parameters
     ----------
     loop : ClosedLoop
-    references : sequence of Step
+    references : sequence of Reference
     parameters : ParameterSet
         Every parameter of the loop.
     plants : int
@@ -63,7 +63,7 @@ def check_steps(
     )
 
 
-def count_steps(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> float:
+def count_steps(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> float:
     """How many steps the independent simulation of a response takes, at least."""
     spacing = sample_spacing(loop, reference, parameters)
     points = POINTS_PER_READING * readings_a_sample(loop, reference) * reference.horizon / spacing
@@ -76,7 +76,7 @@ def _analogue_frequency(loop: ClosedLoop, parameters: ParameterSet) -> float:
     return 0.0 if sampled else highest_dither_frequency(loop, parameters)
 
 
-def _finest_key(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> str:
+def _finest_key(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> str:
     """What sets the steps of a response, with its value: the dither, the sample time, or the step's instant."""
     h, rate = loop.pid.sample_time, _analogue_frequency(loop, parameters)
     if rate and (h is None or SAMPLES_A_DITHER_PERIOD * rate * h > POINTS_PER_READING):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.evaluation.scenarios import Factor, Scenarios, apply_scenario
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ConvergenceError, HardwareError, InputError, check_names, require
@@ -19,14 +19,14 @@ class TuningCase:
 
     Parameters
     ----------
-    reference : Step
+    reference : Reference
     scenario : str
         Its name; empty for the nominal plant.
     values : mapping of str to float or Factor
         The parameter values that differ from the nominal plant.
     """
 
-    reference: Step
+    reference: Reference
     scenario: str = ""
     values: Mapping[str, float | Factor] = field(default_factory=dict)
 
@@ -76,13 +76,13 @@ class TuningCase:
 
 
 def cases(
-    references: Sequence[Step], scenarios: Scenarios, parameters: ParameterSet, tuned: Collection[str] = ()
+    references: Sequence[Reference], scenarios: Scenarios, parameters: ParameterSet, tuned: Collection[str] = ()
 ) -> tuple[TuningCase, ...]:
     """Cases of every reference on the nominal plant, then on each scenario's plant.
 
     Parameters
     ----------
-    references : sequence of Step
+    references : sequence of Reference
     scenarios : mapping of str to mapping
     parameters : ParameterSet
         The parameters that a scenario may change.

@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.continuation import continue_response
 from pneuopt.evaluation.counts import describe_counts
@@ -81,7 +81,7 @@ class Certificate(Result):
 
 def certificate(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
@@ -97,6 +97,7 @@ def certificate(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.models.linear import SecondOrder
     >>> loop = ClosedLoop(SecondOrder().system(), PID(limits=False))
     >>> found = certificate(loop, Step(1.0), loop.parameters.with_values({"pid.Kp": 0.5, "pid.Ki": 30.0}))
@@ -105,7 +106,7 @@ def certificate(
     """
     check_closed_loop(loop)
     full = loop.complete(parameters)
-    for case in cases(as_steps(references), scenarios, full):
+    for case in cases(as_references(references), scenarios, full):
         check_travel(loop, case, full)
     found = evaluate_cases(loop, references, parameters, scenarios=scenarios, band=band, envelope=envelope)
     return judge_evaluations(tuple(found), band)

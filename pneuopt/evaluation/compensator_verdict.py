@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.dither_verdict import (
     NO_RIVAL,
     VERDICT_TONES,
@@ -60,7 +60,7 @@ class CompensatorVerdict(Result):
 
 def judge_compensators(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     without: ParameterSet | None = None,
@@ -73,7 +73,7 @@ def judge_compensators(
     Parameters
     ----------
     loop : ClosedLoop
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
     parameters : ParameterSet
         Values of the design with the compensators.
     without : ParameterSet, optional
@@ -92,7 +92,7 @@ def judge_compensators(
     check_closed_loop(loop)
     check_parameters(parameters)
     require(bool(loop.compensators), "there is nothing to judge: ClosedLoop(plant, pid, compensators=(Knocker(),))")
-    steps, full, bare = as_steps(references), loop.complete(parameters), replace(loop, compensators=())
+    steps, full, bare = as_references(references), loop.complete(parameters), replace(loop, compensators=())
     plain = (full if without is None else full | without).select(bare.parameters)
     before, after = (read_endings(one, steps, p, band) for one, p in ((bare, plain), (loop, full)))
     table, hunts = worst_metrics(before, after), any(e.hunts for e in after)

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbance_input
+from pneuopt.control.reference import Reference, disturbance_input
 from pneuopt.dynamics.simulate import continue_simulation
 from pneuopt.evaluation.dither_mean import period_mean
 from pneuopt.evaluation.evaluate import CaseEvaluation
@@ -46,7 +46,7 @@ class Course:
     Attributes
     ----------
     loop : ClosedLoop
-    reference : Step
+    reference : Reference
     period : float or None
         The time over which dither is averaged [s].
     t : ndarray, shape (n,)
@@ -64,7 +64,7 @@ class Course:
     """
 
     loop: ClosedLoop
-    reference: Step
+    reference: Reference
     period: float | None
     t: Array
     signal: Array

@@ -3,7 +3,7 @@
 from math import ceil, floor, log10
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.control.sensor import Encoder
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
@@ -13,7 +13,7 @@ from pneuopt.quantities.units import write_value
 COUNT_TOLERANCE = 1e-9
 
 
-def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Step, band: float) -> str | None:
+def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, band: float) -> str | None:
     """Sentence for a settling band narrower than half of what one count changes the reading by; None for others.
 
     A position inside half a count of the reference reads as the reference, inside the band or outside, so that nothing
@@ -24,7 +24,7 @@ def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Step,
     loop : ClosedLoop
     parameters : ParameterSet
         Every parameter of the loop.
-    reference : Step
+    reference : Reference
     band : float
         Half width, a fraction of the step.
     """

@@ -120,7 +120,7 @@ class Ending:
     def largest_overshoot(self) -> float:
         """The mean's largest distance beyond the reference, in steps; on either side where only a disturbance steps."""
         error = self.course.error
-        return float(max(0.0, (error if self.course.reference.is_step else np.abs(error)).max()))
+        return float(max(0.0, (error if self.course.reference.changes else np.abs(error)).max()))
 
     def refutes(self, settling_time: float) -> bool:
         """Whether the mean leaves the band after this instant, beyond the horizon [s]."""
@@ -183,7 +183,7 @@ def _describe_defect(ending: Ending, rest_error: float) -> tuple[Defect, str] | 
         return Defect.GROWS, f"runs away: {until} it is {abs(course.error[-1]):.3g} steps off"
     if course.stops:
         return Defect.UNDECIDED, f"is undecided: {course.stops}"
-    if course.reference.is_step and moved < MIN_MOTION:
+    if course.reference.changes and moved < MIN_MOTION:
         return Defect.STANDS_STILL, f"stands still: {until} it has moved by {100 * max(moved, 0.0):.2g} % of the step"
     if cycle is not None and ending.growth > MIN_GROWTH:
         return Defect.GROWS, f"swings more and more: {until} it has {cycle.describe(course.loop.feedback.unit)}"

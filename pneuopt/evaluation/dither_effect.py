@@ -10,7 +10,7 @@ import numpy as np
 from pneuopt.control.averaging import ripple
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY, DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.hooks import Axis, FinalElement, Rest
 from pneuopt.dynamics.system import System, names
 from pneuopt.evaluation.response import command_range
@@ -53,14 +53,14 @@ class DitherEffect:
 
 
 def dither_effect(
-    loop: ClosedLoop, reference: Step, parameters: ParameterSet, *, speed: float | None = None
+    loop: ClosedLoop, reference: Reference, parameters: ParameterSet, *, speed: float | None = None
 ) -> DitherEffect:
     """Amplitudes that the dither causes: the motion and, behind a final element, its travel and force.
 
     Parameters
     ----------
     loop : ClosedLoop
-    reference : Step
+    reference : Reference
         The body is held at its start.
     parameters : ParameterSet
         Values with the dither's amplitude and frequency.
@@ -81,13 +81,15 @@ def dither_effect(
     return _add_effect_at_rest(found, loop, axis, axis.final_element, held, full)
 
 
-def describe_swing(loop: ClosedLoop, references: Sequence[Step], parameters: ParameterSet, band: float) -> str | None:
+def describe_swing(
+    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, band: float
+) -> str | None:
     """Sentence for a dither that moves the measured signal out of the settling band; None for others.
 
     Parameters
     ----------
     loop : ClosedLoop
-    references : sequence of Step
+    references : sequence of Reference
     parameters : ParameterSet
         Values with the dither's amplitude and frequency.
     band : float
@@ -112,7 +114,7 @@ def describe_swing(loop: ClosedLoop, references: Sequence[Step], parameters: Par
 
 
 def _operating_points(
-    loop: ClosedLoop, axis: Axis, reference: Step, speed: float | None
+    loop: ClosedLoop, axis: Axis, reference: Reference, speed: float | None
 ) -> tuple[dict[str, float], dict[str, float]]:
     """What is known of the plant where the body moves, half way of a step in position, and where it is held."""
     if loop.feedback.name == axis.position:

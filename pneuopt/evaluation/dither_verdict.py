@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.evaluation.dither_effect import DitherEffect, dither_effect, explain_effect, format_with_prefix
 from pneuopt.evaluation.dithered_ending import DitheredEnding, read_ending
@@ -114,7 +114,7 @@ class DitherVerdict(Result):
 
 def judge_dither(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     without: ParameterSet | None = None,
@@ -133,7 +133,7 @@ def judge_dither(
     Parameters
     ----------
     loop : ClosedLoop
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
     parameters : ParameterSet
         Values of the design with dither, whose amplitude is positive.
     without : ParameterSet, optional
@@ -155,7 +155,7 @@ def judge_dither(
     """
     check_closed_loop(loop)
     check_parameters(parameters)
-    steps = as_steps(references)
+    steps = as_references(references)
     full = loop.complete(parameters)
     require(loop.dither is not None, "there is no dither to judge: ClosedLoop(plant, pid, Dither())")
     require(full.value(DITHER_AMPLITUDE) > 0, "there is no dither to judge: dither.amplitude is 0")
@@ -180,7 +180,7 @@ def judge_dither(
 
 
 def read_endings(
-    loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, band: float
+    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, band: float
 ) -> list[DitheredEnding]:
     """How a loop's response to each reference ends."""
     return [read_ending(found, band) for found in evaluate_cases(loop, steps, parameters, band=band)]
@@ -194,7 +194,7 @@ def worst_metrics(before: Sequence[DitheredEnding], after: Sequence[DitheredEndi
     return pd.DataFrame({n: pd.DataFrame([e.metrics for e in endings]).max() for n, endings in designs.items()})
 
 
-def _object_to_swing(reference: Step, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
+def _object_to_swing(reference: Reference, found: DitheredEnding, effect: DitherEffect) -> Iterator[str]:
     """Objection to a dither that swings the signal by a large part of the step, in the end or while the body moves."""
     signal, axis = found.course.loop.feedback, found.course.loop.plant.axis or Axis()
     moving = {axis.speed: effect.speed, axis.position: effect.travel}.get(signal.name, nan)

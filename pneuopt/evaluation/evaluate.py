@@ -9,7 +9,7 @@ import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import MAX_STEPS, simulate
 from pneuopt.evaluation.budget import POINTS_PER_READING, check_steps
 from pneuopt.evaluation.cases import TuningCase, cases
@@ -36,7 +36,7 @@ LIMIT_CYCLE_METRICS = ("LimitCycleAmplitude", "LimitCycleFrequency", "StickShare
 
 def evaluate(
     loop: ClosedLoop | Rig,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
@@ -54,7 +54,7 @@ def evaluate(
         The plant's true signal is measured, not a sensor's reading of it. A rig's loop runs with the rig's actuator
         and sensors (`record`, seed 0) and is measured at the controller's samples; PeakControl is then that of the
         command after the actuator. A rig has no margins, which are those of a smooth loop.
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
         Each step begins from rest or from steady motion.
     parameters : ParameterSet
     scenarios : mapping of str to mapping, optional
@@ -94,6 +94,7 @@ def evaluate(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.evaluation.rig import Sensor
     >>> from pneuopt.models.drive import ForceDrive
     >>> from pneuopt.models.friction import Viscous
@@ -106,7 +107,7 @@ def evaluate(
     >>> ["MaxSensitivity" in found.index for found in (smooth, real)]
     [True, False]
     """
-    steps = as_steps(references)
+    steps = as_references(references)
     check_parameters(parameters)
     inner, _ = _loop_and_rig(loop, steps)
     full = inner.complete(parameters)
@@ -153,7 +154,7 @@ def tabulate_metrics(evaluations: Iterable[CaseEvaluation]) -> "pd.DataFrame":
 
 def evaluate_cases(
     loop: ClosedLoop | Rig,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
@@ -161,7 +162,7 @@ def evaluate_cases(
     envelope: Envelope = (),
 ) -> Iterator[CaseEvaluation]:
     """Evaluate one case after the other; parameters and errors as for `evaluate`."""
-    steps = as_steps(references)
+    steps = as_references(references)
     check_parameters(parameters)
     inner, rig = _loop_and_rig(loop, steps)
     full = inner.complete(parameters)
@@ -169,13 +170,13 @@ def evaluate_cases(
         yield _evaluate_case(inner, rig, case, full, band, envelope)
 
 
-def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -> Trajectory:
+def respond(loop: ClosedLoop | Rig, reference: Reference, parameters: ParameterSet) -> Trajectory:
     """Response that `evaluate` measures, from rest or from steady motion.
 
     Parameters
     ----------
     loop : ClosedLoop or Rig
-    reference : Step
+    reference : Reference
     parameters : ParameterSet
 
     Returns
@@ -189,7 +190,7 @@ def respond(loop: ClosedLoop | Rig, reference: Step, parameters: ParameterSet) -
     return _respond(inner, rig, reference, full)
 
 
-def _respond(loop: ClosedLoop, rig: Rig | None, reference: Step, parameters: ParameterSet) -> Trajectory:
+def _respond(loop: ClosedLoop, rig: Rig | None, reference: Reference, parameters: ParameterSet) -> Trajectory:
     run = loop_inputs(loop, reference, sample_spacing(loop, reference, parameters))
     start = loop.initial(parameters, reference=reference.initial, start=reference.start)
     if rig is not None:
@@ -220,7 +221,7 @@ def _evaluate_case(
 
 
 def limit_cycle_metrics(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
 ) -> dict[str, float]:
     """Metrics of the limit cycle after the transient, which takes the first 40 % after the step; amplitude 0: none.
 
@@ -237,7 +238,7 @@ def limit_cycle_metrics(
     return dict(zip(LIMIT_CYCLE_METRICS, values, strict=True))
 
 
-def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Step]) -> tuple[ClosedLoop, Rig | None]:
+def _loop_and_rig(model: ClosedLoop | Rig, references: Sequence[Reference]) -> tuple[ClosedLoop, Rig | None]:
     """Loop with inputs for the references' disturbances, and the rig around it, if any."""
     meant = "a ClosedLoop, such as ClosedLoop(drive, PID()), or a Rig with one"
     check_argument("loop", model, (ClosedLoop, Rig), meant)

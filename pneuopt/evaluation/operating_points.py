@@ -26,7 +26,7 @@ from pneuopt.control.averaged_plant import is_affine
 from pneuopt.control.linear_controller import operating_gains
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbance_input
+from pneuopt.control.reference import Reference, disturbance_input
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.evaluation.dither_mean import period_mean
@@ -75,7 +75,7 @@ class OperatingPoint:
 
 
 def operating_points(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
 ) -> tuple[OperatingPoint, ...]:
     """The operating points that a step response passes; see the module.
 
@@ -85,7 +85,7 @@ def operating_points(
         With inputs for the reference's disturbances (`add_disturbances`).
     parameters : ParameterSet
         Every parameter of the loop.
-    reference : Step
+    reference : Reference
     response : Trajectory
         The loop's states and outputs.
     """
@@ -93,7 +93,7 @@ def operating_points(
 
 
 def operating_point_margins(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
 ) -> "pd.DataFrame":
     """A row for each of the `operating_points`: "point", "t" [s], the metrics of the linear loop, and "stable".
 
@@ -105,7 +105,7 @@ def operating_point_margins(
 
 
 def margin_rows(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
 ) -> tuple[dict[str, Any], ...]:
     """The rows of `operating_point_margins`."""
     return tuple(
@@ -159,7 +159,7 @@ def counted_points(metric: str, count: int) -> int:
 
 
 def worst_open_loop(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
 ) -> tuple[str, Linearisation]:
     """The open loop at the operating point where its sensitivity peak is the largest, and the point's name."""
     points = operating_points(loop, parameters, reference, response)
@@ -184,7 +184,7 @@ def friction_slope(loop: ClosedLoop, parameters: ParameterSet, linear: Linearisa
 
 
 def _find_points(
-    loop: ClosedLoop, parameters: ParameterSet, reference: Step, response: Trajectory
+    loop: ClosedLoop, parameters: ParameterSet, reference: Reference, response: Trajectory
 ) -> Iterator[OperatingPoint]:
     disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
     t, signals = response.t, response.matrix([*names(loop.plant.states), "control"]).T

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -23,7 +23,7 @@ SAMPLES_A_DITHER_PERIOD = 20
 def measure(
     loop: ClosedLoop,
     parameters: ParameterSet,
-    reference: Step,
+    reference: Reference,
     response: Trajectory,
     band: float,
     envelope: Envelope = (),
@@ -49,19 +49,19 @@ def measure(
         control=response["control"],
         sample_time=loop.pid.sample_time,
         envelope=envelope,
-        scale=None if reference.is_step else reference.nominal_size,
+        scale=None if reference.changes else reference.nominal_size,
     )
 
 
-def loop_inputs(loop: ClosedLoop, reference: Step, step: float) -> Trajectory:
-    """Inputs of the loop under a reference; those that the reference does not name are zero."""
+def loop_inputs(loop: ClosedLoop, reference: Reference, step: float) -> Trajectory:
+    """Inputs of the loop under a reference; those that the reference has no column for are zero."""
     run = reference.trajectory(step)
-    others = [q.name for q in loop.inputs if q.name not in run]
-    return run.with_columns({n: np.zeros(len(run)) for n in others})
+    columns, none = run.values, np.zeros(len(run))
+    return Trajectory(run.t, {q.name: columns.get(q.name, none) for q in loop.inputs})
 
 
 def sample_spacing(
-    loop: ClosedLoop, reference: Step, parameters: ParameterSet, samples_a_period: int = SAMPLES_A_DITHER_PERIOD
+    loop: ClosedLoop, reference: Reference, parameters: ParameterSet, samples_a_period: int = SAMPLES_A_DITHER_PERIOD
 ) -> float:
     """Spacing of the samples [s]: the controller's sample time, or a fine one that divides the step's instant."""
     if loop.pid.sample_time is not None:
@@ -72,7 +72,7 @@ def sample_spacing(
     return float(whole / math.ceil(whole / longest - 1e-9))
 
 
-def readings_a_sample(loop: ClosedLoop, reference: Step) -> int:
+def readings_a_sample(loop: ClosedLoop, reference: Reference) -> int:
     """Readings of a response per sample of the controller."""
     h = loop.pid.sample_time
     if h is None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import simulate_stick_slip
 from pneuopt.dynamics.stick_slip import Event, EventKind
 from pneuopt.evaluation.cases import TuningCase, cases
@@ -147,7 +147,7 @@ class RestCheck(Result):
 
 def check_rest(
     model: ClosedLoop | Rig,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
@@ -159,7 +159,7 @@ def check_rest(
     ----------
     model : ClosedLoop or Rig
         With Karnopp's friction: ``stick_slip_drive(drive)`` makes such a plant of a smooth one.
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
         Each is held at its final value until `duration`.
     parameters : ParameterSet
     scenarios : mapping of str to mapping, optional
@@ -184,6 +184,7 @@ def check_rest(
     that:
 
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.models.drive import ForceDrive
     >>> from pneuopt.models.friction import Stribeck
     >>> from pneuopt.models.karnopp import Karnopp
@@ -196,7 +197,7 @@ def check_rest(
     check_argument(
         "loop", model, (ClosedLoop, Rig), "a ClosedLoop, such as ClosedLoop(drive, PID()), or a Rig with one"
     )
-    steps = as_steps(references)
+    steps = as_references(references)
     if model.loop is None:
         raise ModelError("this rig has no controller, so it follows no reference; make it of a ClosedLoop")
     require(isfinite(duration), f"check_rest: duration must be finite, got {duration} s")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.pid import AntiWindup
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.export.header import check_name, comment_text
 from pneuopt.export.vendor_blocks import BLOCK_FORMS, Block, BlockForm, Design
@@ -22,7 +22,7 @@ def export_settings(
     loop: ClosedLoop,
     parameters: ParameterSet,
     block: Block,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     *,
     name: str = "controller",
     centre: float = 0.0,
@@ -39,7 +39,7 @@ def export_settings(
         With a sample time.
     parameters : ParameterSet
     block : Block
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
         On which the two are compared.
     name : str
         Of the file.
@@ -99,14 +99,14 @@ def run_as_block(
 
 
 def compare_with_block(
-    loop: ClosedLoop, parameters: ParameterSet, block: Block, references: Step | Sequence[Step]
+    loop: ClosedLoop, parameters: ParameterSet, block: Block, references: Reference | Sequence[Reference]
 ) -> list[str]:
     """Lines that say what a design is worth as a block runs it, beside what it is worth as tuned."""
     own, values, found = run_as_block(loop, parameters, block)
     if not found:
         return ["The block runs the design as it was tuned."]
     lines = ["As the block runs it, the design differs:", *(f"- {difference}" for difference in found), ""]
-    unit, steps = loop.feedback.unit, as_steps(references)
+    unit, steps = loop.feedback.unit, as_references(references)
     try:
         tuned, run = evaluate(loop, steps, parameters), evaluate(own, steps, values)
     except (ConvergenceError, InputError) as error:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.requirements import larger_is_better, metric_name, requirement_values
 from pneuopt.evaluation.specification import Objective, Specification, specify
@@ -66,7 +66,7 @@ class DesignOutlook(Shown):
 def predict_loss(
     found: Tracking,
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     objective: Objective,
     *,
@@ -78,7 +78,7 @@ def predict_loss(
     ----------
     found : Tracking
     loop : ClosedLoop
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
     parameters : ParameterSet
         The design's gains and the plant's other values.
     objective : Specification, Requirement or mapping
@@ -122,7 +122,7 @@ def _plants(found: Tracking, ahead: int) -> "list[tuple[pd.Timestamp, bool, dict
 
 
 def _certify(
-    loop: ClosedLoop, references: Step | Sequence[Step], parameters: ParameterSet, spec: Specification
+    loop: ClosedLoop, references: Reference | Sequence[Reference], parameters: ParameterSet, spec: Specification
 ) -> dict[str, float | str]:
     """The worst metrics of a design, and why it fails."""
     found = certificate(loop, references, parameters, band=spec.band, envelope=spec.envelope)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_COLUMNS, ORANGE, axes_grid, finish_columns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -28,7 +28,7 @@ class Response:
     ----------
     run : Trajectory
         With the measured signal and "control"; "valve.spool" [1] and "friction.force" are drawn where it has them.
-    reference : Step
+    reference : Reference
     measured : str
         Column of the signal that follows the reference.
     units : tuple of str
@@ -42,7 +42,7 @@ class Response:
     """
 
     run: Trajectory
-    reference: Step
+    reference: Reference
     measured: str
     units: tuple[str, str]
     before: Trajectory | None = None

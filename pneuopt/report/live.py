@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbance_input
+from pneuopt.control.reference import Reference, Step, disturbance_input
 from pneuopt.evaluation.report import relevant_units
 from pneuopt.export.javascript import write_loop_javascript
 from pneuopt.models.load import GRAVITY
@@ -40,7 +40,7 @@ LOG_RANGE = 20.0
 
 def live_script(
     loop: ClosedLoop,
-    references: Sequence[Step],
+    references: Sequence[Reference],
     parameters: ParameterSet,
     *,
     band: float = 0.02,
@@ -55,8 +55,8 @@ def live_script(
     Parameters
     ----------
     loop : ClosedLoop
-    references : sequence of Step
-        Those that begin at rest or in steady motion are offered, with their disturbances.
+    references : sequence of Reference
+        Steps that begin at rest or in steady motion are offered, with their disturbances.
     parameters : ParameterSet
         Every parameter of the loop.
     band : float
@@ -67,7 +67,10 @@ def live_script(
         Metrics of the references, one a column, in their order; a limit is watched where the script agrees with them.
     """
     loop = add_disturbances(loop, references)
-    finders = [RestFinder(loop, r, parameters) for r in references]
+    steps = {k: r for k, r in enumerate(references) if isinstance(r, Step)}
+    if not steps:
+        return ""
+    finders = [RestFinder(loop, r, parameters) for r in steps.values()]
     try:
         code = write_loop_javascript(loop)
         starts = [finder.start.tolist() for finder in finders]
@@ -81,7 +84,7 @@ def live_script(
         "sliders": sliders,
         "references": [
             _reference(r, places, loop.feedback.unit) | {"x0": x0, "rest": rest, "certified": _figures(certified, k)}
-            for k, (r, x0, rest) in enumerate(zip(references, starts, rests, strict=True))
+            for (k, r), x0, rest in zip(steps.items(), starts, rests, strict=True)
         ],
         "limits": {n: limit for n, limit in (limits or {}).items() if n in LIVE_METRICS},
         "units": {n: units.get(n, "") for n in LIVE_METRICS},
@@ -115,7 +118,7 @@ def _reference(reference: Step, places: Mapping[str, int], unit: str) -> dict[st
         "final": reference.final,
         "inputs": [[places[disturbance_input(n)], value] for n, value in reference.disturbance.items()],
         "size": reference.nominal_size,
-        "isStep": reference.is_step,
+        "isStep": reference.changes,
         "horizon": reference.horizon,
         "label": f"{reference.label} {unit}",
     }

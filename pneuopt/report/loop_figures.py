@@ -8,7 +8,7 @@ import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.evaluate import respond
 from pneuopt.evaluation.operating_points import worst_open_loop
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def simulate_responses(
-    loop: ClosedLoop, references: Sequence[Step], parameters: ParameterSet, before: ParameterSet | None = None
+    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, before: ParameterSet | None = None
 ) -> list[Response]:
     """The response to each reference, with that of the gains before where they can be simulated."""
     units = (loop.feedback.unit, loop.command.unit)
@@ -38,7 +38,7 @@ def simulate_responses(
 
 def loop_figures(
     loop: ClosedLoop,
-    references: Sequence[Step],
+    references: Sequence[Reference],
     parameters: ParameterSet,
     before: ParameterSet | None = None,
     *,
@@ -49,7 +49,7 @@ def loop_figures(
     Parameters
     ----------
     loop : ClosedLoop
-    references : sequence of Step
+    references : sequence of Reference
     parameters : ParameterSet
     before : ParameterSet, optional
         With the gains before tuning, which are drawn beside.
@@ -108,7 +108,7 @@ def diagram_picture(loop: ClosedLoop) -> Picture:
     return Picture(partial(plot_loop, loop), alt, "The loop as it was simulated.")
 
 
-def _simulate_response(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory:
+def _simulate_response(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> Trajectory:
     """The response, with the friction force where the plant has one."""
     run, plant = respond(loop, reference, parameters), loop.plant
     if not plant.states or not has_friction_map(plant):
@@ -118,13 +118,13 @@ def _simulate_response(loop: ClosedLoop, reference: Step, parameters: ParameterS
     return run.with_columns({"friction.force": friction_force(plant, whole, parameters)})
 
 
-def _simulate_initial_response(loop: ClosedLoop, reference: Step, parameters: ParameterSet) -> Trajectory | None:
+def _simulate_initial_response(loop: ClosedLoop, reference: Reference, parameters: ParameterSet) -> Trajectory | None:
     try:
         return _simulate_response(loop, reference, parameters)
     except (ConvergenceError, InputError):
         return None
 
 
-def _open_loop(loop: ClosedLoop, parameters: ParameterSet, reference: Step, run: Trajectory) -> Linearisation:
+def _open_loop(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, run: Trajectory) -> Linearisation:
     disturbed = add_disturbances(loop, [reference])
     return worst_open_loop(disturbed, loop.complete(parameters), reference, run)[1]

@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.evaluation.certificate import Certificate
 from pneuopt.evaluation.report import metric_cell, report_metrics, report_notes
 from pneuopt.evaluation.requirements import larger_is_better
@@ -51,7 +51,7 @@ class LoopView:
     Attributes
     ----------
     loop : ClosedLoop
-    references : sequence of Step
+    references : sequence of Reference
     parameters : ParameterSet
         Every parameter of the loop.
     before : ParameterSet, optional
@@ -61,7 +61,7 @@ class LoopView:
     """
 
     loop: ClosedLoop
-    references: Sequence[Step]
+    references: Sequence[Reference]
     parameters: ParameterSet
     before: ParameterSet | None = None
     band: float = 0.02

@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import HasSystem
 from pneuopt.evaluation.certificate import Certificate
 from pneuopt.identification.result import IdentificationResult
@@ -36,7 +36,7 @@ def write_report(
     model: HasSystem | ClosedLoop | None = None,
     experiments: Experiment | Sequence[Experiment] = (),
     held_out: Experiment | Sequence[Experiment] = (),
-    references: Step | Sequence[Step] = (),
+    references: Reference | Sequence[Reference] = (),
     parameters: ParameterSet | None = None,
     band: float = 0.02,
 ) -> None:
@@ -60,7 +60,7 @@ def write_report(
         Of a fit: the logs that it was made from, in their order.
     held_out : Experiment or sequence of Experiment
         Logs that the fit has not seen.
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
         Those of the loop.
     parameters : ParameterSet, optional
         Of a certificate: every parameter of its loop. Of a tuning: those before, to be drawn beside.
@@ -86,7 +86,7 @@ def write_report(
     True
     """
     require(isinstance(result, Shown), f"a report is written of a result, got {type(result).__name__}")
-    steps = as_steps(references)
+    steps = as_references(references)
     logs, others = (
         as_tuple(n, given, Experiment, LOGS) for n, given in (("experiments", experiments), ("held_out", held_out))
     )
@@ -105,7 +105,7 @@ def write_report(
 
 
 def _view(
-    model: object, steps: Sequence[Step], parameters: ParameterSet | None, before: ParameterSet | None, band: float
+    model: object, steps: Sequence[Reference], parameters: ParameterSet | None, before: ParameterSet | None, band: float
 ) -> LoopView | None:
     """What a loop's figures are drawn from; None without a loop."""
     if model is None or parameters is None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.compiled.rollout import processor_count
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.evaluate import evaluate
@@ -99,7 +99,7 @@ class BatchEvaluation(Shown):
 
 def evaluate_batch(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     cases: Mapping[str, Mapping[str, float]],
     *,
@@ -118,7 +118,7 @@ def evaluate_batch(
     Parameters
     ----------
     loop : ClosedLoop
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
     parameters : ParameterSet
         The nominal plant and the gains.
     cases : mapping of str to mapping of str to float
@@ -155,6 +155,7 @@ def evaluate_batch(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.evaluation.scenarios import samples
     >>> from pneuopt.models.linear import SecondOrder
     >>> loop = ClosedLoop(SecondOrder().system(), PID())
@@ -167,7 +168,7 @@ def evaluate_batch(
     """
     from pneuopt.quantities.frames import WideFrame
 
-    steps, chosen = as_steps(references), tuple(dict.fromkeys(metrics))
+    steps, chosen = as_references(references), tuple(dict.fromkeys(metrics))
     check_parameters(parameters)
     check_closed_loop(loop)
     chunk = CHUNK_A_CORE * processor_count() if chunk is None else chunk
@@ -265,7 +266,7 @@ def _pick_cases(table: "pd.DataFrame", columns: Sequence[str], share: float, see
 
 def _certify(
     loop: ClosedLoop,
-    steps: Sequence[Step],
+    steps: Sequence[Reference],
     parameters: ParameterSet,
     cases: Mapping[str, Mapping[str, float]],
     table: "pd.DataFrame",

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.meter import needed_channels
@@ -35,7 +35,7 @@ class Fleet:
     def __init__(
         self,
         loop: ClosedLoop,
-        steps: Sequence[Step],
+        steps: Sequence[Reference],
         parameters: ParameterSet,
         cases: Mapping[str, Mapping[str, float]],
         metrics: Sequence[str],
@@ -122,7 +122,7 @@ class Fleet:
             period = dither.period(rate, self.loop.pid.sample_time) if dither is not None and rate else None
             yield period, np.flatnonzero(sound & (rates == rate))
 
-    def _start_states(self, rows: Indices, step: Step, shared: Array | None) -> tuple[Indices, Array]:
+    def _start_states(self, rows: Indices, step: Reference, shared: Array | None) -> tuple[Indices, Array]:
         """The plants that can begin, and their states before the step; the others get their reason."""
         good, states = list[int](), list[Array]()
         for k in rows.tolist():
@@ -136,11 +136,11 @@ class Fleet:
         found = np.reshape(states, (len(good), len(self.loop.states)))
         return np.array(good, dtype=np.intp), np.pad(found, ((0, 0), (0, int(has_integral(self.loop)))))
 
-    def start(self, values: Mapping[str, float], step: Step) -> Array:
+    def start(self, values: Mapping[str, float], step: Reference) -> Array:
         """The state before a step of the plant with these values."""
         return TuningCase(step, "", values).initial(self.loop, self._full)
 
-    def _shared_start(self, step: Step) -> Array | None:
+    def _shared_start(self, step: Reference) -> Array | None:
         """The state before the step, if it is the same on every plant, as far as probes tell; None: each has its own.
 
         It takes a millisecond, which is longer than a plant's response in the lanes. The probes are the plants with the

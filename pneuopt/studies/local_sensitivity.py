@@ -14,7 +14,7 @@ import numpy as np
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.evaluation.meter import needed_channels
@@ -81,7 +81,7 @@ class LocalSensitivity(Shown):
 
 def local_sensitivity(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     spreads: SampleSpreads,
     *,
@@ -93,7 +93,7 @@ def local_sensitivity(
     Parameters
     ----------
     loop : ClosedLoop
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
     parameters : ParameterSet
         The design, at which the derivatives are taken.
     spreads : mapping
@@ -120,6 +120,7 @@ def local_sensitivity(
     The error of a first-order lag under a proportional gain, 1/(1 + Kp K), falls with the plant's gain K:
 
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.models.linear import FirstOrder
     >>> loop = ClosedLoop(FirstOrder().system(), PID())
     >>> design = loop.parameters.with_values({"pid.Kp": 4.0, "pid.Ki": 0.0})
@@ -132,7 +133,7 @@ def local_sensitivity(
 
     from pneuopt.quantities.frames import WideFrame
 
-    steps, chosen = as_steps(references), tuple(dict.fromkeys(metrics))
+    steps, chosen = as_references(references), tuple(dict.fromkeys(metrics))
     check_parameters(parameters)
     check_closed_loop(loop)
     check_smooth(loop.plant)
@@ -214,7 +215,7 @@ def _run_with_sensitivities(
     return run.y[0], np.array(along)
 
 
-def _start_change(fleet: Fleet, reference: Step, steps: Mapping[str, float], more: int) -> Array:
+def _start_change(fleet: Fleet, reference: Reference, steps: Mapping[str, float], more: int) -> Array:
     """How the state before the step changes with an axis."""
     ends = [
         fleet.start({n: fleet.nominal_value(n) + side * START_SIDE * s for n, s in steps.items()}, reference)

@@ -9,7 +9,7 @@ from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.linear_loop import linear_plant
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed
@@ -67,7 +67,7 @@ def _check_dither(loop: ClosedLoop, space: Space) -> None:
         loop.dither.check(highest_dither_frequency(loop, space.parameters), loop.pid.sample_time)
 
 
-def _check_horizon(reference: Step, spec: Specification) -> None:
+def _check_horizon(reference: Reference, spec: Specification) -> None:
     """Check that a reference's record is long enough for the limits on times to be read."""
     record = reference.horizon - reference.at
     for q in spec.limits:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.resolution import MAX_REFINEMENTS, refine_instants, spread_instants
 from pneuopt.evaluation.response import SAMPLES_A_DITHER_PERIOD, loop_inputs, readings_a_sample, sample_spacing
@@ -20,7 +20,7 @@ SEARCH_TOLERANCE = 5.0
 
 def reference_grids(
     loop: ClosedLoop,
-    references: Sequence[Step],
+    references: Sequence[Reference],
     parameters: ParameterSet,
     samples_a_period: int = SAMPLES_A_DITHER_PERIOD,
 ) -> list[ReferenceGrid]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.scenarios import Scenarios
 from pneuopt.evaluation.specification import Specification
@@ -23,7 +23,7 @@ class TuningTask:
     Attributes
     ----------
     loop : ClosedLoop
-    references : tuple of Step
+    references : tuple of Reference
     scenarios : mapping of str to mapping
     space : Space
         The free gains, and every parameter of the loop.
@@ -34,7 +34,7 @@ class TuningTask:
     """
 
     loop: ClosedLoop
-    references: tuple[Step, ...]
+    references: tuple[Reference, ...]
     scenarios: Scenarios
     space: Space
     spec: Specification

@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.requirements import (
     Requirement,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def pareto_front(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     minimise: tuple[Requirement, Requirement],
@@ -74,6 +74,7 @@ def pareto_front(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.models.linear import FirstOrder
     >>> from pneuopt.evaluation.requirements import PeakControl, SettlingTime
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))

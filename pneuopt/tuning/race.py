@@ -182,7 +182,7 @@ def _course(simulator: Simulator) -> RaceCourse:
     n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_of(k) for k in range(len(simulator.cases))])
     u, t, h = (np.array(arrays) for arrays in zip(*(g.pad(n) for g in grids), strict=True))
     settings = [
-        (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.is_step))
+        (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.changes))
         for g, r in ((g, g.reference) for g in grids)
     ]
     length, first = np.array([[len(g.t), g.step_index] for g in grids]).T

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.dynamics.system import names
@@ -32,7 +32,7 @@ class ReferenceGrid:
 
     Attributes
     ----------
-    reference : Step
+    reference : Reference
     t : ndarray, shape (n,)
     u : ndarray, shape (n, n_inputs)
     spacing : float
@@ -41,7 +41,7 @@ class ReferenceGrid:
         The controller's, if it is sampled [s].
     """
 
-    reference: Step
+    reference: Reference
     t: Array
     u: Array
     spacing: float
@@ -60,7 +60,7 @@ class ReferenceGrid:
             last = -(-last // readings) * readings
         if last >= len(self.t) - 1:
             return self
-        reference = replace(self.reference, horizon=float(self.t[last]))
+        reference = self.reference.with_horizon(float(self.t[last]))
         return replace(self, reference=reference, t=self.t[: last + 1], u=self.u[: last + 1])
 
     def pad(self, n: int) -> tuple[Array, Array, Array]:
@@ -173,7 +173,7 @@ def read_metrics(
         "averaged": averaged,
     }
     settings["sample_time"] = grid.sample_time
-    settings["scale"] = None if reference.is_step else reference.nominal_size
+    settings["scale"] = None if reference.changes else reference.nominal_size
     given = (grid.t, signal, reference.final, reference.initial)
     settings["control"], meter = y[:, :, CONTROL_OUTPUT], meter_values(y, channels)
     settings["wider"] = bands[1:]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metric import Requirement, Sense
 from pneuopt.evaluation.requirements import SettlingTime, metric_name, upper_limit, user_limit, with_user_limit
@@ -34,7 +34,7 @@ MAX_LOCAL_SIMULATIONS = 200
 
 
 def relaxation_specification(
-    spec: Specification, requirement: Requirement, references: Sequence[Step]
+    spec: Specification, requirement: Requirement, references: Sequence[Reference]
 ) -> Specification:
     """The specification of the tuning that makes a limited requirement as small as the other limits allow.
 
@@ -47,7 +47,7 @@ def relaxation_specification(
 
 
 def limits_with_settling(
-    spec: Specification, references: Sequence[Step], *, always: bool = False
+    spec: Specification, references: Sequence[Reference], *, always: bool = False
 ) -> tuple[Requirement, ...]:
     """The limits, and one that the response settles at all where a settling time is minimised without a limit.
 

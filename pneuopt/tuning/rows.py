@@ -86,7 +86,7 @@ class Lanes:
             self.stride,
             self.grid.sample_time,
             self.envelope,
-            reference.is_step,
+            reference.changes,
         )
 
     def _to_gains(self, by_column: Array) -> Array:

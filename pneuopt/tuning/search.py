@@ -164,7 +164,7 @@ class Search:
 
     def _stretch_task(self, factor: float, rests: bool) -> TuningTask:
         """The task over so many horizons, with a limit that every response settles."""
-        steps = tuple(replace(r, horizon=r.at + factor * (r.horizon - r.at)) for r in self.task.references)
+        steps = tuple(r.with_horizon(r.at + factor * (r.horizon - r.at)) for r in self.task.references)
         spec = self.spec.with_rest(self.task.horizon) if rests else self.spec
         spec = replace(spec, limits=limits_with_settling(spec, steps, always=True))
         return replace(self.task, references=steps, spec=spec)

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
@@ -62,7 +62,7 @@ class Simulator:
     Parameters
     ----------
     loop : ClosedLoop
-    references : sequence of Step
+    references : sequence of Reference
     space : Space
     scenarios : mapping of str to mapping, optional
         The plants beside the nominal one.
@@ -83,7 +83,7 @@ class Simulator:
     def __init__(
         self,
         loop: ClosedLoop,
-        references: Sequence[Step],
+        references: Sequence[Reference],
         space: Space,
         scenarios: Scenarios = NO_SCENARIOS,
         spec: Specification | None = None,
@@ -356,7 +356,7 @@ class Simulator:
         k = speed_output(self.loop, self.meter_channels)
         return np.zeros(len(y), dtype=np.intp) if k is None else fastest_samples(grid, y[:, :, k], period or 0.0)
 
-    def _margin_function(self, references: Sequence[Step]) -> MarginFunction:
+    def _margin_function(self, references: Sequence[Reference]) -> MarginFunction:
         """Margins of many loops, read from the frequency on at which a slow integral swings against a resting drive."""
         horizon, h = max(r.horizon for r in references), self.loop.pid.sample_time
         slowest, lowest = 1 / horizon, lowest_noise_frequency(horizon)
@@ -371,7 +371,7 @@ class Simulator:
         amplitude, frequency = (p[:, order.index(f"dither.{n}")] for n in ("amplitude", "frequency"))
         return np.where(amplitude == 0, 0.0, frequency)
 
-    def _fastest_eigenvalue(self, references: Sequence[Step]) -> float:
+    def _fastest_eigenvalue(self, references: Sequence[Reference]) -> float:
         """The rate of the fastest mode over the gains' box and all plants [1/s].
 
         On the scenarios' plants only the corners that are fastest on the nominal one are examined.

@@ -13,7 +13,7 @@ from math import inf
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import check_smooth
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.budget import check_steps
@@ -53,7 +53,7 @@ STOPPED = "a second search was interrupted, and the design was not tried on othe
 
 def tune(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     minimise: Objective,
@@ -73,7 +73,7 @@ def tune(
     ----------
     loop : ClosedLoop
         The requirements are read on its true measured signal; the controller acts on what the loop's sensor shows.
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
         Each from rest, or from steady motion, and with a label of its own; the worst counts.
     parameters : ParameterSet
         Of plant, controller and dither. The free ones ("pid.*", "dither.*", "feedforward.*", a compensator's) are tuned
@@ -126,6 +126,7 @@ def tune(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.models.linear import FirstOrder
     >>> from pneuopt.evaluation.requirements import Overshoot, PeakControl, SettlingTime
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False))
@@ -221,7 +222,7 @@ def _try_on_plants(
 
 def prepare_task(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     spec: Specification,
     scenarios: Scenarios = NO_SCENARIOS,
@@ -232,9 +233,9 @@ def prepare_task(
     check_closed_loop(loop)
     check_parameters(parameters)
     check_smooth(loop.plant)
-    steps = as_steps(references)
+    steps = as_references(references)
     loop = add_disturbances(loop, steps)
-    require(len(steps) > 0, "no reference to tune for; give a Step")
+    require(len(steps) > 0, "no reference to tune for; give a Step or a Move")
     check_steps(loop, steps, loop.complete(parameters), plants=1 + len(scenarios), max_steps=max_steps)
     space = search_space(loop, parameters)
     spec = spec.without(PeakControl) if clip_level(loop, space.parameters) <= spec.limit(PeakControl) else spec

@@ -11,7 +11,7 @@ import numpy as np
 
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference, Step
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
 from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.requirements import METRICS, MaxSensitivity, PeakControl, metric_name, upper_limit
@@ -97,15 +97,17 @@ class TwoPhase:
         """Refuse loops that are not linear, scenarios and requirements without an equation, by an `InputError`."""
         message = "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Racing()"
         require(is_linear(task.loop), message)
+        require(are_steps(task.references), "TwoPhase tunes for steps, not for moves; use method=Racing()")
         require(not task.scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
         inexact = _inexact_requirements(task.spec)
         require(not inexact, f"TwoPhase has no equation for {', '.join(inexact)}; use method=Racing()")
 
     def suits(self, task: TuningTask) -> bool:
-        """Whether the loop is linear, not clipped and without scenarios, and all that is asked for has an equation."""
+        """Whether the loop is linear, not clipped, on one plant and asked for steps and what has an equation."""
         clip = clip_level(task.loop, task.space.parameters)
         clipped = clip < math.inf and not task.spec.limit(PeakControl) < clip  # designs that saturate are as welcome
-        can = is_linear(task.loop) and not clipped and not task.scenarios and not _inexact_requirements(task.spec)
+        steps = are_steps(task.references) and not task.scenarios
+        can = is_linear(task.loop) and steps and not clipped and not _inexact_requirements(task.spec)
         return can and has_few_steps(task.loop, task.references, task.space, self)
 
     def find(
@@ -160,7 +162,12 @@ def is_linear(loop: ClosedLoop) -> bool:
     return not ca.depends_on(ca.jacobian(ca.vertcat(*ode(t, x, u, p)), signals), signals)
 
 
-def has_few_steps(loop: ClosedLoop, references: Sequence[Step], space: Space, method: TwoPhase) -> bool:
+def are_steps(references: Sequence[Reference]) -> bool:
+    """Whether every reference is constant after an instant, as the phases of the problem need it."""
+    return all(isinstance(r, Step) for r in references)
+
+
+def has_few_steps(loop: ClosedLoop, references: Sequence[Reference], space: Space, method: TwoPhase) -> bool:
     """Whether few enough RK4 steps lie between two nodes for the problem to take less time than a simulated one."""
     own = Space(space.parameters, tuple(n for n in space.names if n not in ("pid.Tt", "pid.lower", "pid.upper")))
     rate = fastest_eigenvalue(loop, own.vectors(own.corners()), [np.zeros(len(loop.states))]).max()
@@ -202,7 +209,7 @@ def _is_stable(loop: ClosedLoop, most: float, solution: Solution) -> bool:
 
 def solve_two_phase(
     loop: ClosedLoop,
-    references: Sequence[Step],
+    references: Sequence[Reference],
     space: Space,
     spec: Specification,
     method: TwoPhase,
@@ -271,7 +278,7 @@ class TwoPhasePath:
 
 
 def two_phase_path(
-    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, method: TwoPhase
+    loop: ClosedLoop, references: Sequence[Reference], space: Space, spec: Specification, method: TwoPhase
 ) -> TwoPhasePath:
     """Prepare a problem whose limits and settling band are going to move; `spec` is already tightened."""
     transcription = transcribe_two_phase(loop, references, space, spec, method.nodes)

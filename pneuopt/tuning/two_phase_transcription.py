@@ -15,7 +15,7 @@ import numpy as np
 
 from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step, disturbance_input
+from pneuopt.control.reference import Reference, disturbance_input
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.margins import frequency_grid, sensitivity_terms
@@ -44,7 +44,7 @@ BAND_PARAMETER = "band.share"  # name of the settling band's factor, 1 as transc
 
 
 def transcribe_two_phase(
-    loop: ClosedLoop, references: Sequence[Step], space: Space, spec: Specification, nodes: tuple[int, int]
+    loop: ClosedLoop, references: Sequence[Reference], space: Space, spec: Specification, nodes: tuple[int, int]
 ) -> Transcription:
     """Write the two-phase problem, in which the references share one settling time, the largest.
 
@@ -52,7 +52,7 @@ def transcribe_two_phase(
     ----------
     loop : ClosedLoop
         A linear one.
-    references : sequence of Step
+    references : sequence of Reference
     space : Space
     spec : Specification
         Already tightened.
@@ -86,7 +86,7 @@ def without_clip(loop: ClosedLoop) -> ClosedLoop:
     return replace(loop, pid=replace(loop.pid, limits=False))
 
 
-def _extra_unknowns(references: Sequence[Step], spec: Specification) -> ParameterSet:
+def _extra_unknowns(references: Sequence[Reference], spec: Specification) -> ParameterSet:
     """The settling time, an unknown for each other term of the objective, and a number for each other limit."""
     horizon = min(r.horizon - r.at for r in references)
     most = min(spec.limit(SettlingTime), (1 - TAIL_SHARE) * horizon)  # metrics need the rest as the record's end
@@ -108,7 +108,7 @@ def _extra_unknowns(references: Sequence[Step], spec: Specification) -> Paramete
     return ParameterSet(given)
 
 
-def _durations(references: Sequence[Step], spec: Specification, settling: Parameter) -> ParameterSet:
+def _durations(references: Sequence[Reference], spec: Specification, settling: Parameter) -> ParameterSet:
     """The durations [s] of each reference, before its step and of its settled phase.
 
     Where the error at the end counts the settled phase ends with the horizon; otherwise it is as long as the record
@@ -132,7 +132,7 @@ def _settled_duration(i: int) -> str:
     return f"rest.{i}"
 
 
-def _horizon_limits(references: Sequence[Step], parameters: ParameterSet) -> list[Limit]:
+def _horizon_limits(references: Sequence[Reference], parameters: ParameterSet) -> list[Limit]:
     """The settled phase ends with the horizon, where its duration is unknown because the settling time is."""
     q, names_ = ca.SX.sym("q", len(parameters)), list(parameters)
     return [
@@ -149,7 +149,7 @@ def _horizon_limits(references: Sequence[Step], parameters: ParameterSet) -> lis
 
 
 def _extend_system(
-    loop: ClosedLoop, extra: ParameterSet, space: Space, references: Sequence[Step], nodes: tuple[int, int]
+    loop: ClosedLoop, extra: ParameterSet, space: Space, references: Sequence[Reference], nodes: tuple[int, int]
 ) -> DiscreteSystem:
     """Discretise the loop with the extra unknowns among its parameters, so that path limits may depend on them."""
     system = loop.system()
@@ -167,7 +167,9 @@ def _extend_system(
     )
 
 
-def _reference_phases(loop: ClosedLoop, space: Space, i: int, reference: Step, nodes: tuple[int, int]) -> list[Phase]:
+def _reference_phases(
+    loop: ClosedLoop, space: Space, i: int, reference: Reference, nodes: tuple[int, int]
+) -> list[Phase]:
     """The phases of reference i: before the step, where there is such a time, transient and settled."""
     start = _state_before_step(loop, space, reference)
     disturbed = {disturbance_input(n): v for n, v in reference.disturbance.items()}
@@ -184,7 +186,7 @@ def _reference_phases(loop: ClosedLoop, space: Space, i: int, reference: Step, n
     return [*before, transient, make_phase("settled", nodes[1], reference.final, _settled_duration(i), None)]
 
 
-def _state_before_step(loop: ClosedLoop, space: Space, reference: Step) -> Array:
+def _state_before_step(loop: ClosedLoop, space: Space, reference: Reference) -> Array:
     """The loop's state before the step, shape (n_states,); `InputError` where it depends on the gains."""
     first = loop.initial(space.parameters, reference=reference.initial, start=reference.start)
     for share in (0.3, 0.8):
@@ -200,7 +202,7 @@ def _state_before_step(loop: ClosedLoop, space: Space, reference: Step) -> Array
 
 
 def _path_limits(
-    loop: ClosedLoop, space: Space, spec: Specification, system: DiscreteSystem, i: int, reference: Step
+    loop: ClosedLoop, space: Space, spec: Specification, system: DiscreteSystem, i: int, reference: Reference
 ) -> list[Limit]:
     """The path limits of reference i: settling band, overshoot, steady-state error, peak command and clip."""
     t, x, u, p = (ca.SX.sym(k, system.step.size1_in(j)) for k, j in zip("txup", (0, 2, 3, 4), strict=True))
@@ -225,7 +227,7 @@ def _path_limits(
     if spec.concerns(SettlingTime):
         inside, both_ends = error / p[at(BAND_PARAMETER)], (Where.NODES, Where.END)
         found += [path_limit("settling band", inside, -spec.band, spec.band, w, (settled,)) for w in both_ends]
-    beyond = error if reference.is_step else ca.vertcat(error, -error)
+    beyond = error if reference.changes else ca.vertcat(error, -error)
     found += upper_limits(Overshoot, beyond, Where.NODES, both)
     found += upper_limits(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,))
     found += upper_limits(PeakControl, ca.vertcat(control, -control), Where.NODES, both)

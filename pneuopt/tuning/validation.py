@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step, as_steps
+from pneuopt.control.reference import Reference, as_references
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.certificate import Defect, certificate
 from pneuopt.evaluation.expected_plants import ExpectedPlants, PlantAxis
@@ -106,7 +106,7 @@ class DesignValidation(Result):
 
 def validate_design(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     minimise: Objective,
@@ -142,6 +142,7 @@ def validate_design(
     Examples
     --------
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.models.linear import FirstOrder
     >>> from pneuopt.evaluation.requirements import Overshoot, SettlingTime
     >>> from pneuopt.evaluation.scenarios import samples
@@ -160,7 +161,7 @@ def validate_design(
     spec = specify(minimise, subject_to)
     check_closed_loop(loop)
     check_parameters(parameters)
-    steps = as_steps(references)
+    steps = as_references(references)
     loop = add_disturbances(loop, steps)
     full = loop.complete(parameters).select(loop.parameters)
     ends = {f"{a.label} {side}": v for a in expected.axes for side, v in (("low", a.low), ("high", a.high))}
@@ -192,7 +193,7 @@ def validate_design(
 
 
 def _simulate_plants(
-    loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
+    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, spec: Specification, scenarios: Scenarios
 ) -> tuple["pd.DataFrame", list[str]]:
     """The metrics of each case by compiled simulation, a column a case, and the plants that have no rest."""
     import pandas as pd
@@ -211,7 +212,9 @@ def _simulate_plants(
     return found.loc[[n for n in METRICS if n in (*spec.kinds, *LANE_DEFECTS)]], restless
 
 
-def _rests(loop: ClosedLoop, steps: Sequence[Step], parameters: ParameterSet, plant: str, scenarios: Scenarios) -> bool:
+def _rests(
+    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, plant: str, scenarios: Scenarios
+) -> bool:
     """Whether the loop rests, or moves steadily, on a plant before each step."""
     try:
         for step in steps:
@@ -226,7 +229,7 @@ def _certify(
     parameters: ParameterSet,
     spec: Specification,
     scenarios: Scenarios,
-    steps: Sequence[Step],
+    steps: Sequence[Reference],
     worst: Sequence[str],
 ) -> tuple["pd.DataFrame", list[tuple[str, list[str]]]]:
     """The metrics of some cases by the independent simulation, a column a case, and the defects of their plants."""
@@ -243,14 +246,14 @@ def _certify(
     return pd.DataFrame(metrics), defects
 
 
-def _worst_case(by_case: "pd.DataFrame", values: "pd.DataFrame", metric: str, steps: Sequence[Step]) -> str:
+def _worst_case(by_case: "pd.DataFrame", values: "pd.DataFrame", metric: str, steps: Sequence[Reference]) -> str:
     """The case in which a metric is worst."""
     plant = str(values.columns[_rank_order(values.loc[metric].to_numpy(dtype=float), metric)[-1]])
     own = [TuningCase(step, plant).label for step in steps]
     return own[int(_rank_order(by_case.loc[metric, own].to_numpy(dtype=float), metric)[-1])]
 
 
-def _worst_by_plant(by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Step]) -> "pd.DataFrame":
+def _worst_by_plant(by_case: "pd.DataFrame", plants: Sequence[str], steps: Sequence[Reference]) -> "pd.DataFrame":
     """The worst of each plant's metrics over its references, a column a plant; NaN is the worst."""
     import pandas as pd
 

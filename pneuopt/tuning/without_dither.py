@@ -5,7 +5,7 @@ from typing import Any
 
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.evaluation.specification import Objective
 from pneuopt.quantities.arguments import check_parameters
 from pneuopt.quantities.errors import require
@@ -16,7 +16,7 @@ from pneuopt.tuning.tune import tune
 
 def tune_without_dither(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
     minimise: Objective,
@@ -30,7 +30,7 @@ def tune_without_dither(
     Parameters
     ----------
     loop : ClosedLoop
-    references : Step or sequence of Step
+    references : Reference or sequence of Reference
     parameters : ParameterSet
         As given to `tune` for the design with dither; the dither's offset stays free if it is.
     minimise : Requirement, mapping of Requirement to weight, or Specification
@@ -48,6 +48,7 @@ def tune_without_dither(
     --------
     >>> from pneuopt.control.dither import Dither
     >>> from pneuopt.control.pid import PID
+    >>> from pneuopt.control.reference import Step
     >>> from pneuopt.evaluation.requirements import SettlingTime
     >>> from pneuopt.models.linear import FirstOrder
     >>> loop = ClosedLoop(FirstOrder().system(), PID(limits=False), Dither(50.0))

@@ -115,8 +115,8 @@ def find_faults(t: Array, error: Array, step: po.Step, settled: float) -> tuple[
         wrong.append(f"leaves the band at {late:.4g} s, certified {settled:.4g} s")
     if np.abs(error[t > (HORIZONS - 1) * step.horizon]).max() > BAND + SLACK:
         wrong.append("does not stay at the reference")
-    peak = float((error if step.is_step else np.abs(error))[first].max())
-    if peak > (OVERSHOOT if step.is_step else PEAK) + SLACK:
+    peak = float((error if step.changes else np.abs(error))[first].max())
+    if peak > (OVERSHOOT if step.changes else PEAK) + SLACK:
         wrong.append(f"peak {100 * peak:.3g} %")
     within = t[first & (np.abs(error) > BAND)]
     return wrong, abs(within[-1] - settled) / step.horizon if len(within) and np.isfinite(settled) else 0.0

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference, Step, as_references
 from pneuopt.quantities.errors import InputError
 
 
@@ -52,3 +52,15 @@ def test_a_step_between_samples_is_refused_with_the_nearest() -> None:
         Step(1.0, at=0.1049).trajectory(0.01)
     with pytest.raises(InputError, match="spacing 2 s"):
         Step(1.0).trajectory(2.0)
+
+
+def test_a_step_is_a_reference() -> None:
+    step = Step(0.2, at=0.1, initial=0.1)
+    assert isinstance(step, Reference)
+    assert step.with_horizon(2.0) == Step(0.2, at=0.1, initial=0.1, horizon=2.0)
+    assert step.values(np.array([0.0, 0.1, 5.0])).tolist() == [0.1, step.final, step.final]
+
+
+def test_what_is_no_reference_is_refused() -> None:
+    with pytest.raises(InputError, match="references takes a Step or a Move"):
+        as_references([Step(0.1), 0.1])  # type: ignore[list-item]
