@@ -22,6 +22,7 @@ from .control.knocker import Knocker
 from .control.linear_loop import linear_plant, open_loop
 from .control.loop import ClosedLoop
 from .control.motion_feedforward import MotionFeedforward
+from .control.moves import Move, MoveProfile
 from .control.pid import PID, AntiWindup
 from .control.reference import Reference, Step
 from .control.sensor import Encoder, SensorLag
@@ -240,6 +241,8 @@ __all__ = [
     "ModelSelection",
     "MotionDrive",
     "MotionFeedforward",
+    "Move",
+    "MoveProfile",
     "NoiseGain",
     "Normal",
     "Overshoot",

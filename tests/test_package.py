@@ -185,6 +185,8 @@ PUBLIC_NAMES = [
     "record",
     "Racing",
     "read_cases",
+    "Move",
+    "MoveProfile",
     "Recording",
     "Reference",
     "Report",
