@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import tomlkit
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.centre import command_centre
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
@@ -27,6 +27,7 @@ from pneuopt.files.loop import (
     read_loop_sections,
 )
 from pneuopt.files.method import read_method
+from pneuopt.files.references import read_references
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY, bound_units, read_bound
 from pneuopt.files.spreads import read_draw, read_sample_spreads, read_spreads
 from pneuopt.files.toml import (
@@ -41,12 +42,10 @@ from pneuopt.files.toml import (
 from pneuopt.files.tuning_keys import (
     ACCEPT_KEY,
     BUDGET_KEYS,
-    REFERENCE_KEYS,
     SCENARIO_KEYS,
     TUNING_KEYS,
     limit_key,
     objective_key,
-    signal_units,
 )
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Takes
@@ -71,7 +70,7 @@ class Tuning:
     Attributes
     ----------
     loop : ClosedLoop
-    references : tuple of Step
+    references : tuple of Reference
     parameters : ParameterSet
         "pid.*", "dither.*", "sensor.*", "feedforward.*", the compensators'; the free ones within finite bounds.
     specification : Specification
@@ -91,7 +90,7 @@ class Tuning:
     """
 
     loop: ClosedLoop
-    references: tuple[Step, ...]
+    references: tuple[Reference, ...]
     parameters: ParameterSet
     specification: Specification
     scenarios: Callable[[ParameterSet], Scenarios] = lambda _: NO_SCENARIOS
@@ -139,7 +138,7 @@ def read_tuning(path: str | Path, plant: System, parameters: ParameterSet | None
     section = table.get("scenarios", {}), str(path)
     scenarios, validation = (partial(read, *section) for read in (read_scenarios, read_validation_scenarios))
     method = read_method(table.get("method", {}), f"{path}: [method]")
-    references = _references(table, loop, path)
+    references = read_references(table.get("reference", []), loop, path)
     max_steps = _read_budget(table.get("budget", {}), f"{path}: [budget]")
     accept = _read_accept(table.get(ACCEPT_KEY, TUNING_KEYS[ACCEPT_KEY].usual), f"{path}: {ACCEPT_KEY}")
     return Tuning(loop, references, own, spec, scenarios, validation, method, max_steps, accept, centre)
@@ -240,46 +239,6 @@ def _read_accept(words: Any, where: str) -> tuple[Defect, ...]:
     known = TUNING_KEYS[ACCEPT_KEY].choices or {}
     check_names("defect", words, known, where)
     return tuple(known[word] for word in words)
-
-
-def _references(table: TuningSections, loop: ClosedLoop, path: str | Path) -> tuple[Step, ...]:
-    """Read the [[reference]] sections."""
-    entries = table.get("reference", [])
-    several = isinstance(entries, list) and all(isinstance(e, dict) for e in entries)
-    require(several, f"{path}: write each reference as a section of its own, [[reference]]")
-    require(bool(entries), f'{path}: no reference; add [[reference]] with step = "0.2 m/s" and horizon = "1 s"')
-    steps = [_step(e, loop, f"{path}: [[reference]] {k}") for k, e in enumerate(entries, 1)]
-    labels = {s.label for s in steps}
-    require(len(labels) == len(steps), f"{path}: two references step between the same values; tables tell them by that")
-    return tuple(steps)
-
-
-def _step(entry: Mapping[str, Any], loop: ClosedLoop, where: str) -> Step:
-    """Read one [[reference]], in the units of the loop's signals."""
-    unit, outputs = loop.feedback.unit, {q.name: q.unit for q in loop.plant.outputs}
-    signals = signal_units(loop.command.unit, unit)
-    units = {n: key.unit.format_map(signals) for n, key in REFERENCE_KEYS.items() if key.takes is Takes.NUMBER}
-    check_names("key", entry, REFERENCE_KEYS, where)
-    start = entry.get("start", {})
-    require(isinstance(start, dict), f'{where} start: write start = {{ position = "250 mm" }}')
-    check_names("output", start, outputs, f"{where} start")
-    for key in ("horizon",) if "disturbance" in entry else ("step", "horizon"):
-        require(key in entry, f"{where} has no {key}")
-    read = {("size" if k == "step" else k): read_fixed_value(entry, k, units[k], where) for k in units if k in entry}
-    pushed = _disturbance(entry.get("disturbance", {}), loop, f"{where} disturbance")
-    begun = {n: read_fixed_value(start, n, outputs[n], f"{where} start") for n in start}
-    known: dict[str, Any] = {"size": 0.0, **read, "start": begun, "disturbance": pushed}
-    return construct_at(lambda: Step(**known), where)
-
-
-def _disturbance(table: Any, loop: ClosedLoop, where: str) -> dict[str, float]:
-    """Read a disturbance: the changes of parameters and inputs of the plant."""
-    require(isinstance(table, dict), f'{where}: write disturbance = {{ "load.force" = "50 N" }}')
-    flat = {f"{n}.{m}": v for n, e in table.items() if isinstance(e, dict) for m, v in e.items()}
-    flat |= {n: v for n, v in table.items() if not isinstance(v, dict)}
-    units = {q.name: q.unit for q in loop.plant.inputs} | {n: p.unit for n, p in loop.plant.parameters.items()}
-    check_names("parameter or input of the plant", flat, units, where)
-    return {n: read_fixed_value(flat, n, units[n].partition("(")[0], where) for n in flat}
 
 
 def _read_objective(table: TuningSections, path: str | Path) -> dict[Requirement, float]:

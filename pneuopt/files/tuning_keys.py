@@ -12,12 +12,12 @@ from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Waveform
 from pneuopt.control.forms import Form
 from pneuopt.control.pid import AntiWindup
-from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.requirements import SettlingTime, StepEnvelope
 from pneuopt.files.method import METHOD_SECTION
+from pneuopt.files.reference_keys import REFERENCE_KEYS
 from pneuopt.files.requirements import REQUIREMENTS_BY_KEY
 from pneuopt.files.spreads import CORNERS_KEY, SAMPLES_KEY
 from pneuopt.quantities.keys import Key, Takes, choice, first_sentence, flag, table
@@ -74,20 +74,6 @@ LOOP_MEANINGS: Mapping[str, str] = {
     **{section: first_sentence(part) for section, part in COMPENSATORS.items()},
 }
 
-_PUSH = Key("by how much it changes", unit="{own}", example='"50 N"')
-_KNOWN = Key("its value at time 0", unit="{own}", example='"250 mm"')
-REFERENCE_KEYS: Mapping[str, Key] = {
-    "step": Key("height of the step; required without a disturbance", unit="{difference}", example='"0.1 m/s"'),
-    "horizon": Key("end of the experiment", unit="s", required=True, example='"1 s"'),
-    "initial": Key("value before the step", unit="{measured}", usual=Step.initial),
-    "at": Key("when it steps", unit="s", usual=Step.at),
-    "scale": Key(
-        "what fractions are of", unit="{difference}", example='"0.1 m/s"', condition="for a disturbance alone"
-    ),
-    "start": table("what else is known of the plant at time 0", {}, others=_KNOWN, named="output"),
-    "disturbance": table("what changes of the plant at that instant", {}, others=_PUSH, named="parameter or input"),
-}
-
 OBJECTIVE_KEYS: Mapping[str, Key] = {"weight": Key("its share of the objective", usual=1.0)}
 _ENVELOPE = Key("rows of instant, lower and upper bound", Takes.LIST, example='[["0 s", "-10 %", "110 %"]]')
 EXTRA_KEYS: Mapping[str, Mapping[str, Key]] = {
@@ -139,7 +125,7 @@ TUNING_KEYS: Mapping[str, Key] = {
         "defects with which a design is certified all the same", Takes.LIST, choices=_words(Defect), usual=[]
     ),
     **{n: table(LOOP_MEANINGS[n], keys, required=n == "pid") for n, keys in LOOP_KEYS.items()},
-    "reference": table("a step to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
+    "reference": table("a step or a move to follow; one or more", REFERENCE_KEYS, takes=Takes.TABLES, required=True),
     "minimise": table("what shall be small, weighted", {n: objective_key(n) for n in REQUIREMENTS_BY_KEY}),
     "limits": table("what shall be kept", {n: limit_key(n) for n in REQUIREMENTS_BY_KEY}),
     "scenarios": table("other plants and gains for which it shall hold, too", SCENARIO_KEYS),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pneuopt.control.reference import Reference
+from pneuopt.control.reference import Reference, Step
 from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_COLUMNS, ORANGE, axes_grid, finish_columns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+CURVE_POINTS = 500  # of a reference: fewer show corners in its bends, more make figures larger
 DRIVE_SIGNALS = {"valve.spool": ("valve [%]", 100.0), "friction.force": ("friction [{force}]", 1.0)}
 
 
@@ -90,8 +91,7 @@ def _draw_tracking(axes: "Axes", response: Response, band: float) -> None:
         lw=0,
         label=f"± {100 * band:g} % of the step",
     )
-    steps = [reference.initial, reference.initial, reference.final, reference.final]
-    axes.plot([0, reference.at, reference.at, end], steps, color=ORANGE, lw=1.0, label="reference")
+    axes.plot(*_reference_curve(reference, end), color=ORANGE, lw=1.0, label="reference")
     signal, before = run[response.measured], response.before
     if before is not None:
         axes.plot(*_dither_mean(before.t, before[response.measured], response), color=GREY, lw=1.0, label="before")
@@ -103,6 +103,15 @@ def _draw_tracking(axes: "Axes", response: Response, band: float) -> None:
     axes.set_title(f"{reference.initial:g} to {reference.final:g} {unit}", fontsize=9)
     ends = [reference.initial, reference.final]
     _set_view_limits(axes, signal, ends, ends if before is None else before[response.measured])
+
+
+def _reference_curve(reference: Reference, end: float) -> tuple[Array, Array]:
+    """Points of a reference up to the end of its record; a step stands upright."""
+    if isinstance(reference, Step):
+        values = [reference.initial, reference.initial, reference.final, reference.final]
+        return np.array([0, reference.at, reference.at, end]), np.array(values)
+    t = np.linspace(0, end, CURVE_POINTS)
+    return t, reference.values(t)
 
 
 def _draw_signal(axes: "Axes", response: Response, name: str, label: str, factor: float) -> None:

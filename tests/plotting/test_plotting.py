@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+from pneuopt.control.moves import Move
 from pneuopt.control.reference import Step
 from pneuopt.dynamics.system import Linearisation
 from pneuopt.evaluation.margins import margins
@@ -121,6 +122,17 @@ def test_steps_show_band_reference_and_command() -> None:
     assert "3 of 4 steps" in [q.get_text() for q in alone.texts]
     with pytest.raises(InputError, match="no response"):
         plot_steps([])
+
+
+def test_a_move_is_drawn_as_it_runs() -> None:
+    t, move = np.linspace(0, 1, 101), Move(0.2, speed=0.5, acceleration=5.0, dwell=0.5)
+    run = Trajectory(t, {"position": move.values(t - 0.01), "control": np.zeros(101)})
+    figure = plot_steps([Response(run, move, "position", ("m", "V"))])
+    drawn = figure.axes[0].lines[0]
+    assert drawn.get_label() == "reference"
+    x, y = np.asarray(drawn.get_xdata()), np.asarray(drawn.get_ydata())
+    np.testing.assert_allclose(y, move.values(x))
+    assert y[-1] == move.final
 
 
 def test_steps_show_what_goes_on_inside_where_it_is_known() -> None:
