@@ -30,6 +30,7 @@ from .dynamics.python_control import from_control, to_control
 from .dynamics.simulate import StickSlipResult, contacts, simulate, simulate_stick_slip
 from .dynamics.stick_slip import EventKind
 from .dynamics.system import DiscreteSystem, Linearisation, System, define, discretise
+from .evaluation.band import Tolerance
 from .evaluation.certificate import Certificate, certificate
 from .evaluation.compensator_verdict import CompensatorVerdict, judge_compensators
 from .evaluation.defects import Defect, Finding
@@ -294,6 +295,7 @@ __all__ = [
     "Stribeck",
     "System",
     "Thermal",
+    "Tolerance",
     "Tracking",
     "Trajectory",
     "TuningResult",

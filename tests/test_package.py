@@ -187,6 +187,7 @@ PUBLIC_NAMES = [
     "read_cases",
     "Move",
     "MoveProfile",
+    "Tolerance",
     "Recording",
     "Reference",
     "Report",

@@ -11,6 +11,7 @@ import numpy as np
 
 from pneuopt.control.profiles import PlannedMotion, plan_minimum_jerk, plan_s_curve
 from pneuopt.control.reference import describe_circumstances, disturbance_columns, reference_samples
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.trajectories import Trajectory
@@ -159,7 +160,8 @@ class Move:
         Returns
         -------
         Trajectory
-            "reference", "reference_speed", "reference_acceleration", and each disturbance by `disturbance_input`.
+            "reference", its first and second derivative, "reference_speed" and "reference_acceleration", and each
+            disturbance by `disturbance_input`.
 
         Raises
         ------
@@ -172,7 +174,7 @@ class Move:
         [0.0, 0.5, 1.0, 1.0]
         """
         k, first = reference_samples(self, step)
-        names = "reference", "reference_speed", "reference_acceleration"
+        names = "reference", REFERENCE_SPEED, REFERENCE_ACCELERATION
         t: Array = np.asarray(k * step, dtype=np.float64)
         columns = dict(zip(names, self.motion(t), strict=True))
         return Trajectory(t, columns | disturbance_columns(self, k >= first))

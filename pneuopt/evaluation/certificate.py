@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.continuation import continue_response
 from pneuopt.evaluation.counts import describe_counts
@@ -85,7 +86,7 @@ def certificate(
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
-    band: float = 0.02,
+    band: Band = 0.02,
     envelope: Envelope = (),
 ) -> Certificate:
     """Evaluate gains on every case and look for defects; parameters, errors and warnings as for `evaluate`.
@@ -113,15 +114,15 @@ def certificate(
 
 
 def judge_evaluations(
-    evaluations: Sequence[CaseEvaluation], band: float, rest_error: float = 0.0, *, continues: bool = True
+    evaluations: Sequence[CaseEvaluation], band: Band, rest_error: float = 0.0, *, continues: bool = True
 ) -> Certificate:
     """The certificate of gains that have been evaluated on every case.
 
     Parameters
     ----------
     evaluations : sequence of CaseEvaluation
-    band : float
-        Half width of the settling band, a fraction of the step.
+    band : float or Tolerance
+        Half width of the settling band, a fraction of the step or in the measured unit.
     rest_error : float
         Distance from the reference at which the loop may rest outside the band, a fraction of the step.
     continues : bool
@@ -134,7 +135,8 @@ def judge_evaluations(
     findings, notes = [finding for row in margins for finding in _find_instability(row)], list[str]()
     metrics = tabulate_metrics(evaluations)
     for found in evaluations if continues else ():
-        ending = Ending(continue_response(found, band), band, found.case.label)
+        share = band_share(band, found.case.reference)
+        ending = Ending(continue_response(found, share), share, found.case.label)
         findings += find_defects(ending, rest_error)
         notes += describe_ending(ending, found.metrics)
         counts = describe_counts(found.loop, found.parameters, found.case.reference, band)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.dither_verdict import (
     NO_RIVAL,
     VERDICT_TONES,
@@ -64,7 +65,7 @@ def judge_compensators(
     parameters: ParameterSet,
     *,
     without: ParameterSet | None = None,
-    band: float = 0.02,
+    band: Band = 0.02,
 ) -> CompensatorVerdict:
     """Evaluate a loop with its compensators and a rival without them, and say whether they are useful, and why.
 
@@ -96,7 +97,8 @@ def judge_compensators(
     plain = (full if without is None else full | without).select(bare.parameters)
     before, after = (read_endings(one, steps, p, band) for one, p in ((bare, plain), (loop, full)))
     table, hunts = worst_metrics(before, after), any(e.hunts for e in after)
-    usefulness, changes = weigh_changes(table, band, loop, [], hunts=hunts)
+    narrowest = min(band_share(band, r) for r in steps)
+    usefulness, changes = weigh_changes(table, narrowest, loop, [], hunts=hunts)
     notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
     rival = "gains tuned without it"
     if without is None:

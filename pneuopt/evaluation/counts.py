@@ -5,6 +5,7 @@ from math import ceil, floor, log10
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.control.sensor import Encoder
+from pneuopt.evaluation.band import Band, Tolerance, band_share
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.units import write_value
 
@@ -13,7 +14,7 @@ from pneuopt.quantities.units import write_value
 COUNT_TOLERANCE = 1e-9
 
 
-def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, band: float) -> str | None:
+def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Reference, band: Band) -> str | None:
     """Sentence for a settling band narrower than half of what one count changes the reading by; None for others.
 
     A position inside half a count of the reference reads as the reference, inside the band or outside, so that nothing
@@ -25,14 +26,15 @@ def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Refer
     parameters : ParameterSet
         Every parameter of the loop.
     reference : Reference
-    band : float
-        Half width, a fraction of the step.
+    band : float or Tolerance
+        Half width, a fraction of the step or in the measured unit.
     """
     count, size, unit = loop.count_size(parameters), abs(reference.nominal_size), loop.feedback.unit
-    if count / 2 <= band * size * (1 + COUNT_TOLERANCE):
+    half = band_share(band, reference) * size
+    if count / 2 <= half * (1 + COUNT_TOLERANCE):
         return None
-    told = f"the settling band of +-{write_value(band * size, unit, 3)} is narrower than half"
-    change, wider = write_value(count, unit, 3), _wider_band(count / 2 / size)
+    told = f"the settling band of +-{write_value(half, unit, 3)} is narrower than half"
+    change, wider = write_value(count, unit, 3), _wider_band(count / 2, size, band, unit)
     if sees_speed(loop):
         remedy = "a finer encoder or a longer filter of the sensor"
         return f"{told} the {change} by which one count changes the reading; {wider}{remedy}"
@@ -42,11 +44,14 @@ def describe_counts(loop: ClosedLoop, parameters: ParameterSet, reference: Refer
     return f"{told} the encoder's count of {change}, the controller {tells}; {wider}{remedy}"
 
 
-def _wider_band(least: float) -> str:
-    """The words that name a wide enough band, rounded up to three digits; none where no fraction is wide enough."""
+def _wider_band(half: float, size: float, band: Band, measured: str) -> str:
+    """The words that name a wide enough band, rounded up to three digits; none where none is within the step."""
+    measures = isinstance(band, Tolerance)
+    least, most = (half, size) if measures else (half / size, 1.0)
     unit = 10.0 ** (floor(log10(least)) - 2)
     rounded = ceil(least / unit * (1 - COUNT_TOLERANCE)) * unit
-    return f"take band = {rounded:.3g} or more, " if rounded < 1 else "take "
+    shown = write_value(rounded, measured, 3) if measures else f"{rounded:.3g}"
+    return f"take band = {shown} or more, " if rounded < most else "take "
 
 
 def sees_speed(loop: ClosedLoop) -> bool:

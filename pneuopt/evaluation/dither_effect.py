@@ -13,6 +13,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.hooks import Axis, FinalElement, Rest
 from pneuopt.dynamics.system import System, names
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.response import command_range
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
@@ -82,7 +83,7 @@ def dither_effect(
 
 
 def describe_swing(
-    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, band: float
+    loop: ClosedLoop, references: Sequence[Reference], parameters: ParameterSet, band: Band
 ) -> str | None:
     """Sentence for a dither that moves the measured signal out of the settling band; None for others.
 
@@ -92,15 +93,16 @@ def describe_swing(
     references : sequence of Reference
     parameters : ParameterSet
         Values with the dither's amplitude and frequency.
-    band : float
-        Half width of the settling band, a fraction of the step.
+    band : float or Tolerance
+        Half width of the settling band, a fraction of the step or in the measured unit.
     """
     full, step = loop.complete(parameters), min(references, key=lambda r: abs(r.nominal_size))
     if loop.dither_period(full) is None:
         return None
     moves, _ = _operating_points(loop, loop.plant.axis or Axis(), step, None)
     moving = _state_harmonics(loop, loop.plant, full, _try_rest(loop.plant, full, moves))
-    swing, half = abs(moving.get(loop.feedback.name, 0.0)), band * abs(step.nominal_size)
+    share = band_share(band, step)
+    swing, half = abs(moving.get(loop.feedback.name, 0.0)), share * abs(step.nominal_size)
     if swing <= half:
         return None
     signal, command = loop.feedback, loop.command
@@ -108,7 +110,7 @@ def describe_swing(
     swings, allowed = (format_with_prefix(v, signal.unit) for v in (swing, half))
     return (
         f"the given dither of {amplitude:.3g} {command.unit} at {frequency:.4g} Hz swings the {signal.name} by "
-        f"+-{swings}, beyond the settling band of +-{allowed} (+-{100 * band:.3g} % of step {step.label}): only the "
+        f"+-{swings}, beyond the settling band of +-{allowed} (+-{100 * share:.3g} % of step {step.label}): only the "
         f"mean over its period can settle; lower {DITHER_AMPLITUDE}, raise {DITHER_FREQUENCY}, or widen the band"
     )
 

@@ -10,6 +10,7 @@ from pneuopt.control.dither import DITHER_AMPLITUDE
 from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.hooks import Axis
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.dither_effect import DitherEffect, dither_effect, explain_effect, format_with_prefix
 from pneuopt.evaluation.dithered_ending import DitheredEnding, read_ending
 from pneuopt.evaluation.evaluate import evaluate_cases
@@ -118,7 +119,7 @@ def judge_dither(
     parameters: ParameterSet,
     *,
     without: ParameterSet | None = None,
-    band: float = 0.02,
+    band: Band = 0.02,
 ) -> DitherVerdict:
     """Evaluate a loop with its dither and a rival without one, and say whether the dither is useful, and why.
 
@@ -168,8 +169,8 @@ def judge_dither(
     objections = [
         text for step, found in zip(steps, after, strict=True) for text in _object_to_swing(step, found, effect)
     ]
-    hunts = any(e.hunts for e in after)
-    usefulness, changes = weigh_changes(table, band, loop, objections, hunts=hunts)
+    hunts, narrowest = any(e.hunts for e in after), min(band_share(band, r) for r in steps)
+    usefulness, changes = weigh_changes(table, narrowest, loop, objections, hunts=hunts)
     notes = [n for which, endings in (("without", before), ("with", after)) for e in endings for n in e.describe(which)]
     rival = "gains tuned without it"
     if without is None:
@@ -180,7 +181,7 @@ def judge_dither(
 
 
 def read_endings(
-    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, band: float
+    loop: ClosedLoop, steps: Sequence[Reference], parameters: ParameterSet, band: Band
 ) -> list[DitheredEnding]:
     """How a loop's response to each reference ends."""
     return [read_ending(found, band) for found in evaluate_cases(loop, steps, parameters, band=band)]

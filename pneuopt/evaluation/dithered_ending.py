@@ -6,6 +6,7 @@ from math import isfinite
 
 import numpy as np
 
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.continuation import Course, continue_response
 from pneuopt.evaluation.defects import BAND_TOLERANCE, Ending
 from pneuopt.evaluation.dither_mean import FINAL_PERIODS, TAIL_SHARE, period_mean
@@ -61,22 +62,23 @@ class DitheredEnding:
             yield f"{which} it the response is judged until {until}: {self.course.contact}"
 
 
-def read_ending(found: CaseEvaluation, band: float) -> DitheredEnding:
+def read_ending(found: CaseEvaluation, band: Band) -> DitheredEnding:
     """Continue a response until it stands, shows whether it hunts or meets a limit, and read how it ends.
 
     Parameters
     ----------
     found : CaseEvaluation
-    band : float
-        Half width of the settling band, a fraction of the step.
+    band : float or Tolerance
+        Half width of the settling band, a fraction of the step or in the measured unit.
 
     Raises
     ------
     ConvergenceError
         If the simulation stops.
     """
-    course, size = continue_response(found, band), abs(found.case.reference.nominal_size)
-    ending = Ending(course, band, found.case.label)
+    share = band_share(band, found.case.reference)
+    course, size = continue_response(found, share), abs(found.case.reference.nominal_size)
+    ending = Ending(course, share, found.case.label)
     begin, mean = begin_of_end(ending), np.abs(course.error)
     raw = np.abs(course.signal - course.reference.final) / size
     errors = {
@@ -94,7 +96,7 @@ def read_ending(found: CaseEvaluation, band: float) -> DitheredEnding:
         ending.cycle,
         _ripple(course),
         _largest_speed(found),
-        describe_ripple(found.metrics, size, band),
+        describe_ripple(found.metrics, size, share),
     )
 
 

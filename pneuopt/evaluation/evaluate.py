@@ -11,6 +11,7 @@ from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.simulate import MAX_STEPS, simulate
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.budget import POINTS_PER_READING, check_steps
 from pneuopt.evaluation.cases import TuningCase, cases
 from pneuopt.evaluation.limit_cycle import MIN_RELATIVE_AMPLITUDE, TRANSIENT_SHARE, find_limit_cycle
@@ -40,7 +41,7 @@ def evaluate(
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
-    band: float = 0.02,
+    band: Band = 0.02,
     envelope: Envelope = (),
     max_steps: float = MAX_STEPS,
 ) -> "pd.DataFrame":
@@ -59,8 +60,8 @@ def evaluate(
     parameters : ParameterSet
     scenarios : mapping of str to mapping, optional
         Further plants or tolerances, from `corners`, `samples`, `draws` or `tolerances`.
-    band : float
-        Half width of the settling band around the reference, a fraction of the step.
+    band : float or Tolerance
+        Half width of the settling band around the reference, a fraction of the step or in the measured unit.
     envelope : sequence of (float, float, float)
         The bounds of a `StepEnvelope`.
     max_steps : float
@@ -158,7 +159,7 @@ def evaluate_cases(
     parameters: ParameterSet,
     *,
     scenarios: Scenarios = NO_SCENARIOS,
-    band: float = 0.02,
+    band: Band = 0.02,
     envelope: Envelope = (),
 ) -> Iterator[CaseEvaluation]:
     """Evaluate one case after the other; parameters and errors as for `evaluate`."""
@@ -209,7 +210,7 @@ def _respond(loop: ClosedLoop, rig: Rig | None, reference: Reference, parameters
 
 
 def _evaluate_case(
-    loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: ParameterSet, band: float, envelope: Envelope
+    loop: ClosedLoop, rig: Rig | None, case: TuningCase, parameters: ParameterSet, band: Band, envelope: Envelope
 ) -> CaseEvaluation:
     parameters = case.case_parameters(parameters)
     response = _respond(loop, rig, case.reference, parameters)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pneuopt.evaluation.air import AIR_CHANNEL, air_rows
+from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.energy import EnergyUse
 from pneuopt.evaluation.metric import AtLeast, AtMost, Metric, Sense, Source
 from pneuopt.evaluation.metric import Requirement as Requirement  # noqa: PLC0414 - who names a kind reads it here
@@ -47,18 +48,20 @@ class SettlingTime(Requirement):
 
     Parameters
     ----------
-    band : float
-        Half width, as a fraction of the step.
+    band : float or Tolerance
+        Half width, as a fraction of the step, or in the measured unit: ``Tolerance(1e-4)`` is 0.1 mm of a position.
     max : float, optional
         [s]
     """
 
     metric = Metric("SettlingTime", "s", Source.RESPONSE, headline=True, exact=True)
-    band: float = 0.02
+    band: Band = 0.02
     max: float | None = None
 
     def __post_init__(self) -> None:
-        require(0 < self.band < 1, f"SettlingTime: band is a fraction between 0 and 1, got {self.band}; 2 % is 0.02")
+        proper = isinstance(self.band, Tolerance) or 0 < self.band < 1
+        told = f"SettlingTime: band is a fraction between 0 and 1, got {self.band}; 2 % is 0.02"
+        require(proper, f"{told}, 0.1 mm is Tolerance(1e-4)")
         super().__post_init__()
 
 

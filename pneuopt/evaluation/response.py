@@ -6,6 +6,8 @@ import numpy as np
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
+from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.metrics import BandCentre, Envelope, step_metrics
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.trajectories import Trajectory
@@ -25,7 +27,7 @@ def measure(
     parameters: ParameterSet,
     reference: Reference,
     response: Trajectory,
-    band: float,
+    band: Band,
     envelope: Envelope = (),
 ) -> dict[str, float]:
     """Metrics of a simulated response, with the settling band around the reference.
@@ -43,7 +45,7 @@ def measure(
         reference.final,
         reference.initial,
         start=reference.at,
-        band=band,
+        band=band_share(band, reference),
         band_centre=BandCentre.REFERENCE,
         dither_period=loop.dither_period(parameters),
         control=response["control"],
@@ -56,7 +58,9 @@ def measure(
 def loop_inputs(loop: ClosedLoop, reference: Reference, step: float) -> Trajectory:
     """Inputs of the loop under a reference; those that the reference has no column for are zero."""
     run = reference.trajectory(step)
-    columns, none = run.values, np.zeros(len(run))
+    columns, none = dict(run.values), np.zeros(len(run))
+    if loop.sensed_signal.order == 1 and REFERENCE_SPEED in columns:  # the reference is a speed, and this is its rate
+        columns[REFERENCE_ACCELERATION] = columns[REFERENCE_SPEED]
     return Trajectory(run.t, {q.name: columns.get(q.name, none) for q in loop.inputs})
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from types import MappingProxyType
 
+from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
@@ -41,13 +42,14 @@ class Specification:
         The terms of the objective with their weights; empty where a file only describes a loop.
     limits : tuple of Requirement
         At most one of a kind, the tightest.
-    band : float
-        Half width of the settling band, a fraction of the step; 2 % unless a requirement names another.
+    band : float or Tolerance
+        Half width of the settling band, a fraction of the step or in the measured unit; 2 % unless a requirement
+        names another.
     """
 
     weights: Mapping[Requirement, float]
     limits: tuple[Requirement, ...]
-    band: float
+    band: Band
 
     @property
     def envelope(self) -> EnvelopeBounds:
@@ -102,7 +104,7 @@ class Specification:
         """Copy without the limit of this kind."""
         return replace(self, limits=tuple(q for q in self.limits if not isinstance(q, kind)))
 
-    def with_band(self, band: float) -> "Specification":
+    def with_band(self, band: Band) -> "Specification":
         """Copy with another settling band."""
         return replace(self, band=band)
 
@@ -172,7 +174,7 @@ def specify_limits(
     terms = [metric_name(q) for q in weights]
     require(len(set(terms)) == len(terms), f"minimise names a kind of requirement twice: {', '.join(terms)}")
     bands = {q.band for q in (*weights, *subject_to) if isinstance(q, SettlingTime)}
-    require(len(bands) <= 1, f"settling bands differ: {sorted(bands)}; one band holds for the whole tuning")
+    require(len(bands) <= 1, f"settling bands differ: {sorted(bands, key=str)}; one band holds for the whole tuning")
     tubes = {q.bounds for q in (*weights, *subject_to) if isinstance(q, StepEnvelope)}
     require(len(tubes) <= 1, "two StepEnvelopes differ; join them to one")
     for tube in tubes:
@@ -184,14 +186,15 @@ def specify_limits(
     return Specification(weights, tuple(limits.values()), next(iter(bands), 0.02))
 
 
-def _check_envelope(tube: EnvelopeBounds, requirements: Sequence[Requirement], band: float) -> None:
+def _check_envelope(tube: EnvelopeBounds, requirements: Sequence[Requirement], band: Band) -> None:
     """Refuse an envelope that contradicts another requirement, so that no response keeps both."""
     start, (last, low, up) = tube[0], tube[-1]
     allows_start = start[0] > 0 or start[1] <= 0 <= start[2]
     message = f"StepEnvelope: at the step itself the bounds are {start[1]:g} to {start[2]:g}, but the response is at 0"
     require(allows_start, f"{message}; let them include 0 there, or begin later")
     for q in requirements:
-        near = band if isinstance(q, SettlingTime) else q.max if isinstance(q, SteadyStateError) else None
+        share = None if isinstance(band, Tolerance) else band
+        near = share if isinstance(q, SettlingTime) else q.max if isinstance(q, SteadyStateError) else None
         other = f"{metric_name(q)} asks for 1 to within {near}"
         message = f"StepEnvelope: from {last:g} s on the bounds are {low:g} to {up:g}, {other}"
         require(near is None or (low <= 1 + near and up >= 1 - near), f"{message}; move the bounds, or leave one out")

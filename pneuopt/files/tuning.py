@@ -14,6 +14,7 @@ from pneuopt.control.reference import Reference
 from pneuopt.dynamics.centre import command_centre
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.dynamics.system import System
+from pneuopt.evaluation.band import Band, Tolerance
 from pneuopt.evaluation.certificate import Defect
 from pneuopt.evaluation.expected_plants import PLANT_COUNT
 from pneuopt.evaluation.metric import Requirement
@@ -47,7 +48,7 @@ from pneuopt.files.tuning_keys import (
     limit_key,
     objective_key,
 )
-from pneuopt.quantities.errors import InputError, check_names, require
+from pneuopt.quantities.errors import InputError, UnitError, check_names, require
 from pneuopt.quantities.keys import Takes
 from pneuopt.quantities.output import plain_value, write_text
 from pneuopt.quantities.parameters import ParameterSet
@@ -133,7 +134,7 @@ def read_tuning(path: str | Path, plant: System, parameters: ParameterSet | None
     require("pid" in table, f"{path}: no controller; add a section [pid]")
     centre = command_centre(plant, parameters or plant.parameters)
     loop, own = read_loop_sections(table, plant, path, centre)
-    weights, limits = _read_objective(table, path), _read_requirements(table, loop, path)
+    weights, limits = _read_objective(table, loop, path), _read_requirements(table, loop, path)
     spec = construct_at(lambda: specify_limits(limits, weights), f"{path}: [minimise] and [limits]")
     section = table.get("scenarios", {}), str(path)
     scenarios, validation = (partial(read, *section) for read in (read_scenarios, read_validation_scenarios))
@@ -241,7 +242,7 @@ def _read_accept(words: Any, where: str) -> tuple[Defect, ...]:
     return tuple(known[word] for word in words)
 
 
-def _read_objective(table: TuningSections, path: str | Path) -> dict[Requirement, float]:
+def _read_objective(table: TuningSections, loop: ClosedLoop, path: str | Path) -> dict[Requirement, float]:
     """Read [minimise]: requirements and their weights."""
     where = f"{path}: [minimise]"
     check_names("requirement", table.get("minimise", {}), REQUIREMENTS_BY_KEY, where)
@@ -253,7 +254,8 @@ def _read_objective(table: TuningSections, path: str | Path) -> dict[Requirement
         check_names("key", entry, keys, spot)
         weight = read_fixed_value(entry, "weight", "1", spot) if "weight" in entry else keys["weight"].usual
         require(0 < weight < float("inf"), f"{spot}: weight must be positive, got {weight:g}")
-        weights[_make_requirement(key, entry, {"max": None} if key == "step_envelope" else {}, spot)] = weight
+        limit = {"max": None} if key == "step_envelope" else {}
+        weights[_make_requirement(key, entry, limit, loop.feedback.unit, spot)] = weight
     return weights
 
 
@@ -270,18 +272,32 @@ def _read_requirements(table: TuningSections, loop: ClosedLoop, path: str | Path
         require(bound in entry or key == "step_envelope", f"{spot} has no {bound}")
         at = f"{spot} {bound}" if entry is given else spot
         limit = {bound: read_bound(key, entry[bound], units[key], at)} if bound in entry else {}
-        found.append(_make_requirement(key, entry, limit, spot))
+        found.append(_make_requirement(key, entry, limit, loop.feedback.unit, spot))
     return tuple(found)
 
 
-def _make_requirement(key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], where: str) -> Requirement:
+def _make_requirement(
+    key: str, entry: Mapping[str, Any], limit: Mapping[str, float | None], measured: str, where: str
+) -> Requirement:
     """Make the requirement of a key, with its limit, and with its band or bounds where it has them."""
     own: dict[str, Any] = dict(limit)
     if key == "step_envelope":
         own["bounds"] = _read_envelope(entry.get("bounds"), f"{where} bounds")
     elif "band" in entry:
-        own["band"] = read_fixed_value(entry, "band", "1", where)
+        own["band"] = _read_band(entry, measured, where)
     return construct_at(lambda: REQUIREMENTS_BY_KEY[key](**own), where)
+
+
+def _read_band(entry: Mapping[str, Any], measured: str, where: str) -> Band:
+    """Read a settling band: a fraction of the step, or a half width in the measured unit."""
+    try:
+        return read_fixed_value(entry, "band", "1", where)
+    except UnitError:
+        width = measured.partition("(")[0]
+    try:
+        return construct_at(lambda: Tolerance(read_fixed_value(entry, "band", width, where)), where)
+    except UnitError as error:
+        raise UnitError(f'{error}, or as a fraction of the step, band = "2 %"') from None
 
 
 def _read_envelope(table: Any, where: str) -> EnvelopeBounds:

@@ -77,7 +77,9 @@ LOOP_MEANINGS: Mapping[str, str] = {
 OBJECTIVE_KEYS: Mapping[str, Key] = {"weight": Key("its share of the objective", usual=1.0)}
 _ENVELOPE = Key("rows of instant, lower and upper bound", Takes.LIST, example='[["0 s", "-10 %", "110 %"]]')
 EXTRA_KEYS: Mapping[str, Mapping[str, Key]] = {
-    "settling_time": {"band": Key("half width of the band, a fraction of the step", usual=SettlingTime.band)},
+    "settling_time": {
+        "band": Key('half width of the band, a fraction of the step or as "0.1 mm"', usual=SettlingTime.band)
+    },
     "step_envelope": {"bounds": _ENVELOPE},
 }
 """The keys of some requirements beside their limit and weight."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pneuopt.control.reference import Reference, Step
+from pneuopt.evaluation.band import Band, band_share, describe_band
 from pneuopt.plotting.canvas import BLUE, GREY, MAX_PLOT_COLUMNS, ORANGE, axes_grid, finish_columns
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import require
@@ -51,7 +52,7 @@ class Response:
     force_unit: str = "N"
 
 
-def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure":
+def plot_steps(responses: Sequence[Response], *, band: Band = 0.02) -> "Figure":
     """Step responses: signal, reference and band, command, valve and friction below each other.
 
     Parameters
@@ -78,9 +79,9 @@ def plot_steps(responses: Sequence[Response], *, band: float = 0.02) -> "Figure"
     return finish_columns(figure, grid, len(responses), "steps")
 
 
-def _draw_tracking(axes: "Axes", response: Response, band: float) -> None:
+def _draw_tracking(axes: "Axes", response: Response, band: Band) -> None:
     run, reference, unit = response.run, response.reference, response.units[0]
-    width = band * abs(reference.nominal_size)
+    width = band_share(band, reference) * abs(reference.nominal_size)
     end = float(run.t[-1])
     axes.fill_between(
         [reference.at, end],
@@ -89,7 +90,7 @@ def _draw_tracking(axes: "Axes", response: Response, band: float) -> None:
         color=ORANGE,
         alpha=0.2,
         lw=0,
-        label=f"± {100 * band:g} % of the step",
+        label=f"± {describe_band(band, unit)}",
     )
     axes.plot(*_reference_curve(reference, end), color=ORANGE, lw=1.0, label="reference")
     signal, before = run[response.measured], response.before

@@ -1,5 +1,5 @@
 // The part of a page that moves: sliders set parameters, the loop is integrated at once, and redrawn.
-// Uses LOOP, makeLoop and simulateLoop of the loop, findRest, and DATA: values, sliders, references, limits, band, units.
+// Uses LOOP, makeLoop and simulateLoop of the loop, findRest, and DATA: values, sliders, references (each with its band), limits, units.
 const POINTS = 600; // instants of a response: fewer show corners, more cost time in a frame
 const AGREEMENT = 0.02; // share by which a figure of the design may differ from its certificate and count as the same
 const LEAST = { SettlingTime: 2e-3, Overshoot: 0.1, PeakControl: 0 }; // the same near zero, in the figures' units
@@ -55,7 +55,7 @@ function readMetrics(run, p, reference) {
     if (t[i] < reference.at) continue;
     const off = (y[i] - reference.final) / size;
     over = Math.max(over, reference.isStep ? off : Math.abs(off));
-    if (Math.abs(off) > DATA.band) settled = i + 1 < y.length ? t[i + 1] : Infinity;
+    if (Math.abs(off) > reference.band) settled = i + 1 < y.length ? t[i + 1] : Infinity;
   }
   const peak = control.reduce((most, v) => Math.max(most, Math.abs(v)), 0);
   return { SettlingTime: settled - reference.at, Overshoot: 100 * over, PeakControl: peak };
@@ -174,7 +174,7 @@ function startPage() {
     const pair = (of, get, unit) => (of ? [{ x: of.t, y: get(of), colour: unit }] : []);
     const signal = (r) => r.outputs[DATA.measured];
     const control = (r) => r.outputs[r.outputs.length - 1];
-    const size = DATA.band * Math.abs(reference.size);
+    const size = reference.band * Math.abs(reference.size);
     const wanted = { x: [0, reference.at, reference.at, reference.horizon], colour: COLOURS.wanted, width: 1 };
     wanted.y = [reference.initial, reference.initial, reference.final, reference.final];
     const both = (get) => [...pair(first, get, COLOURS.was), ...pair(run, get, COLOURS.now)];

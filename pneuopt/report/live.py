@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, Step, disturbance_input
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.report import relevant_units
 from pneuopt.export.javascript import write_loop_javascript
 from pneuopt.models.load import GRAVITY
@@ -43,7 +44,7 @@ def live_script(
     references: Sequence[Reference],
     parameters: ParameterSet,
     *,
-    band: float = 0.02,
+    band: Band = 0.02,
     limits: Mapping[str, float] | None = None,
     certified: "pd.DataFrame | None" = None,
 ) -> str:
@@ -83,12 +84,12 @@ def live_script(
         "values": loop.parameter_vector(parameters).tolist(),
         "sliders": sliders,
         "references": [
-            _reference(r, places, loop.feedback.unit) | {"x0": x0, "rest": rest, "certified": _figures(certified, k)}
+            _reference(r, places, loop.feedback.unit)
+            | {"x0": x0, "rest": rest, "band": band_share(band, r), "certified": _figures(certified, k)}
             for (k, r), x0, rest in zip(steps.items(), starts, rests, strict=True)
         ],
         "limits": {n: limit for n, limit in (limits or {}).items() if n in LIVE_METRICS},
         "units": {n: units.get(n, "") for n in LIVE_METRICS},
-        "band": band,
         "measured": [q.name for q in loop.outputs].index(loop.feedback.name),
         "labels": [f"{q.name} [{q.unit}]" for q in (loop.feedback, loop.outputs[-1])],
         "controller": list(loop.tunable_sections),

@@ -10,6 +10,7 @@ from pneuopt.control.disturbance import add_disturbances
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.system import Linearisation
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.evaluate import respond
 from pneuopt.evaluation.operating_points import worst_open_loop
 from pneuopt.plotting import Response, friction_force, has_friction_map, plot_bode, plot_loop, plot_steps
@@ -42,7 +43,7 @@ def loop_figures(
     parameters: ParameterSet,
     before: ParameterSet | None = None,
     *,
-    band: float = 0.02,
+    band: Band = 0.02,
 ) -> dict[str, "Figure"]:
     """The steps, "", and the Bode plot, "bode", at the first one's operating point with the largest sensitivity.
 

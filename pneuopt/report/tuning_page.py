@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.certificate import Certificate
 from pneuopt.evaluation.report import metric_cell, report_metrics, report_notes
 from pneuopt.evaluation.requirements import larger_is_better
@@ -64,7 +65,7 @@ class LoopView:
     references: Sequence[Reference]
     parameters: ParameterSet
     before: ParameterSet | None = None
-    band: float = 0.02
+    band: Band = 0.02
 
     def figures(self) -> dict[str, "Figure"]:
         """The steps and the Bode plot, see `loop_figures`."""

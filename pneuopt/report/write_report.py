@@ -7,6 +7,7 @@ from pathlib import Path
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.runnable import HasSystem
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.certificate import Certificate
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.tracking import Tracking
@@ -38,7 +39,7 @@ def write_report(
     held_out: Experiment | Sequence[Experiment] = (),
     references: Reference | Sequence[Reference] = (),
     parameters: ParameterSet | None = None,
-    band: float = 0.02,
+    band: Band = 0.02,
 ) -> None:
     """Write a result as one page of HTML that needs no network: verdict first, figures where they belong, hashes.
 
@@ -105,7 +106,7 @@ def write_report(
 
 
 def _view(
-    model: object, steps: Sequence[Reference], parameters: ParameterSet | None, before: ParameterSet | None, band: float
+    model: object, steps: Sequence[Reference], parameters: ParameterSet | None, before: ParameterSet | None, band: Band
 ) -> LoopView | None:
     """What a loop's figures are drawn from; None without a loop."""
     if model is None or parameters is None:

@@ -21,6 +21,7 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.compiled.rollout import processor_count
 from pneuopt.dynamics.runnable import check_smooth
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.meter import check_channels
 from pneuopt.evaluation.metric import Source
@@ -104,7 +105,7 @@ def evaluate_batch(
     cases: Mapping[str, Mapping[str, float]],
     *,
     metrics: Sequence[str] = BATCH_METRICS,
-    band: float = 0.02,
+    band: Band = 0.02,
     recertify: float = 0.01,
     tolerance: float = USUAL_TOLERANCE,
     seed: int = 0,
@@ -270,7 +271,7 @@ def _certify(
     parameters: ParameterSet,
     cases: Mapping[str, Mapping[str, float]],
     table: "pd.DataFrame",
-    limits: tuple[float, float],
+    limits: tuple[Band, float],
     compute: "Callable[..., pd.DataFrame]",
 ) -> "pd.DataFrame":
     """Hold the lanes' figures of some cases to the independent simulation's."""

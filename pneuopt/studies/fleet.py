@@ -9,6 +9,7 @@ import numpy as np
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Pieces, Rollout
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.meter import needed_channels
 from pneuopt.quantities.arrays import Array, Indices, Mask
@@ -39,7 +40,7 @@ class Fleet:
         parameters: ParameterSet,
         cases: Mapping[str, Mapping[str, float]],
         metrics: Sequence[str],
-        band: float,
+        band: Band,
     ) -> None:
         self.loop, self.metrics, self.band = loop, tuple(metrics), band
         self._full = loop.complete(parameters).select(loop.parameters)

@@ -17,6 +17,7 @@ from pneuopt.control.loop import ClosedLoop, check_closed_loop
 from pneuopt.control.reference import Reference, as_references
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runnable import check_smooth
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.meter import needed_channels
 from pneuopt.evaluation.scenarios import SampleSpreads, axis_labels, values_at
 from pneuopt.quantities.arguments import check_parameters
@@ -86,7 +87,7 @@ def local_sensitivity(
     spreads: SampleSpreads,
     *,
     metrics: Sequence[str] = LOCAL_METRICS,
-    band: float = 0.02,
+    band: Band = 0.02,
 ) -> LocalSensitivity:
     """Derivatives of a design's figures to the tolerances, times these, from one simulation with its sensitivities.
 

@@ -11,6 +11,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Reference
 from pneuopt.control.rest import find_rest, set_sliding_direction
+from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.cases import TuningCase
 from pneuopt.evaluation.counts import describe_counts, sees_speed
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
@@ -105,7 +106,8 @@ def _check_counts(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specif
 def _check_hold(loop: ClosedLoop, case: TuningCase, space: Space, spec: Specification) -> None:
     """Check that a command within the limits holds the reference to within the settling band."""
     reference = case.reference
-    target = reference.final - spec.band * reference.size  # the size is 0 for a disturbance alone
+    room = band_share(spec.band, reference) * reference.size  # 0 for a disturbance alone
+    target = reference.final - room
 
     def find_obstacle(share: float) -> str:
         """The reason why a part of the reference cannot be held; empty where it can."""

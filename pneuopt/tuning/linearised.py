@@ -13,6 +13,7 @@ import numpy as np
 from pneuopt.control.compensation import acting_always
 from pneuopt.control.dither import DITHER_AMPLITUDE, DITHER_FREQUENCY
 from pneuopt.dynamics.compiled.rollout import Rollout, RolloutResult
+from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.metrics import MIN_SETTLED_PERIODS
 from pneuopt.evaluation.requirements import (
@@ -106,6 +107,9 @@ class LinearisedProblem:
         self._wrt = [self._order.index(n) for n in self._space.names]
         self._cases = [np.flatnonzero(own) for own in simulator.cases_by_grid()]
         self._periods = simulator.dither_periods()
+        shares = [band_share(spec.band, grid.reference) for grid in simulator.grids]
+        self._band = min(shares)  # the error is counted so that it is every reference's
+        self._error_units = [self._band / share for share in shares]
         self.horizon = min(g.reference.horizon - g.reference.at for g in simulator.grids)
         self._strides = [max(1, (len(g.t) - g.step_index) // nodes) for g in simulator.grids]
         longest = max(self._periods, default=0.0)
@@ -139,8 +143,8 @@ class LinearisedProblem:
             after = np.maximum.accumulate(size.max(axis=0)[::-1])[::-1]
             k = np.searchsorted(t, times)
             late = np.maximum(late, np.append(after, 0.0)[k])
-            crossings = np.maximum(crossings, np.append(_band_entry_times(t, size, self._spec.band), np.inf)[k])
-        excess = np.maximum(late - self._spec.band, 0.0)
+            crossings = np.maximum(crossings, np.append(_band_entry_times(t, size, self._band), np.inf)[k])
+        excess = np.maximum(late - self._band, 0.0)
         times = np.where(excess == 0, np.minimum(crossings, times), times)
         costs = np.where(
             times <= self.bounds[-1, 1] * self.horizon, weight * times + self._band_weight * excess, np.inf
@@ -152,7 +156,7 @@ class LinearisedProblem:
     @cached_property
     def _band_weight(self) -> float:
         """The penalty of leaving the settling band by the whole step."""
-        return self._scale * max(PROGRAM_BAND_PENALTY, 1 / self._spec.band)
+        return self._scale * max(PROGRAM_BAND_PENALTY, 1 / self._band)
 
     @cached_property
     def _groups(self) -> tuple[list[tuple[type, float, bool]], RowGroups]:
@@ -203,7 +207,7 @@ class LinearisedProblem:
             by_time = step / (t[k + 1] - t[k]) * (1 - late) * self.horizon
         by_gain = reading.by_gain[:, k] * (1 - share)[:, None] + reading.by_gain[:, k + 1] * share[:, None]
         slopes = np.concatenate([by_gain, by_time[..., None]], axis=-1)
-        return np.array([error, -error]) - self._spec.band, np.array([slopes, -slopes])
+        return np.array([error, -error]) - self._band, np.array([slopes, -slopes])
 
     def _read(self, unit: Array) -> list[list[LinearisedResponse]]:
         """Simulate points; the linearised response of each point to each reference."""
@@ -243,7 +247,7 @@ class LinearisedProblem:
             self._spec.envelope,
             self._simulator.meter_channels,
         )
-        error, by_gain = lanes.record.error
+        error, by_gain = (self._error_units[g] * a for a in lanes.record.error)
         rows_of: dict[type, tuple[Array, Array]] = {
             kind: kind.metric.slope(lanes.record)
             for kind in ROW_REQUIREMENTS

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pneuopt.dynamics.compiled.race import RACE_VALUES, RaceCourse, RaceField, RaceMerit, race
+from pneuopt.evaluation.band import Band, band_number, band_unit
 from pneuopt.evaluation.requirements import (
     REQUIREMENT_KINDS,
     ROBUSTNESS_REQUIREMENTS,
@@ -65,7 +66,7 @@ class Race:
         """Let races see so much of each response after the step only [s]."""
         self._simulator = self._whole if duration == np.inf else self._whole.cut(duration)
         self.is_cut = any(len(a.t) < len(b.t) for a, b in zip(self._simulator.grids, self._whole.grids, strict=True))
-        self._course = _course(self._simulator)
+        self._course = _course(self._simulator, self._spec.band)
 
     def merits(self, points: Array, rivals: Array | None = None) -> tuple[Array, Indices]:
         """The merit of each point on every case and on the whole response, and its worst case, shapes (m,).
@@ -176,13 +177,13 @@ def may_be_cut(spec: Specification) -> bool:
     )
 
 
-def _course(simulator: Simulator) -> RaceCourse:
+def _course(simulator: Simulator, band: Band) -> RaceCourse:
     """The cases of a simulator, as a race in machine code takes them."""
     grids = simulator.grids
     n, grid = max(len(g.t) for g in grids), np.array([simulator.grid_of(k) for k in range(len(simulator.cases))])
     u, t, h = (np.array(arrays) for arrays in zip(*(g.pad(n) for g in grids), strict=True))
     settings = [
-        (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.changes))
+        (r.final, r.nominal_size, r.initial, g.spacing, g.t[g.step_index] - r.at, float(r.changes), band_unit(band, r))
         for g, r in ((g, g.reference) for g in grids)
     ]
     length, first = np.array([[len(g.t), g.step_index] for g in grids]).T
@@ -191,7 +192,9 @@ def _course(simulator: Simulator) -> RaceCourse:
     )
 
 
-def _merit_bounds(spec: Specification, bands: Sequence[float]) -> RaceMerit:
+def _merit_bounds(spec: Specification, bands: Sequence[Band]) -> RaceMerit:
     kinds = [next(kind for kind in REQUIREMENT_KINDS if kind.metric.name == n) for n in RACE_VALUES]
     weights, limits = np.array([[spec.weight(kind), spec.limit(kind)] for kind in kinds]).T
-    return RaceMerit(np.array(bands), weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL)
+    return RaceMerit(
+        np.array([band_number(band) for band in bands]), weights, limits, WORST_MERIT, VIOLATION_PENALTY, RUNAWAY_LEVEL
+    )

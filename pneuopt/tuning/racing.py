@@ -13,6 +13,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from pneuopt.evaluation.band import band_share
 from pneuopt.evaluation.requirements import SettlingTime
 from pneuopt.evaluation.specification import Specification
 from pneuopt.quantities.arrays import Array, Indices
@@ -205,7 +206,8 @@ def run_racing(
 def _phases(simulator: Simulator, spec: Specification, method: Racing, share: float) -> Iterator[_Phase]:
     """The phases of a start on coarse samples; wider bands only where a settling time is asked for."""
     trials = share * method.trials * len(simulator.space.names)
-    wider = [spec.band * b for b in sorted(method.bands) if spec.band * b < 1] if spec.concerns(SettlingTime) else []
+    widest = max(band_share(spec.band, grid.reference) for grid in simulator.grids)
+    wider = [spec.band * b for b in sorted(method.bands) if widest * b < 1] if spec.concerns(SettlingTime) else []
     stages = [bands for bands in (wider, wider[:1]) if bands]
     for bands, part in zip(stages, BAND_SHARES, strict=False):
         yield _Phase("wide bands", simulator.coarse(spec, bands), round(part * trials))

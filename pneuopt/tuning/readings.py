@@ -12,6 +12,7 @@ from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Pieces
 from pneuopt.dynamics.runge_kutta import rk4
 from pneuopt.dynamics.system import names
+from pneuopt.evaluation.band import Band, band_share
 from pneuopt.evaluation.dither_mean import DitherPeriodMean
 from pneuopt.evaluation.meter import meter_outputs
 from pneuopt.evaluation.metrics import BandCentre, Envelope, batch_metrics
@@ -131,7 +132,7 @@ def has_integral(loop: ClosedLoop) -> bool:
 def read_metrics(
     grid: ReferenceGrid,
     y: Array,
-    bands: Sequence[float],
+    bands: Sequence[Band],
     period: float | None,
     only: Collection[str],
     envelope: Envelope,
@@ -144,8 +145,8 @@ def read_metrics(
     grid : ReferenceGrid
     y : ndarray, shape (m, n, n_outputs)
         The outputs of `loop_pieces`.
-    bands : sequence of float
-        Settling bands, fractions of the step. Over several SettlingTime is the mean; a response that does not settle
+    bands : sequence of float or Tolerance
+        Settling bands. Over several SettlingTime is the mean; a response that does not settle
         counts as `penalty_settling_time`.
     period : float or None
         The time over which the signal is averaged [s].
@@ -176,8 +177,9 @@ def read_metrics(
     settings["scale"] = None if reference.changes else reference.nominal_size
     given = (grid.t, signal, reference.final, reference.initial)
     settings["control"], meter = y[:, :, CONTROL_OUTPUT], meter_values(y, channels)
-    settings["wider"] = bands[1:]
-    found = batch_metrics(*given, band=bands[0], envelope=envelope, only=only, meter=meter, **settings)
+    shares = [band_share(band, reference) for band in bands]
+    settings["wider"] = shares[1:]
+    found = batch_metrics(*given, band=shares[0], envelope=envelope, only=only, meter=meter, **settings)
     if len(bands) > 1:
         times = np.column_stack([found["SettlingTime"], found["SettlingTimes"]])
         most = penalty_settling_time(reference.horizon - reference.at, excess)[:, None]

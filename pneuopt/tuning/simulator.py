@@ -10,6 +10,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference
 from pneuopt.dynamics.compiled.rollout import Rollout
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.batch_margins import MarginFunction, batch_margin_function
 from pneuopt.evaluation.cases import cases
 from pneuopt.evaluation.margins import lowest_noise_frequency
@@ -92,7 +93,7 @@ class Simulator:
         self.response_metrics = tuple(dict.fromkeys((*BASE_METRICS, *(k for k in kinds if k not in linearised))))
         self.margin_metrics = tuple(dict.fromkeys((*BASE_MARGINS, *(k for k in kinds if k in linearised))))
         self._envelope = spec.envelope if spec else ()
-        self._wider: tuple[float, ...] = ()
+        self._wider: tuple[Band, ...] = ()
         self._is_refined = False
         self.cases = cases(references, scenarios, space.parameters, space.names)
         self.loop, self.space = loop, space
@@ -107,7 +108,7 @@ class Simulator:
         self.robustness = self._margin_function(references)  # about `operating_points`
         self._find_points = PointFinder(loop, self.rollout, self._rate)
 
-    def coarse(self, spec: Specification, bands: Sequence[float] = ()) -> "Simulator":
+    def coarse(self, spec: Specification, bands: Sequence[Band] = ()) -> "Simulator":
         """A copy for use during a search, with half as many samples, which reads only what `spec` asks for.
 
         With `bands` SettlingTime is the mean over those and the band asked for; a response that does not settle counts
@@ -125,7 +126,7 @@ class Simulator:
         part.substeps = [rk4_substeps(self._rate, grid.spacing) for grid in part.grids]
         return part
 
-    def bands(self, band: float) -> tuple[float, ...]:
+    def bands(self, band: Band) -> tuple[Band, ...]:
         """The settling bands over which SettlingTime is averaged."""
         return (band, *self._wider)
 
@@ -179,14 +180,13 @@ class Simulator:
         rates = [float(case.case_vectors(given, order)[0, order.index("dither.frequency")]) for case in self.cases]
         return [dither.period(rate, self.loop.pid.sample_time) for rate in rates]
 
-    def respond(self, points: Array, band: float, lanes: Mask | None = None) -> Responses:
+    def respond(self, points: Array, band: Band, lanes: Mask | None = None) -> Responses:
         """Simulate candidates.
 
         Parameters
         ----------
         points : ndarray, shape (m, n)
-        band : float
-            Half width of the settling band, a fraction of the step.
+        band : float or Tolerance
         lanes : ndarray of bool, shape (m, n_cases), optional
             Which cases of which candidate; by default all.
         """
@@ -299,7 +299,7 @@ class Simulator:
             own = np.flatnonzero(self._grid_of[case] == g)
             yield from np.split(own, np.arange(MAX_CHUNK_LANES, len(own), MAX_CHUNK_LANES))
 
-    def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: float) -> None:
+    def _measure(self, out: LaneMetrics, chunk: Indices, case: Indices, starts: Array, p: Array, band: Band) -> None:
         """Simulate the lanes `chunk` and fill their rows of `out`."""
         if not len(chunk):
             return
@@ -309,7 +309,7 @@ class Simulator:
         assert found.x is not None
         self._read(out, chunk, case, p, (found.x, found.y, found.x_end), band)
 
-    def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: float) -> Responses:
+    def read(self, p: Array, case: Indices, run: LaneRun, shape: tuple[int, int], band: Band) -> Responses:
         """The responses of candidates on every case, of which the outputs and end states are known.
 
         Parameters
@@ -320,14 +320,14 @@ class Simulator:
             States at every `KEPT_STATES`-th sample, outputs and end states.
         shape : tuple of int
             m and n_cases.
-        band : float
+        band : float or Tolerance
         """
         measured = LaneMetrics.empty(len(p), self._longest, run[0].shape[2], self.response_metrics)
         for chunk in self._chunks(case):
             self._read(measured, chunk, case[chunk], p[chunk], (run[0][chunk], run[1][chunk], run[2][chunk]), band)
         return Responses(np.ones(shape, dtype=bool), p, measured, MarginReader(self.margin_metrics, self._read_margins))
 
-    def _read(self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: LaneRun, band: float) -> None:
+    def _read(self, out: LaneMetrics, chunk: Indices, case: Indices, p: Array, run: LaneRun, band: Band) -> None:
         """Fill the rows `chunk` of `out` from states, outputs and end states."""
         states, outputs, ends = run
         out.passage.states[chunk, : states.shape[1]], out.passage.ends[chunk] = states, ends

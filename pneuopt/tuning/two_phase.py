@@ -13,6 +13,7 @@ from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, Step
 from pneuopt.dynamics.runge_kutta import RK4_MAX_H_LAMBDA
+from pneuopt.evaluation.band import Tolerance, band_number
 from pneuopt.evaluation.margins import margins
 from pneuopt.evaluation.requirements import METRICS, MaxSensitivity, PeakControl, metric_name, upper_limit
 from pneuopt.evaluation.specification import Specification
@@ -98,6 +99,8 @@ class TwoPhase:
         message = "TwoPhase needs a linear loop with a continuous controller, and this one is not; use method=Racing()"
         require(is_linear(task.loop), message)
         require(are_steps(task.references), "TwoPhase tunes for steps, not for moves; use method=Racing()")
+        fraction = not isinstance(task.spec.band, Tolerance)
+        require(fraction, "TwoPhase takes a settling band as a fraction of the step; use method=Racing()")
         require(not task.scenarios, "TwoPhase tunes for one plant, not for scenarios; leave method= out")
         inexact = _inexact_requirements(task.spec)
         require(not inexact, f"TwoPhase has no equation for {', '.join(inexact)}; use method=Racing()")
@@ -106,7 +109,7 @@ class TwoPhase:
         """Whether the loop is linear, not clipped, on one plant and asked for steps and what has an equation."""
         clip = clip_level(task.loop, task.space.parameters)
         clipped = clip < math.inf and not task.spec.limit(PeakControl) < clip  # designs that saturate are as welcome
-        steps = are_steps(task.references) and not task.scenarios
+        steps = are_steps(task.references) and not task.scenarios and not isinstance(task.spec.band, Tolerance)
         can = is_linear(task.loop) and steps and not clipped and not _inexact_requirements(task.spec)
         return can and has_few_steps(task.loop, task.references, task.space, self)
 
@@ -271,7 +274,7 @@ class TwoPhasePath:
         gains = dict(zip(self.names, start.tolist(), strict=True))
         path = [
             {metric_name(q): upper_limit(q) for q in spec.limits if metric_name(q) in parameters}
-            | {BAND_PARAMETER: spec.band / self.band}
+            | {BAND_PARAMETER: band_number(spec.band) / self.band}
             for spec in specs
         ]
         return follow_path(self.problem, parameters.with_values(gains), path)
@@ -282,7 +285,8 @@ def two_phase_path(
 ) -> TwoPhasePath:
     """Prepare a problem whose limits and settling band are going to move; `spec` is already tightened."""
     transcription = transcribe_two_phase(loop, references, space, spec, method.nodes)
-    return TwoPhasePath(prepare_full_space(transcription, method.solver, warm_start=True), space.names, spec.band)
+    problem = prepare_full_space(transcription, method.solver, warm_start=True)
+    return TwoPhasePath(problem, space.names, band_number(spec.band))
 
 
 def _objective_value(solution: Solution) -> float:

@@ -17,6 +17,7 @@ from pneuopt.control.linear_loop import open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, disturbance_input
 from pneuopt.dynamics.system import DiscreteSystem, System, discretise, names
+from pneuopt.evaluation.band import band_number
 from pneuopt.evaluation.dither_mean import TAIL_SHARE
 from pneuopt.evaluation.margins import frequency_grid, sensitivity_terms
 from pneuopt.evaluation.requirements import (
@@ -225,8 +226,9 @@ def _path_limits(
 
     found = []
     if spec.concerns(SettlingTime):
+        width = band_number(spec.band)
         inside, both_ends = error / p[at(BAND_PARAMETER)], (Where.NODES, Where.END)
-        found += [path_limit("settling band", inside, -spec.band, spec.band, w, (settled,)) for w in both_ends]
+        found += [path_limit("settling band", inside, -width, width, w, (settled,)) for w in both_ends]
     beyond = error if reference.changes else ca.vertcat(error, -error)
     found += upper_limits(Overshoot, beyond, Where.NODES, both)
     found += upper_limits(SteadyStateError, ca.vertcat(error, -error), Where.END, (settled,))

@@ -7,6 +7,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.evaluation.band import Tolerance
 from pneuopt.evaluation.certificate import certificate
 from pneuopt.evaluation.counts import describe_counts
 from pneuopt.models.drive import ForceDrive
@@ -44,6 +45,17 @@ def test_a_reading_within_half_a_count_is_blind() -> None:
 def test_a_band_of_half_a_count_is_seen(band: float, resolution: float) -> None:
     loop = counted(resolution=resolution)
     assert describe_counts(loop, loop.parameters, STEP, band) is None
+
+
+def test_a_tolerance_below_half_a_count_is_named_in_its_unit() -> None:
+    loop = ClosedLoop(
+        ForceDrive(Viscous()).system(), PID(sample_time=1e-3), measured="position", sensor=Encoder(resolution=1e-3)
+    )
+    told = describe_counts(loop, loop.parameters, Step(0.1), Tolerance(1e-4))
+    assert told is not None
+    assert told.startswith("the settling band of +-0.1 mm is narrower than half the encoder's count of 1 mm")
+    assert "take band = 0.5 mm or more" in told
+    assert describe_counts(loop, loop.parameters, Step(0.1), Tolerance(5e-4)) is None
 
 
 def test_a_sensor_without_counts_shows_every_band() -> None:

@@ -2,6 +2,7 @@ import math
 
 import pytest
 
+from pneuopt.evaluation.band import Tolerance
 from pneuopt.evaluation.requirements import (
     GainMargin,
     MaxComplementarySensitivity,
@@ -75,6 +76,16 @@ def test_tightening_leaves_room_inside() -> None:
     assert spec.limit(SettlingTime) == 1.0
     assert spec.limit(StepEnvelope) == pytest.approx(0.97)
     assert next(q.min for q in spec.limits if isinstance(q, GainMargin)) == pytest.approx(3.0 / 0.97)
+
+
+def test_a_tolerance_is_tightened_as_a_band_is() -> None:
+    spec = specify(SettlingTime(Tolerance(1e-4)), [Overshoot(0.1)])
+    assert spec.band == Tolerance(1e-4)
+    tightened = spec.tighten(0.1, 0.1).band
+    assert isinstance(tightened, Tolerance)
+    assert tightened.half_width == pytest.approx(0.9e-4)
+    with pytest.raises(InputError, match="settling bands differ"):
+        specify(SettlingTime(Tolerance(1e-4)), [SettlingTime(0.02, max=1.0)])
 
 
 def test_several_kinds_are_asked_about_at_once() -> None:

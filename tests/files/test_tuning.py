@@ -1,6 +1,4 @@
-import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pneuopt.control.dither import Dither, Waveform
-from pneuopt.control.moves import Move, MoveProfile
 from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.evaluation.requirements import (
@@ -158,59 +155,6 @@ def test_a_reference_may_be_a_disturbance(tmp_path: Path) -> None:
     assert second == Step(0.0, at=0.2, scale=0.05, disturbance={"load.force": -5.0})
 
 
-MOVE = """[loop]
-measured = "position"
-[pid]
-Kp = "200 N/m"
-[[reference]]
-move = "-200 mm"
-speed = "0.5 m/s"
-acceleration = "5 m/s^2"
-jerk = "100 m/s^3"
-at = "100 ms"
-initial = "50 mm"
-dwell = "2 s"
-disturbance = { "load.force" = "20 N" }
-[minimise]
-settling_time = {}
-"""
-
-
-def test_a_reference_may_be_a_move(tmp_path: Path) -> None:
-    drive = ForceDrive(Coulomb()).system()
-    push = {"load.force": 20.0}
-    move = Move(-0.2, speed=0.5, acceleration=5.0, jerk=100.0, at=0.1, initial=0.05, dwell=2.0, disturbance=push)
-    assert read_tuning(written(tmp_path, MOVE), drive).references == (move,)
-    shaped = MOVE.replace('jerk = "100 m/s^3"', 'profile = "minimum jerk"')
-    (found,) = read_tuning(written(tmp_path, shaped), drive).references
-    assert found == replace(move, jerk=math.inf, profile=MoveProfile.MINIMUM_JERK)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ('dwell = "2 s"', 'horizon = "2 s"', "horizon does not belong to a move, which ends by dwell"),
-        ('move = "-200 mm"', 'step = "-200 mm"', "speed does not belong to a step, which ends by horizon"),
-        ('move = "-200 mm"', 'step = "1 mm"\nmove = "1 mm"', "has a step and a move"),
-        ('speed = "0.5 m/s"', "", "[[reference]] 1 has no speed"),
-        ('jerk = "100 m/s^3"', 'profile = "ramp"', "unknown profile 'ramp'"),
-        (
-            'jerk = "100 m/s^3"',
-            'jerk = "9 m/s^3"\nprofile = "trapezoid"',
-            "the acceleration of a trapezoid steps",
-        ),
-        ('"0.5 m/s"', '"0.5 m"', "speed: unit 'm' does not measure 'm/s'"),
-        ('"0.5 m/s"', '"-0.5 m/s"', "Move: speed is a limit on its size and must be positive"),
-    ],
-)
-def test_refuses_a_move_and_says_where(tmp_path: Path, old: str, new: str, said: str) -> None:
-    assert old in MOVE
-    with pytest.raises(InputError) as error:
-        read_tuning(written(tmp_path, MOVE.replace(old, new, 1)), ForceDrive(Coulomb()).system())
-    assert "[[reference]] 1" in str(error.value)
-    assert said in str(error.value)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -262,6 +206,8 @@ def test_refuses_a_move_and_says_where(tmp_path: Path, old: str, new: str, said:
         ('"5 %"', '"500 %"', "[limits] overshoot: Overshoot: max must be above 0 and below 1, a fraction"),
         ("= 1.6", "= 0.9", "[limits] max_sensitivity: MaxSensitivity: max must be above 1"),
         ('max = "500 ms", ', "", "[limits] settling_time has no max"),
+        ('band = "2 %"', 'band = "2 mm"', "unit 'mm' does not measure 'm/s'"),
+        ('band = "2 %"', 'band = "-2 mm/s"', "Tolerance: half_width must be positive"),
         ('"4500 mV"', "4.5", '[limits] peak_control: 4.5 has no unit; write "4.5 V"'),
         ("[limits]\n", "[[limits]]\n", ": limits must be a section, [limits]"),
     ],

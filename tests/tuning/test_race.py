@@ -12,6 +12,7 @@ from pneuopt.control.pid import PID
 from pneuopt.control.reference import Step
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.compiled.rollout import Rollout
+from pneuopt.evaluation.band import Tolerance
 from pneuopt.evaluation.requirements import (
     IAE,
     ISE,
@@ -73,9 +74,10 @@ def points(simulator: Simulator, m: int = 24) -> np.ndarray:
     ("minimise", "limits"),
     [
         (SettlingTime(0.1), LIMITS),
+        (SettlingTime(Tolerance(0.015)), LIMITS),
         ({ITAE(): 1.0, IAE(): 0.1, ISE(): 0.1, PeakControl(): 1e-3}, [MaxSensitivity(1.3), Overshoot(0.2)]),
     ],
-    ids=["settling", "integrals"],
+    ids=["settling", "tolerance", "integrals"],
 )
 def test_who_beats_its_rival_comes_through_and_nobody_else(
     kind: str, minimise: Objective, limits: list[Requirement]

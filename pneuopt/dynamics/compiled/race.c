@@ -8,7 +8,7 @@
 
 enum { SIGNAL, CONTROL };                                  /* of the outputs */
 enum { SETTLING, OVERSHOOT, PEAK, IAE, ISE, ITAE, VALUES }; /* of the values whose bounds are read */
-enum { FINAL, SIZE, INITIAL, SPACING, OFFSET, IS_STEP, SETTINGS };
+enum { FINAL, SIZE, INITIAL, SPACING, OFFSET, IS_STEP, BAND_UNIT, SETTINGS };
 #define ROUNDING 1e-9 /* share by which a bound must pass: at 0 a rounding would drop what ties; more runs longer */
 
 typedef struct {
@@ -75,7 +75,7 @@ static int has_lost(const Race *r, Runner *run, double *exits) {
     const double error = read_error(r, run, k), size = fabs(error), t = set[OFFSET] + at[k] - at[0];
     double settling = 0;
     for (Count b = 0; b < r->bands; b++) {
-      if (size > r->band[b]) exits[b] = t - period / 2; /* the ripple may carry it back that much sooner */
+      if (size > r->band[b] * set[BAND_UNIT]) exits[b] = t - period / 2; /* the ripple may carry it back that much sooner */
       settling += exits[b] / r->bands;
     }
     if (k > 0) {

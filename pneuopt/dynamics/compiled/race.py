@@ -27,9 +27,9 @@ class RaceCourse:
         Instants and steps [s].
     grid, length, first : ndarray of int, shape (n_cases,)
         Each case's grid, the number of its samples, and the first one from the step on.
-    settings : ndarray, shape (n_cases, 6)
+    settings : ndarray, shape (n_cases, 7)
         The reference after the step, the step's size, the signal before it, the spacing of the samples [s], the time of
-        `first` after the step [s], and 1 for a step, 0 for a disturbance.
+        `first` after the step [s], 1 for a step or 0 for a disturbance, and what fraction of the step a band of 1 is.
     substeps : int
         RK4 steps a sample.
     every : int
@@ -54,7 +54,7 @@ class RaceMerit:
     Parameters
     ----------
     bands : ndarray
-        Half widths of settling bands, fractions of the step, over which the settling time is averaged.
+        Half widths of settling bands, in what the settings say, over which the settling time is averaged.
     weights, limits : ndarray, shape (6,)
         Of `RACE_VALUES`: weights in the objective, 0 for none, and limits, inf for none.
     worst, penalty : float
