@@ -262,6 +262,9 @@ def export_command(
     name: Annotated[
         str, typer.Option(metavar="NAME", help="Of the block and its files.", show_default="controller")
     ] = "controller",
+    pv_span: Annotated[
+        str, typer.Option(metavar="VALUE", help="Of rockwell: the span that its PV is scaled to, 0.5m/s.")
+    ] = "",
     uncertified: Annotated[bool, typer.Option("--uncertified", help="Export gains that no certificate holds.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there already.")] = False,
 ) -> None:
@@ -269,7 +272,7 @@ def export_command(
     with report_errors():
         from pneuopt.cli.export import run_export
 
-        raise typer.Exit(run_export(fit, tuned, to, folder, name, uncertified, force))
+        raise typer.Exit(run_export(fit, tuned, to, folder, name, uncertified, force, pv_span))
 
 
 @_command("next-experiment")

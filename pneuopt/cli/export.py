@@ -21,6 +21,8 @@ from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import write_bytes
 from pneuopt.quantities.source import read_toml_source
 from pneuopt.quantities.status import Code
+from pneuopt.quantities.unit_algebra import difference_unit
+from pneuopt.quantities.units import read_value
 
 FMU = "fmu"  # the form that is the plant, not the controller
 SHOWN_METRICS = ("SettlingTime", "Overshoot", "MaxSensitivity")
@@ -30,7 +32,9 @@ MAKERS |= {"twincat": "beckhoff", "matlab": "simulink", "py": "python", "c99": "
 NOT_CERTIFIED = "NOT CERTIFIED: no independent simulation stands behind these gains."
 
 
-def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncertified: bool, force: bool) -> int:
+def run_export(
+    fit: Path, tuned: Path, to: str, folder: Path, name: str, uncertified: bool, force: bool, span: str = ""
+) -> int:
     """Write the files and say which; returns the exit status.
 
     Parameters
@@ -45,10 +49,16 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
         Whether gains without a certificate may be written.
     force : bool
         Whether old files may be replaced.
+    span : str
+        Of the process value as a block scales it, with its unit; "" for 1 in SI units.
     """
     languages, blocks = {kind.value: kind for kind in Language}, {kind.value: kind for kind in Block}
     _check_form(to, [*languages, *blocks, FMU])
+    scaled = Block.ROCKWELL.value
+    require(not span or to == scaled, f"--pv-span: of --to {scaled} only, whose gains are for errors in percent of it")
     task, parameters = read_fit_and_tuning(fit, tuned)
+    unit = task.loop.feedback.unit
+    measured_span = read_value(span, difference_unit(unit), where="--pv-span") if span else 1.0
     origin = [*_certificate_lines(tuned, uncertified), *_source_lines(fit, tuned)]
     given = (task.loop, parameters)
     if to == FMU:
@@ -57,7 +67,9 @@ def run_export(fit: Path, tuned: Path, to: str, folder: Path, name: str, uncerti
         files = export_controller(*given, languages[to], name=name, centre=task.centre, origin=origin)
     else:
         block = blocks[to]
-        files = export_settings(*given, block, task.references, name=name, centre=task.centre, origin=origin)
+        files = export_settings(
+            *given, block, task.references, name=name, centre=task.centre, origin=origin, measured_span=measured_span
+        )
     placed = {folder / file: text for file, text in files.items()}
     write_files(placed, force)
     if to in blocks:

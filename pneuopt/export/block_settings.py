@@ -27,6 +27,7 @@ def export_settings(
     name: str = "controller",
     centre: float = 0.0,
     origin: Sequence[str] = (),
+    measured_span: float = 1.0,
 ) -> dict[str, str]:
     """Write what is to be typed into a PID block, with formula and source, and the design as that block runs it.
 
@@ -47,6 +48,9 @@ def export_settings(
         Of the valve [the command's unit].
     origin : sequence of str
         Where the gains come from; any text.
+    measured_span : float
+        From the least to the largest process value as the block scales it [the measured unit]; Rockwell's gains
+        are for errors in percent of it.
 
     Returns
     -------
@@ -63,7 +67,9 @@ def export_settings(
     told = "a continuous controller cannot be exported: give it a sample time, sample_time under [pid], and tune again"
     require(loop.pid.sample_time is not None, told, ModelError)
     loop.check(parameters)
-    form, design = BLOCK_FORMS[block], _design(loop, parameters, centre)
+    message = f"measured_span must be positive and finite, got {measured_span:g} {loop.feedback.unit}"
+    require(0 < measured_span < math.inf, message)
+    form, design = BLOCK_FORMS[block], replace(_design(loop, parameters, centre), measured_span=measured_span)
     lines = [f"{form.title}: the gains of {name}", *map(comment_text, origin), "", "Settings", ""]
     settings = form.settings(design)
     widths = [max(len(s[k]) for s in settings) for k in (0, 1)]
@@ -104,7 +110,9 @@ def compare_with_block(
     """Lines that say what a design is worth as a block runs it, beside what it is worth as tuned."""
     own, values, found = run_as_block(loop, parameters, block)
     if not found:
-        return ["The block runs the design as it was tuned."]
+        late = block is Block.SIMULINK and loop.pid.limits and loop.pid.anti_windup is AntiWindup.BACK_CALCULATION
+        but = ", but for one sample: at a limit its back-calculation acts a sample later" if late else ""
+        return [f"The block runs the design as it was tuned{but}."]
     lines = ["As the block runs it, the design differs:", *(f"- {difference}" for difference in found), ""]
     unit, steps = loop.feedback.unit, as_references(references)
     try:

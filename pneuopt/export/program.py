@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from pneuopt.control.compensation import Compensator, Instant
-from pneuopt.control.dither import Dither
+from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form, parallel_gains
 from pneuopt.control.loop import ClosedLoop
@@ -120,6 +120,18 @@ def controller_program(loop: ClosedLoop, parameters: ParameterSet, centre: float
 
 
 @dataclass(frozen=True)
+class _WrappedDither(Dither):
+    """A dither whose sine sees less than a turn: after days of samples a PLC's sine of their angle is poor."""
+
+    def wave(self, t: ca.SX, p: Symbols) -> ca.SX:
+        """As `Dither.wave`."""
+        if self.waveform is not Waveform.SINE:
+            return super().wave(t, p)  # its own turns are wrapped
+        turns = p["frequency"] * t
+        return super().wave(turns - ca.floor(turns), {**p, "frequency": ca.SX(1)})
+
+
+@dataclass(frozen=True)
 class _ComputedParts:
     """The parts of a loop that its controller computes, as `controller_update` asks for them."""
 
@@ -159,7 +171,8 @@ def _law(loop: ClosedLoop) -> _Law:
     sensed = loop.sensed_signal
     counts = isinstance(loop.sensor, Encoder) and loop.sensor.differentiates(sensed)
     encoder = replace(loop.sensor, resolution=0.0) if counts and isinstance(loop.sensor, Encoder) else None
-    parts = _ComputedParts(loop.pid, loop.dither, loop.feedforward, loop.compensators, encoder, sensed)
+    dither = None if loop.dither is None else _WrappedDither(**vars(loop.dither))
+    parts = _ComputedParts(loop.pid, dither, loop.feedforward, loop.compensators, encoder, sensed)
     measured = sensed.outputs[encoder.position] if encoder else loop.feedback
     known = loop.states[len(loop.plant.states) :]
     x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}

@@ -43,6 +43,8 @@ class Design:
     centre : float
     sample_time : float
     measured_unit, command_unit : str
+    measured_span : float
+        From the least to the largest process value as the block scales it [the measured unit].
     """
 
     gains: ParallelForm
@@ -55,6 +57,7 @@ class Design:
     sample_time: float
     measured_unit: str
     command_unit: str
+    measured_span: float = 1.0
 
     @property
     def times(self) -> tuple[float, float]:
@@ -142,9 +145,9 @@ def _siemens(d: Design) -> list[Setting]:
 
 def _rockwell(d: Design) -> list[Setting]:
     Ti, Td = d.times
-    scale = 1.0 / d.span if math.isfinite(d.span) else 1.0
+    scale = d.measured_span / d.span if math.isfinite(d.span) else d.measured_span
     Kp, Ki, Kd = (g * scale for g in (d.gains.Kp, d.gains.Ki, d.gains.Kd))
-    per = f"S/R, S the span of PV [{d.measured_unit}], here 1, R that of CV"
+    per = f"S/R, S the span of PV, here {write_value(d.measured_span, d.measured_unit)}, R that of CV"
     return [
         Setting("PID independent: Kp", _number(Kp), f"Kp {per}"),
         Setting("PID independent: Ki [1/s]", _number(Ki), f"Ki {per}"),
@@ -227,6 +230,7 @@ BLOCK_FORMS: Mapping[Block, BlockForm] = {
             "S7-1200 Easy Book, A5E02486680-06, 04/2012, section 9.2.2: formula; 'PIDT1 controller with anti-windup'",
             "S7-1200 System Manual, A5E02486680-AK, V4.2, 09/2016, section 10.2: names, ranges",
             "How it keeps its integral at bay at a limit is not published: taken as clamping.",
+            "These manuals name a dead zone for PID_Temp only (Heat.DeadZone), of the whole error.",
         ),
         _siemens,
     ),
@@ -250,6 +254,8 @@ BLOCK_FORMS: Mapping[Block, BlockForm] = {
         (
             "infosys.beckhoff.com/content/1033/tcplclibcontrollertoolbox/11282668683.html (FB_CTRL_PID)",
             "infosys.beckhoff.com/content/1033/tcplclib_tc2_utilities/34976395.html (FB_BasicPID)",
+            "INFERRED: the pages draw the formula as a picture; this one is by the parameters' descriptions.",
+            "Compare a step of the block with the design before you rely on it.",
             "The page draws the anti-reset windup (ARW) as a figure only: taken as clamping. TIME counts in ms.",
         ),
         _beckhoff,
@@ -261,6 +267,8 @@ BLOCK_FORMS: Mapping[Block, BlockForm] = {
         "Y = KP (e + 1/TN int e dt + TV de/dt) + Y_OFFSET",
         (
             "content.helpme-codesys.com/en/libs/Util/Current/Controller/PID.html and PID_FIXCYCLE.html",
+            "INFERRED: the pages draw the formula as a picture; this one is by the parameters' descriptions.",
+            "Compare a step of the block with the design before you rely on it.",
             "Its derivative has no filter that can be set, its setpoint no weights; at a limit: taken as clamping.",
         ),
         _codesys,

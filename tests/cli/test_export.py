@@ -172,3 +172,14 @@ def test_a_form_by_another_name_is_understood(place: Path, word: str, told: str)
     result = run(f"export fit.toml tuned.toml --to {word}")
     assert (result.exit_code, told in result.stderr) == (2, True), result.stderr
     assert not (place / "controller.c").exists()
+
+
+def test_the_span_of_a_process_value_is_rockwells(place: Path) -> None:
+    assert run("export fit.toml tuned.toml --to rockwell --pv-span 500mm/s").exit_code == 0
+    assert "S the span of PV, here 0.5 m/s" in (place / "controller_rockwell.txt").read_text("ascii")
+    for words, told in (
+        ("--to siemens --pv-span 0.5m/s", "of --to rockwell only"),
+        ("--to rockwell --pv-span 5", "unit"),
+    ):
+        result = run(f"export fit.toml tuned.toml {words}")
+        assert (result.exit_code, told in result.stderr) == (2, True), result.stderr

@@ -57,6 +57,23 @@ def test_the_numbers_make_the_design_by_each_makers_formula() -> None:
     assert (s["FB_CTRL_PID: fKp"], s["FB_CTRL_PID: tTn"], s["FB_CTRL_PID: tTd"]) == pytest.approx((200, 0.05, 0.005))
 
 
+def test_rockwells_gains_scale_with_the_span_of_its_process_value() -> None:
+    loop, given = saturated()
+    short = Step(0.2, horizon=0.02)
+    (text,) = export_settings(loop, given, Block.ROCKWELL, short, measured_span=0.5).values()
+    assert re.search(rf"PID independent: Kp +{200 * 0.5 / 92:.9g} +Kp S/R, S the span of PV, here 0.5 m/s", text)
+    with pytest.raises(InputError, match="measured_span must be positive"):
+        export_settings(loop, given, Block.ROCKWELL, short, measured_span=0.0)
+
+
+def test_what_is_inferred_or_a_sample_late_is_said() -> None:
+    loop, given = saturated()
+    for block in Block:
+        (text,) = export_settings(loop, given, block, Step(0.2, horizon=0.02)).values()
+        assert ("INFERRED" in text) == (block in (Block.BECKHOFF, Block.CODESYS))
+        assert ("back-calculation acts a sample later" in text) == (block is Block.SIMULINK)
+
+
 def test_the_centre_is_the_output_at_rest() -> None:
     assert settings(Block.SIEMENS, centre=50.0)["(output at rest)"] == pytest.approx(50.0)
     assert (settings(Block.CODESYS, centre=50.0)["Y_OFFSET"], settings(Block.CODESYS, centre=50.0)["Y_MAX"]) == (50, 96)
@@ -80,7 +97,7 @@ def test_a_block_that_runs_the_design_changes_nothing() -> None:
     mine, theirs = (evaluate(*pair)[STEP.label]["Overshoot"] for pair in ((loop, STEP, given), (own, STEP, values)))
     assert mine == theirs
     (text,) = export_settings(loop, given, Block.SIMULINK, STEP).values()
-    assert "The block runs the design as it was tuned." in text
+    assert "The block runs the design as it was tuned" in text
 
 
 def test_what_differs_is_named_simulated_and_shown_beside_the_design() -> None:
