@@ -84,6 +84,7 @@ def check_command(
     ],
     json: Json = None,
     plot: Plot = None,
+    report: ReportFile = None,
     accept: Accept = None,
     fix: Annotated[
         Path | None,
@@ -97,7 +98,7 @@ def check_command(
         from pneuopt.cli.check import run_check
         from pneuopt.cli.shared import Outputs
 
-        raise typer.Exit(run_check(drive, _expand_patterns(logs), Outputs(None, json, plot), accept or (), fix))
+        raise typer.Exit(run_check(drive, _expand_patterns(logs), Outputs(None, json, plot, report), accept or (), fix))
 
 
 @_command("identify")
@@ -304,6 +305,7 @@ def next_experiment_command(
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write what to play, CSV.")
     ] = None,
     json: Json = None,
+    report: ReportFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Plan the run that shrinks the confidence intervals of a fit most, within limits."""
@@ -314,7 +316,7 @@ def next_experiment_command(
         targets = tuple(filter(None, (n.strip() for n in target.split(","))))
         lists = (tuple(limit), tuple(noise or ()), tuple(start or ()))
         options = PlannedOptions(duration, sample_time, targets, *lists, runs, mean, budget)
-        raise typer.Exit(run_next_experiment(fit, tuning, options, Outputs(output, json, None), quiet))
+        raise typer.Exit(run_next_experiment(fit, tuning, options, Outputs(output, json, None, report), quiet))
 
 
 @_command("track")
@@ -335,6 +337,7 @@ def track_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write a CSV file.")] = None,
     json: Json = None,
     plot: Plot = None,
+    report: ReportFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Tell whether parameters drift over dated logs, and what that does to a tuned loop; status 1 if so."""
@@ -344,7 +347,7 @@ def track_command(
 
         require(drift > 0, f"--drift {drift:g}: give the percent a week that is to be seen")
         options = TrackOptions(tuned, tuple(parameter or ()), dates, drift / 100, horizon)
-        raise typer.Exit(run_track(drive, _expand_patterns(logs), options, Outputs(output, json, plot), quiet))
+        raise typer.Exit(run_track(drive, _expand_patterns(logs), options, Outputs(output, json, plot, report), quiet))
 
 
 @_command("keys")

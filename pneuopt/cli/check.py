@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.cli.exit_status import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_SUCCESS
 from pneuopt.cli.init import write_files
-from pneuopt.cli.shared import Outputs, finish
+from pneuopt.cli.shared import Outputs, file_hashes, finish
 from pneuopt.cli.terminal import make_console, show_output_files, show_report, show_sentence
 from pneuopt.dynamics.system import System
 from pneuopt.files.assumptions import read_option_assumptions
@@ -26,6 +26,9 @@ from pneuopt.plotting import plot_finding, plot_logs
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report, Tone
+from pneuopt.report.fit_page import Source
+from pneuopt.report.page import Page, Picture
+from pneuopt.report.summary_page import summary_page, title_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +50,8 @@ def run_check(
         found = check(system, experiments, parameters)
         found = replace(found, assumptions=(*found.assumptions, *read_option_assumptions(drive)))
         show_report(make_console(), found.summary())
-        finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found))
+        page = partial(_page, drive, logs, found, errors)
+        finish(outputs, {}, found.to_dict(), None, figures=partial(_figures, found), page=page)
         status = status or (EXIT_FAILURE if found.is_refused else EXIT_SUCCESS)
     return _fix(places, system, parameters, accept) if places else status
 
@@ -125,6 +129,17 @@ def _name_unread(log: Experiment) -> str:
     unread = log.source.unread if log.source else ()
     remedy = "a sidecar's [columns] says which channel a column is"
     return f"; columns that are not read: {', '.join(unread)}; {remedy}" if unread else ""
+
+
+def _page(drive: Path, logs: Sequence[Path], found: Checkup, errors: Sequence[str]) -> Page:
+    """The page of --report: verdict, findings with the rows that show them, and the logs as they were read."""
+    shown = [f for f in found.findings if f.evidence is not None]
+    pictures = [Picture(partial(plot_finding, f), f"What shows it: {f.message}", f.message) for f in shown]
+    alt = "Every channel that was read, over time."
+    pictures += [Picture(partial(plot_logs, found.logs), alt, "The logs as they were read.")]
+    hashes = file_hashes(drive, *logs)
+    source = Source(title_of("Check", drive, logs), hashes, tuple(f"not read: {text}" for text in errors))
+    return summary_page(source, found.summary(), pictures)
 
 
 def _figures(found: Checkup) -> dict[str, "Figure"]:

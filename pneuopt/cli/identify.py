@@ -51,6 +51,7 @@ from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.report.fit_page import Source, fit_page, prediction_page, refusal_page
+from pneuopt.report.summary_page import summary_page, title_of
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.studies.bootstrap import bootstrap
 
@@ -118,14 +119,9 @@ def run_identify(
 
 def _hints(outputs: Outputs) -> list[str]:
     """What to do with a fit: tune its drive, and show it."""
-    fit = outputs.output
-    first = "-o fit.toml with this command keeps the fit, for pneuopt tune"
-    told = [
-        first if fit is None else f"pneuopt tune {fit} tuning.toml -o tuned.toml    (pneuopt init writes a tuning.toml)"
-    ]
-    return (
-        told if outputs.report is not None else [*told, "--report FILE.html with this command makes a page to hand on"]
-    )
+    kept = "with -o fit.toml: keeps the fit, for pneuopt tune"
+    told = [kept if outputs.output is None else f"pneuopt tune {outputs.output} tuning.toml -o tuned.toml"]
+    return told if outputs.report is not None else [*told, "with --report FILE.html: a page to hand on"]
 
 
 def _fit_tables(result: IdentificationResult) -> dict[str, Any]:
@@ -150,8 +146,7 @@ def run_select(
 ) -> int:
     """Choose a friction model by the logs; returns the exit status."""
     remedy = "write the model that is chosen into [friction], and identify again without --select"
-    wanted = (outputs.output, outputs.plot, outputs.report)
-    require(wanted == (None, None, None), f"--select writes neither -o nor --plot nor --report; {remedy}")
+    require((outputs.output, outputs.plot) == (None, None), f"--select writes neither -o nor --plot; {remedy}")
     outputs.check(_input_files(drive, logs))
     model, parameters = read_free_drive(drive)
     systems = _friction_systems(drive, model)
@@ -170,7 +165,9 @@ def run_select(
         )
     tables = {"recommended": chosen.recommended, "reason": chosen.reason, "candidates": records(chosen.table)}
     status = chosen.fits[chosen.recommended].status
-    return finish(outputs, {}, tables, status, report=chosen.summary())
+    source = Source(title_of("Choice of a friction model", drive, logs), file_hashes(drive, *logs))
+    page = partial(summary_page, source, chosen.summary())
+    return finish(outputs, {}, tables, status, report=chosen.summary(), page=page)
 
 
 def run_predict(fit: Path, log: Path, window: float | None, outputs: Outputs, quiet: bool = False) -> int:

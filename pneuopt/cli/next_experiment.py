@@ -18,6 +18,8 @@ from pneuopt.identification.next_experiment import next_experiment
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.units import read_value
+from pneuopt.report.fit_page import Source
+from pneuopt.report.summary_page import summary_page, title_of
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,8 @@ def run_next_experiment(
             progress=report_progress,
         )
     tables = {"design": records(design.table), "provenance": file_hashes(*files), "stats": dict(design.stats)}
-    return finish(outputs, _writers(design, outputs.output), tables, None, report=design.summary())
+    page = partial(summary_page, Source(title_of("Next experiment", fit, ()), file_hashes(*files)), design.summary())
+    return finish(outputs, _writers(design, outputs.output), tables, None, report=design.summary(), page=page)
 
 
 def _writers(design: ExperimentDesign, output: Path | None) -> Writers:

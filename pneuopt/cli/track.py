@@ -24,6 +24,8 @@ from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import records, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import ProgressCallback
+from pneuopt.report.fit_page import Source
+from pneuopt.report.summary_page import summary_page, title_of, tracking_picture
 from pneuopt.shooting.least_squares import LeastSquares
 
 if TYPE_CHECKING:
@@ -84,7 +86,9 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     if outlook is not None:
         tables["design"] = records(outlook.table)
         shown += outlook.summary()
-    finish(outputs, writers, tables, None, figures=lambda: {"": plot_tracking(found)}, report=shown)
+    source = Source(title_of("Tracking", drive, logs), file_hashes(*inputs))
+    page = partial(summary_page, source, shown, [tracking_picture(found)], experiments)
+    finish(outputs, writers, tables, None, figures=lambda: {"": plot_tracking(found)}, report=shown, page=page)
     return EXIT_FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
 
 

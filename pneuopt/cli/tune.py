@@ -94,12 +94,11 @@ def run_tune(fit: Path, tuning: Path, rig: Path | None, outputs: Outputs, quiet:
 
 def _hints(task: Tuning, fit: Path, outputs: Outputs) -> list[str]:
     """What to do with a design: take it to a controller, and show it."""
-    told = [] if outputs.report is not None else ["--report FILE.html with this command makes a page to hand on"]
+    told = [] if outputs.report is not None else ["with --report FILE.html: a page to hand on"]
     if outputs.output is None:
-        return ["-o tuned.toml with this command keeps the gains, pneuopt export takes them to a controller", *told]
-    command = f"pneuopt export {fit} {outputs.output}"
-    exports = [] if task.loop.pid.sample_time is None else [f"{command} --to st    (for a PLC; pneuopt export --help)"]
-    return [*exports, *told]
+        return ["with -o tuned.toml: keeps the gains, for pneuopt export", *told]
+    command = f"pneuopt export {fit} {outputs.output} --to st    (for a PLC; or --help)"
+    return told if task.loop.pid.sample_time is None else [command, *told]
 
 
 def _tune_task(

@@ -12,15 +12,14 @@ from pneuopt.evaluation.certificate import Certificate
 from pneuopt.identification.result import IdentificationResult
 from pneuopt.identification.tracking import Tracking
 from pneuopt.logs.experiments import Experiment
-from pneuopt.plotting import plot_sensitivity, plot_tracking
+from pneuopt.plotting import plot_sensitivity
 from pneuopt.quantities.arguments import as_tuple
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.report import Line, Report
 from pneuopt.quantities.shown import Shown
-from pneuopt.report.data import provenance_section
 from pneuopt.report.fit_page import Source, fit_page
-from pneuopt.report.page import Page, Picture, Section, write_page
+from pneuopt.report.page import Picture, write_page
+from pneuopt.report.summary_page import summary_page, tracking_picture
 from pneuopt.report.tuning_page import LoopView, simulation_page, tuning_page
 from pneuopt.studies.sensitivity import Sensitivity
 from pneuopt.tuning.result import TuningResult
@@ -77,8 +76,7 @@ def write_report(
     Examples
     --------
     >>> import tempfile
-    >>> from pneuopt.quantities.report import Line, Report
-    >>> class Found(Shown):
+    >>>     >>> class Found(Shown):
     ...     def summary(self):
     ...         return Report((Line("nothing is wrong"),))
     >>> place = Path(tempfile.mkdtemp()) / "found.html"
@@ -101,7 +99,7 @@ def write_report(
         require(model is None or parameters is not None, "a certificate holds no gains: give parameters with the loop")
         page = simulation_page(source, result, _view(model, steps, parameters, None, band))
     else:
-        page = _summary_page(source, result)
+        page = summary_page(source, result.summary(), _pictures(result), (), getattr(result, "provenance", {}))
     write_page(path, page)
 
 
@@ -118,19 +116,9 @@ def _view(
     return LoopView(model, steps, model.complete(parameters), earlier, band)
 
 
-def _summary_page(source: Source, result: Shown) -> Page:
-    """Of a result without a page of its own: its summary, with a figure where there is one."""
-    pictures: tuple[Picture, ...] = ()
+def _pictures(result: Shown) -> tuple[Picture, ...]:
+    """Of a result without a page of its own."""
     if isinstance(result, Sensitivity):
         alt = "For each figure the share of its variance that each parameter brings, with its 95 % interval."
-        pictures = (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
-    elif isinstance(result, Tracking):
-        alt = "Estimates with their intervals over dates, the line through them and its band."
-        pictures = (Picture(partial(plot_tracking, result), alt, "Estimates over time."),)
-    first, *others = result.summary().parts
-    is_line = isinstance(first, Line)
-    details = Report(tuple(others) if is_line else (first, *others))
-    verdict = Report((first,) if is_line else ())
-    known = dict(getattr(result, "provenance", {}))
-    sections = (Section("Figures", pictures), Section("Result", (details,)), provenance_section(known, source.hashes))
-    return Page(source.title, verdict, sections, source.warnings)
+        return (Picture(partial(plot_sensitivity, result), alt, "Shares of the variance."),)
+    return (tracking_picture(result),) if isinstance(result, Tracking) else ()

@@ -79,8 +79,9 @@ def test_a_friction_model_is_chosen_and_explained(folder: Path) -> None:
     Path("short.csv").write_text(
         "\n".join(Path("run_01.csv").read_text(encoding="utf-8").splitlines()[:251]) + "\n", encoding="utf-8"
     )
-    result = run("identify drive.toml short.csv --select --json chosen.json")
+    result = run("identify drive.toml short.csv --select --json chosen.json --report page.html")
     assert result.exit_code == 0, result.stderr
+    assert "Choice of a friction model of drive.toml with short.csv" in Path("page.html").read_text("utf-8")
     said = json.loads(Path("chosen.json").read_text(encoding="utf-8"))
     assert said["recommended"] == "coulomb"
     assert result.stdout.startswith(said["reason"])

@@ -7,6 +7,7 @@ from typer.testing import CliRunner, Result
 
 from pneuopt.cli.app import app
 from pneuopt.logs.read_log import read_log
+from tests.report.reading import read_page
 
 DRIVE = Path(__file__).parents[2] / "data/force_rig/drive.toml"
 USUAL = ("--duration", "0.5s", "--sample-time", "2ms", "--limit", "force=-150N..150N", "--limit", "position=-1m..1m")
@@ -20,11 +21,25 @@ def run(*words: str) -> Result:
 
 def test_a_run_is_planned_and_written(tmp_path: Path) -> None:
     place = tmp_path / "run.csv"
-    result = run(*USUAL, "--noise", "position=20um", "--budget", "2", "-q", "--target", "friction.*", "-o", str(place))
+    result = run(
+        *USUAL,
+        "--noise",
+        "position=20um",
+        "--budget",
+        "2",
+        "-q",
+        "--target",
+        "friction.*",
+        "-o",
+        str(place),
+        "--report",
+        str(tmp_path / "run.html"),
+    )
     assert result.exit_code == 0, result.output
     assert "a run of 500 ms gives" in result.output
     force = read_log(place).trajectory["force"]
     assert len(force) == 250
+    assert "a run of 500 ms gives" in read_page(tmp_path / "run.html").text
     assert abs(force).max() <= 150
 
 

@@ -106,6 +106,18 @@ def test_hostile_names_of_files_and_columns_are_text(folder: Path) -> None:
     assert not read.named("img")
 
 
+def test_a_check_has_its_page(folder: Path) -> None:
+    Path("broken.csv").write_text("a,b\n1,2\n", "utf-8")
+    result = run("check", "drive.toml", "run_01.csv", "broken.csv", "--report", "page.html")
+    assert (result.exit_code, "wrote page.html" in result.stdout) == (2, True), result.output
+    read = page()
+    assert headings(read) == ["Figures", "Result", "Provenance"]
+    assert verdict(read) == result.stdout.splitlines()[0]
+    assert any(words.startswith("not read: broken.csv: ") for tag, words in read.words if tag == "li")
+    assert "friction.coulomb" in read.text
+    assert len(read.named("figure")) >= 1
+
+
 def test_a_tuning_has_its_page(folder: Path) -> None:
     result = run("tune", "drive.toml", "tuning.toml", "-o", "tuned.toml", "--report", "page.html", "-q")
     assert result.exit_code == 0, result.output
@@ -192,10 +204,6 @@ def test_an_interrupted_tuning_has_a_page_without_figures(folder: Path, monkeypa
     [
         ("identify drive.toml run_01.csv --report page.pdf", "page.pdf: a report is a page of HTML; name it so"),
         ("identify drive.toml run_01.csv --report none/page.html", "none/page.html: the folder does not exist"),
-        (
-            "identify drive.toml run_01.csv --select --report page.html",
-            "--select writes neither -o nor --plot nor --rep",
-        ),
         ("tune drive.toml tuning.toml --report page.html --json page.html", "is named for two outputs"),
     ],
 )

@@ -9,6 +9,7 @@ import pytest
 
 from tests.cli.test_check import folder, run, write
 from tests.logs.bad_logs import RIGHT, T, swing
+from tests.report.reading import read_page
 
 __all__ = ["folder"]  # the fixture: a drive.toml in a folder of its own
 TUNED = """
@@ -39,7 +40,7 @@ def logs(folder: Path) -> Path:
 
 def test_a_drift_is_status_1_and_says_when_to_tune_again(logs: Path) -> None:
     Path("tuned.toml").write_text(TUNED, encoding="utf-8")
-    files = "--tuned tuned.toml -o history.csv --json drift.json --plot drift.png"
+    files = "--tuned tuned.toml -o history.csv --json drift.json --plot drift.png --report page.html"
     result = run(f"track drive.toml run_2026*.csv --parameter friction.coulomb -q {files}")
     said = " ".join(result.stdout.split())
     assert (result.exit_code, result.stderr) == (1, "")
@@ -53,6 +54,10 @@ def test_a_drift_is_status_1_and_says_when_to_tune_again(logs: Path) -> None:
     assert [row["ahead"] for row in written["design"]] == [False] * WEEKS + [True] * 4
     assert written["design"][-1]["PeakControl"] > written["design"][0]["PeakControl"]
     assert Path("drift.png").stat().st_size > 10_000
+    read = read_page(Path("page.html"))
+    assert "Tracking of drive.toml with 5 logs" in read.text
+    assert "tune again: the tuned loop will fail by 2026-04-19" in read.text
+    assert len(read.named("figure")) == 1
 
 
 @pytest.mark.parametrize(
