@@ -3,8 +3,9 @@
 A plant that integrates adds up whatever its model misses: the position runs away from the log, and the gaps of a fit
 that links its segments take the misfit in their place. In windows with a start state each, the model runs freely for a
 limited time only. Short windows show little of slow terms, long ones gather what the model misses; the length is that
-at which the estimates have the narrowest intervals, which count how parts of the log disagree
-(problems/identify/windows.py holds its estimates to the truth).
+at which the estimates have the narrowest intervals, which count how parts of the log disagree, among those that agree
+with all shorter ones (the rule of Lepski, Theory of Probability and its Applications 35(3), 1991;
+problems/identify/windows.py holds its estimates to the truth).
 """
 
 import math
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pneuopt.dynamics.hooks import Start
 from pneuopt.identification.checks import outputs_in_log
 from pneuopt.identification.clusters import t_quantile
 from pneuopt.identification.misfit import Misfit, diagnose_misfit
@@ -37,6 +39,9 @@ MIN_WINDOWS = 12  # windows of all logs: with fewer the scatter between parts is
 # their own follow any smooth log, also one of another plant, and a lower share takes that for an answer; with a higher
 # one an offset that is zero forbids windows
 MIN_KNOWN_SHARE = 0.5
+# iterations in the first windows, which begin where a search of whole logs has failed, and in the next ones, which
+# begin with the answer of those twice as long: fewer leave what would converge, more are lost where one window creeps
+FIRST_ITERATIONS, NEXT_ITERATIONS = 60, 30
 WINDOW_FACTOR = 2.0  # from one length to the next [1]: lower takes more fits, higher may pass over the best
 
 Windowed = tuple[EstimationProblem, Fit, ChosenWindow]
@@ -74,6 +79,15 @@ class _Trial(NamedTuple):
         sizes = np.abs([self.fit.parameters.value(n) for n in self.fit.parameters.free_names])
         known = float(np.mean(self.half_widths < sizes)) if sizes.size else 1.0
         return self.fit.status.converged and known > MIN_KNOWN_SHARE
+
+    def agrees(self, shorter: "_Trial") -> bool:
+        """Whether its estimates agree with those of shorter windows, in which the model's errors add up less."""
+        names = [n for n in self.fit.parameters.free_names if n in shorter.fit.parameters.free_names]
+        apart = np.abs([self.fit.parameters.value(n) - shorter.fit.parameters.value(n) for n in names])
+        free, others = self.fit.parameters.free_names, shorter.fit.parameters.free_names
+        own, other = self.half_widths, shorter.half_widths
+        widths = [own[free.index(n)] + other[others.index(n)] for n in names]
+        return bool(np.all(apart <= np.array(widths)))
 
 
 def check_window(problem: EstimationProblem) -> None:
@@ -118,10 +132,15 @@ def fit_in_windows(problem: EstimationProblem, fit: Fit) -> Windowed | None:
     if not _has_failed_by_gaps(problem, fit):
         return None
     lengths = [problem.window] if math.isfinite(problem.window) else _lengths(problem)
-    found = [trial for length in lengths if (trial := _try_length(problem, fit, length)).is_answer]
+    trials, start, iterations = list[_Trial](), problem.start_from(fit), FIRST_ITERATIONS
+    for length in reversed(lengths):
+        trials.append(_try_length(problem, start, length, iterations))
+        start, iterations = trials[-1].problem.start_from(trials[-1].fit), NEXT_ITERATIONS
+    found = [trial for trial in trials if trial.is_answer]
     if not found:
         return None
-    best = min(found, key=lambda trial: trial.rank)
+    agreeing = [trial for trial in found if all(trial.agrees(other) for other in found if other.length < trial.length)]
+    best = min(agreeing, key=lambda trial: trial.rank)
     window = ChosenWindow(best.length, lengths[0], lengths[-1], fit.stats["gap_share"])
     return best.problem, best.fit.with_effort_of(fit), window
 
@@ -168,11 +187,12 @@ def _lengths(problem: EstimationProblem) -> list[float]:
     return [shortest * WINDOW_FACTOR**k for k in range(count)]
 
 
-def _try_length(problem: EstimationProblem, fit: Fit, length: float) -> _Trial:
+def _try_length(problem: EstimationProblem, start: Start, length: float, iterations: int) -> _Trial:
     """The fit in windows of one length, a segment each, and what its residuals tell."""
-    last = problem.method.stages[-1:]  # without gaps all stages are alike
-    cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=last))
-    held, found = fit_holding_unidentifiable(cut, cut.start_from(fit))
+    # without gaps all stages are alike; steps are refined where the search has converged
+    last = replace(problem.method.stages[-1], iterations=iterations, refine=1)
+    cut = replace(problem, window=length, method=replace(problem.method, segment_time=length, stages=(last,)))
+    held, found = fit_holding_unidentifiable(cut, start)
     held = replace(held, method=replace(held.method, stages=problem.method.stages))
     unknowns = len(found.parameters.free_names) + len(held.experiments) * len(held.system.states)
     freedom = max(1, found.count - unknowns)

@@ -1,9 +1,11 @@
 """Windows: logs that a model does not follow from end to end are fitted, and predicted, in parts that it follows."""
 
+import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.drive import write_fit
 from pneuopt.files.toml import read_toml
+from pneuopt.identification import windows
 from pneuopt.identification.identify import identify, predict, validate
+from pneuopt.identification.problem import EstimationProblem
 from pneuopt.identification.profiles import profile
 from pneuopt.identification.result import IdentificationResult, Mark
 from pneuopt.logs.experiments import Experiment
@@ -23,7 +27,7 @@ from pneuopt.models.friction import Coulomb, Viscous
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.intersample import Intersample
-from pneuopt.quantities.parameters import ParameterSet
+from pneuopt.quantities.parameters import Parameter, ParameterSet
 from pneuopt.quantities.status import Code
 from pneuopt.quantities.trajectories import Trajectory
 from pneuopt.shooting.least_squares import LeastSquares
@@ -196,3 +200,30 @@ def test_both_errors_are_in_the_file(tmp_path: Path) -> None:
     agreement: Any = read_toml(tmp_path / "fit.toml")["agreement"]
     row = agreement["run"]["position"]
     assert row["free_run_rmse"] > 10 * row["rmse"] > 0
+
+
+@pytest.mark.parametrize(("bias", "chosen"), [(0.5, 0.4), (3.0, 0.2)])
+def test_longer_windows_are_chosen_only_if_shorter_ones_agree(
+    bias: float, chosen: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Narrow intervals of long windows, in which a model's errors add up, have held no truth."""
+    problem, tried = Mock(window=math.inf), list[float]()
+    whole = Mock(stats={"gap_share": 0.5})
+
+    def trial(_: EstimationProblem, start: object, length: float, __: int) -> Mock:
+        tried.append(length)
+        assert start is (problem.start_from.return_value if length == 0.4 else "warm")
+        value, width = (10.0 + bias, 1.0) if length == 0.4 else (10.0, 1.0 + (0.4 - length))
+        parameters = ParameterSet({"gain": Parameter(value, "1", free=True)})
+        own = Mock(length=length, is_answer=True, rank=(0, False, math.log(width)), half_widths=np.array([width]))
+        own.fit.parameters, own.problem.start_from.return_value = parameters, "warm"
+        own.agrees = lambda other: windows._Trial.agrees(own, other)
+        return own
+
+    monkeypatch.setattr(windows, "_has_failed_by_gaps", lambda *_: True)
+    monkeypatch.setattr(windows, "_lengths", lambda _: [0.1, 0.2, 0.4])
+    monkeypatch.setattr(windows, "_try_length", trial)
+    found = windows.fit_in_windows(problem, whole)
+    assert found is not None
+    assert found[2].duration == chosen
+    assert tried == [0.4, 0.2, 0.1]  # each begins with the answer of the one before
