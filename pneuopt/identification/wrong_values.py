@@ -41,6 +41,8 @@ WHOLE_SHARE = 0.98
 # squared residuals above the best trial's, in variances of its residuals, up to which logs do not tell two values
 # apart: lower names one of two by chance, higher names what fits worse
 ALIKE_SQUARES = 20.0
+# what a user knows better than any value of a rig: of values that logs do not tell apart, it is named last
+NATURE = ("ambient.", "gas.")
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ class WrongValue:
         And gaps that this fit leaves, in noise variances.
     alike : tuple of str
         Other fixed values of which each would explain as much.
+    lag : float
+        The dead time in place of which the value may stand [s]; 0 where it is no bandwidth, or not a lower one.
     """
 
     name: str
@@ -68,6 +72,7 @@ class WrongValue:
     share: float
     squares: float
     alike: tuple[str, ...] = ()
+    lag: float = 0.0
 
     @property
     def is_whole(self) -> bool:
@@ -77,9 +82,10 @@ class WrongValue:
     def __str__(self) -> str:
         found, given = (write_value(v, self.unit, 3) for v in (self.found, self.given))
         others = f"; {' or '.join(self.alike)} would explain as much" if self.alike else ""
+        lag = f"; a dead time of {write_value(self.lag, 's', 2)} before it looks the same" if self.lag else ""
         return (
-            f"freeing {self.name} explains {self.share:.0%} of the misfit, with {found} in place of {given}{others}: "
-            "correct it, or free it"
+            f"freeing {self.name} explains {self.share:.0%} of the misfit, with {found} in place of {given}{lag}"
+            f"{others}: correct it, or free it"
         )
 
 
@@ -154,9 +160,21 @@ def find_wrong_value(problem: EstimationProblem, fit: Fit) -> WrongValue | None:
         trials += [found] if (found := _try_freed(problem, fit, name, excess)) else []
     if not trials:
         return None
-    best = min(trials, key=lambda trial: trial.squares)
-    level = best.squares + ALIKE_SQUARES * max(1.0, best.squares / fit.count)
-    return replace(best, alike=tuple(t.name for t in trials if t is not best and t.squares <= level))
+    least = min(trial.squares for trial in trials)
+    level = least + ALIKE_SQUARES * max(1.0, least / fit.count)
+    alike = sorted(
+        (t for t in trials if t.squares <= level), key=lambda trial: (trial.name.startswith(NATURE), trial.squares)
+    )
+    return replace(alike[0], alike=tuple(t.name for t in alike[1:]), lag=_dead_time(problem, alike[0]))
+
+
+def _dead_time(problem: EstimationProblem, value: WrongValue) -> float:
+    """The dead time that delays slow commands as a lower bandwidth of the final control element does [s]; or 0."""
+    axis = problem.system.plant.axis
+    element = axis.final_element if axis is not None else None
+    if element is None or value.name != element.bandwidth:
+        return 0.0
+    return max(0.0, (1 / value.found - 1 / value.given) / (2 * math.pi))
 
 
 def _misses_logs(fit: Fit) -> bool:
@@ -195,7 +213,7 @@ def _try_freed(problem: EstimationProblem, fit: Fit, name: str, excess: float) -
         replace(last, iterations=LAST_TRIAL_ITERATIONS),
     )
     allowed = 1 + (1 - MIN_EXPLAINED_SHARE) * excess / fit.count
-    method = replace(freed.method, stages=stages, max_misfit=allowed)
+    method = replace(freed.method, stages=stages, max_misfit=allowed, allows_state_noise=False)
     found = solve_least_squares(freed.transcription(freed.start_from(fit)), method)
     if found.status.code is Code.INTERRUPTED:
         raise KeyboardInterrupt

@@ -60,6 +60,8 @@ class LeastSquares:
     max_misfit : float
         Squared residuals a sample, in noise variances, beyond which the search ends after the first stage, or before
         the last where the gaps do not absorb the misfit, for a caller who has other starts to try.
+    allows_state_noise : bool
+        Whether gaps may stand for noise of the states where the model misses the logs with tight ones.
     known_costs : tuple of (float, float)
         Gaps and costs at which a search from another start has ended its stages, none of which explained the logs to
         their noise; a search that comes to the same ends there (`JOINED_SEARCH`).
@@ -80,6 +82,7 @@ class LeastSquares:
     progress: ProgressCallback | None = field(default=None, repr=False, compare=False)
     budget: CpuBudget | None = field(default=None, repr=False, compare=False)
     max_misfit: float = math.inf
+    allows_state_noise: bool = True
     known_costs: tuple[tuple[float, float], ...] = field(default=(), repr=False, compare=False)
 
 

@@ -152,6 +152,8 @@ class Search:
         count, (first, *between, last) = self.current.equations.count, self.method.stages
         if not self._promised_squares(last) > MAX_JUMP_MISFIT * count:
             return self._jump_to_last_stage()
+        if not self.method.allows_state_noise:
+            return None
         near_noise = [s for s in between if self._promised_squares(s) <= MAX_CHI_SQUARE_RATIO * count]
         found = self._loosen(near_noise[-1] if near_noise else first, self.current.nodes, self.current.z)
         return found if found.converged else None
@@ -181,6 +183,8 @@ class Search:
 
     def _allow_state_noise(self, status: Status = GAPS_ABSORB_MISFIT) -> Status:
         """Let the gaps stand for noise of the states of a wrong model: the tightest with which all residuals agree."""
+        if not self.method.allows_state_noise:
+            return status
         ended = zip(self.method.stages[:-1], self.stage_ends, strict=False)
         explaining = [(stage, end) for stage, end in ended if self.is_noise(end.cost)]
         for stage, end in reversed(explaining[-MAX_LOOSENED:]):

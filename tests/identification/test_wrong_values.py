@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from pneuopt.dynamics.hooks import Axis, FinalElement
 from pneuopt.dynamics.simulate import simulate
+from pneuopt.identification import wrong_values
 from pneuopt.identification.identify import identify
 from pneuopt.identification.result import IdentificationResult
-from pneuopt.identification.wrong_values import FixedValueTest, WrongValue
+from pneuopt.identification.wrong_values import FixedValueTest, WrongValue, find_wrong_value
 from pneuopt.logs.experiments import Experiment
 from pneuopt.models.drive import ForceDrive
 from pneuopt.models.friction import Coulomb
@@ -82,3 +84,34 @@ def test_values_that_the_logs_do_not_tell_apart_are_named_together() -> None:
     sentence = str(WrongValue("load.force", 0.0, 9.8, "N", 0.804, 1000.0, ("ambient.pressure",)))
     assert sentence.startswith("freeing load.force explains 80% of the misfit, with 9.8 N in place of 0 N; ambient.")
     assert sentence.endswith("would explain as much: correct it, or free it")
+
+
+def test_a_lower_bandwidth_may_stand_for_a_dead_time() -> None:
+    value = WrongValue("valve.bandwidth", 50.0, 31.5, "Hz", 0.97, 1000.0, lag=1.87e-3)
+    assert "with 31.5 Hz in place of 50 Hz; a dead time of 1.9 ms before it looks the same: correct it" in str(value)
+
+
+@pytest.mark.parametrize(
+    ("names", "squares", "named"),
+    [
+        (("ambient.pressure", "load.force"), (1000.0, 1010.0), "load.force"),  # as good: not the air pressure
+        (("ambient.pressure", "load.force"), (1000.0, 1100.0), "ambient.pressure"),  # the logs tell them apart
+        (("valve.bandwidth", "load.force"), (1000.0, 1010.0), "valve.bandwidth"),
+    ],
+)
+def test_what_a_user_knows_best_is_named_last(
+    names: tuple[str, ...], squares: tuple[float, ...], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, found = posed(Coulomb()), dict(zip(names, squares, strict=True))
+    fit = solve_least_squares(problem.transcription(problem.candidates()[0]), problem.method)
+    axis = Axis(final_element=FinalElement("valve", "spool", "air", "", "", "valve.bandwidth", "", ()))
+    problem = replace(problem, system=replace(problem.system.plant, axis=axis))
+    monkeypatch.setattr(wrong_values, "_promised_squares", lambda *_: (2e6, dict.fromkeys(names, 1e3)))
+    monkeypatch.setattr(
+        wrong_values, "_try_freed", lambda _p, _f, name, _e: WrongValue(name, 50.0, 25.0, "Hz", 0.99, found[name])
+    )
+    value = find_wrong_value(problem, fit)
+    assert value is not None
+    assert value.name == named
+    assert value.alike == ((set(names) - {named}).pop(),) * (squares[1] < 1020)
+    assert value.lag == pytest.approx(1 / (2 * np.pi * 50) if named == "valve.bandwidth" else 0.0)

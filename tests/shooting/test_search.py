@@ -124,6 +124,15 @@ def test_a_wrong_model_is_not_searched_with_tight_gaps(monkeypatch: pytest.Monke
     assert fit.stats["iterations"] < 0.7 * whole.stats["iterations"]
 
 
+def test_a_search_without_noise_of_the_states_keeps_its_tight_gaps() -> None:
+    """A trial of another value ended with such noise, which names nothing, and took five seconds for it."""
+    problem, method = shaken(2e-3), LeastSquares()
+    loose, tight = (solve_least_squares(problem, replace(method, allows_state_noise=a)) for a in (True, False))
+    assert loose.jumps is not None
+    assert tight.jumps is None
+    assert tight.stats["gap_deviation"] == method.stages[-1].gap
+
+
 def test_foreseen_squares_are_those_that_tight_gaps_leave() -> None:
     search = Search(segment(shaken(2e-3)), LeastSquares(stages=(Stage(1e-2, 12), Stage(3e-4, 30))))
     first, last = search.method.stages
