@@ -137,9 +137,8 @@ def _page(drive: Path, logs: Sequence[Path], found: Checkup, errors: Sequence[st
     pictures = [Picture(partial(plot_finding, f), f"What shows it: {f.message}", f.message) for f in shown]
     alt = "Every channel that was read, over time."
     pictures += [Picture(partial(plot_logs, found.logs), alt, "The logs as they were read.")]
-    hashes = file_hashes(drive, *logs)
-    source = Source(title_of("Check", drive, logs), hashes, tuple(f"not read: {text}" for text in errors))
-    return summary_page(source, found.summary(), pictures)
+    source = Source(title_of("Check", drive, logs), file_hashes(drive), tuple(f"not read: {text}" for text in errors))
+    return summary_page(source, found.summary(), pictures, found.logs)
 
 
 def _figures(found: Checkup) -> dict[str, "Figure"]:

@@ -154,10 +154,11 @@ def run_select(
     known = parameters.fixed("friction.*").select(
         n for n in parameters if any(n in s.parameters for s in systems.values())
     )
+    experiments = read_experiments(logs, model.system(), known, accept)
     with progress("selecting", quiet=quiet) as report_progress:
         chosen = select_model(
             systems,
-            read_experiments(logs, model.system(), known, accept),
+            experiments,
             known,
             free=[*free, *usual_unknowns()],
             window=window,
@@ -165,8 +166,8 @@ def run_select(
         )
     tables = {"recommended": chosen.recommended, "reason": chosen.reason, "candidates": records(chosen.table)}
     status = chosen.fits[chosen.recommended].status
-    source = Source(title_of("Choice of a friction model", drive, logs), file_hashes(drive, *logs))
-    page = partial(summary_page, source, chosen.summary())
+    source = Source(title_of("Choice of a friction model", drive, logs), file_hashes(drive))
+    page = partial(summary_page, source, chosen.summary(), (), experiments)
     return finish(outputs, {}, tables, status, report=chosen.summary(), page=page)
 
 

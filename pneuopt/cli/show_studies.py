@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pneuopt.evaluation.report import metric_cell
 from pneuopt.evaluation.requirements import larger_is_better
+from pneuopt.quantities.output import format_table
 from pneuopt.quantities.report import Column, Line, Report, Table, Tone, format_number
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 
@@ -101,7 +102,7 @@ def lead_report(verdict: str, status: int) -> Report:
 def format_csv(table: "pd.DataFrame", units: Mapping[str, str]) -> str:
     """As CSV, the units in the header."""
     header = {n: f"{n} [{unit}]" for n, unit in units.items() if unit}
-    return str(table.rename(columns=header).to_csv(index=False, float_format="%.9g", lineterminator="\n"))
+    return format_table(table.rename(columns=header))
 
 
 def _format_gain(value: float) -> str:

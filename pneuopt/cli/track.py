@@ -21,7 +21,7 @@ from pneuopt.logs.dates import find_date
 from pneuopt.logs.experiments import Experiment
 from pneuopt.plotting import plot_tracking
 from pneuopt.quantities.errors import check_names, require
-from pneuopt.quantities.output import records, write_text
+from pneuopt.quantities.output import format_table, records, write_text
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.status import ProgressCallback
 from pneuopt.report.fit_page import Source
@@ -86,7 +86,7 @@ def run_track(drive: Path, logs: Sequence[Path], options: TrackOptions, outputs:
     if outlook is not None:
         tables["design"] = records(outlook.table)
         shown += outlook.summary()
-    source = Source(title_of("Tracking", drive, logs), file_hashes(*inputs))
+    source = Source(title_of("Tracking", drive, logs), file_hashes(*inputs[:1], *inputs[1 + len(logs) :]))
     page = partial(summary_page, source, shown, [tracking_picture(found)], experiments)
     finish(outputs, writers, tables, None, figures=lambda: {"": plot_tracking(found)}, report=shown, page=page)
     return EXIT_FAILURE if found.drifting or (outlook is not None and outlook.fails is not None) else 0
@@ -112,4 +112,4 @@ def _read_dates(logs: Sequence[Path], given: str) -> "list[str | date]":
 
 
 def _write_history(path: Path, table: "pd.DataFrame") -> None:
-    write_text(path, table.reset_index().to_csv(index=False, float_format="%.9g", lineterminator="\n"))
+    write_text(path, format_table(table.reset_index()))

@@ -113,6 +113,11 @@ class BlockForm:
     clamps: bool = True
     time_grain: float = 0.0
 
+    @property
+    def maker(self) -> str:
+        """The first word of the title."""
+        return self.title.partition(" ")[0]
+
 
 def _number(value: float) -> str:
     return f"{value:.9g}" if math.isfinite(value) else "0 (switches it off)"

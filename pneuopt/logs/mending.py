@@ -202,7 +202,8 @@ def write_mended(mended: MendedLog, path: Path, units: Mapping[str, str]) -> dic
         for row in np.column_stack([t.t, t.matrix(t.names)]).tolist()
     ]
     source = log.source.path if log.source else log.name
-    lines = [f"# Made from {Path(source).name} (sha256 {log.sha256}):", *(f"# {change}" for change in mended.changes)]
+    said = [f"Made from {Path(source).name} (sha256 {log.sha256}):", *mended.changes]
+    lines = [f"# {''.join(c if c.isprintable() else '?' for c in text)}" for text in said]  # a line's end would end it
     lines += [] if mended.changes else ["# nothing was changed"]
     lines += [f"accept = {list(log.accept)}"] if log.accept else []
     sections = {

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+"""What text begins with that a spreadsheet computes; a number is none, it is no text here."""
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file whole or not at all.
 
@@ -84,6 +88,26 @@ def write_json(path: str | Path, document: Mapping[str, Any]) -> None:
     document : mapping
     """
     write_text(path, _to_json(plain_value(document)))
+
+
+def format_table(frame: "pd.DataFrame") -> str:
+    """A table as CSV, without its index; text that a spreadsheet would take for a formula has an apostrophe before it.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> print(format_table(pd.DataFrame({"=name": ["=1+1", "run"], "value": [-0.5, 2.0]})))
+    '=name,value
+    '=1+1,-0.5
+    run,2
+    <BLANKLINE>
+    """
+    shown = frame.rename(columns=_quote_formula).map(_quote_formula)
+    return str(shown.to_csv(index=False, float_format="%.9g", lineterminator="\n"))
+
+
+def _quote_formula(cell: Any) -> Any:
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA_STARTS) else cell
 
 
 def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:

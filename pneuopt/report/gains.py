@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pneuopt.control.forms import ParallelForm, to_series, to_standard
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.export.vendor_blocks import Block
+from pneuopt.export.vendor_blocks import BLOCK_FORMS, Block
 from pneuopt.quantities.errors import InputError
 from pneuopt.quantities.parameters import ParameterSet
 from pneuopt.quantities.report import TIED, Line, Report, Table, text_columns
@@ -24,7 +24,7 @@ EXPORTS = {
     "st": "a PLC (IEC 61131-3 structured text)",
     "c": "a microcontroller (C99, with a test)",
     "python": "a Python program",
-    **{block.value: f"the PID block of {block.value.capitalize()}" for block in Block},
+    **{block.value: f"the PID block of {BLOCK_FORMS[block].maker}" for block in Block},
     "fmu": "a simulation tool (the plant as FMU)",
 }
 """The forms of `pneuopt export`, and who takes them."""

@@ -15,7 +15,6 @@ from pneuopt.export.javascript import write_loop_javascript
 from pneuopt.models.load import GRAVITY
 from pneuopt.quantities.errors import ConvergenceError, InputError
 from pneuopt.quantities.parameters import ParameterSet
-from pneuopt.quantities.unit_algebra import difference_unit
 from pneuopt.report.live_rest import RestFinder, is_refused
 
 if TYPE_CHECKING:
@@ -152,7 +151,7 @@ def _slider(finders: Sequence[RestFinder], parameters: ParameterSet, name: str) 
         return None
     is_log = low > 0 and high / low > LOG_RANGE
     place = list(loop.parameters).index(name)
-    return {"name": name, "place": place, "unit": difference_unit(p.unit), "low": low, "high": high, "isLog": is_log}
+    return {"name": name, "place": place, "unit": p.unit, "low": low, "high": high, "isLog": is_log}
 
 
 def _runnable_end(finders: Sequence[RestFinder], name: str, value: float, end: float) -> float:

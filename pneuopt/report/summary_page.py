@@ -28,7 +28,7 @@ def summary_page(
     found : Report
     pictures : sequence of Picture
     experiments : sequence of Experiment
-        Logs of which the page lists what was read.
+        Logs of which the page lists what was read, and their hashes.
     provenance : mapping of str to str, optional
         The result's own.
     """
@@ -39,9 +39,13 @@ def summary_page(
         Section("Figures", tuple(pictures)),
         Section("Result", (details,)),
         *((data_section(experiments),) if experiments else ()),
-        provenance_section(dict(provenance or {}), source.hashes),
+        provenance_section(dict(provenance or {}), {**source.hashes, **_hashes(experiments)}),
     )
     return Page(source.title, Report((first,) if is_line else ()), sections, source.warnings)
+
+
+def _hashes(experiments: Sequence[Experiment]) -> dict[str, str]:
+    return {f"sha256[{e.name}]": e.sha256 for e in experiments if e.sha256}
 
 
 def tracking_picture(found: Tracking) -> Picture:

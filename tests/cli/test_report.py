@@ -104,6 +104,10 @@ def test_hostile_names_of_files_and_columns_are_text(folder: Path) -> None:
     assert f"Identification of <b>drive.toml from {name}.csv" in read.text
     assert ("td", "<script>alert(2)</script>") in read.words
     assert not read.named("img")
+    assert run("check", "<b>drive.toml", f"{name}.csv", "--report", "page.html").exit_code == 0
+    read = page()
+    assert f"Check of <b>drive.toml with {name}.csv" in read.text
+    assert not [*read.named("img"), *read.named("b")]
 
 
 def test_a_check_has_its_page(folder: Path) -> None:
@@ -111,7 +115,7 @@ def test_a_check_has_its_page(folder: Path) -> None:
     result = run("check", "drive.toml", "run_01.csv", "broken.csv", "--report", "page.html")
     assert (result.exit_code, "wrote page.html" in result.stdout) == (2, True), result.output
     read = page()
-    assert headings(read) == ["Figures", "Result", "Provenance"]
+    assert headings(read) == ["Figures", "Result", "Data", "Provenance"]
     assert verdict(read) == result.stdout.splitlines()[0]
     assert any(words.startswith("not read: broken.csv: ") for tag, words in read.words if tag == "li")
     assert "friction.coulomb" in read.text
@@ -121,9 +125,7 @@ def test_a_check_has_its_page(folder: Path) -> None:
 def test_a_tuning_has_its_page(folder: Path) -> None:
     result = run("tune", "drive.toml", "tuning.toml", "-o", "tuned.toml", "--report", "page.html", "-q")
     assert result.exit_code == 0, result.output
-    assert result.stdout.endswith(
-        "Next: pneuopt export drive.toml tuned.toml --to st    (for a PLC; pneuopt export --help)\n"
-    )
+    assert result.stdout.endswith("Next: pneuopt export drive.toml tuned.toml --to st    (for a PLC; or --help)\n")
     read = page()
     assert ("td", "pneuopt export drive.toml tuned.toml --to siemens") in read.words
     assert verdict(read).startswith("converged: ")

@@ -1,9 +1,11 @@
 """`mend_log`: what no reader takes, mended by rule, and said row by row."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomlkit
 
 from pneuopt.logs.experiments import Experiment
 from pneuopt.logs.mending import mend_log, write_mended
@@ -98,3 +100,10 @@ def test_a_decimal_comma_is_no_fault(tmp_path: Path) -> None:
 def test_two_recordings_in_a_file_are_not_mended(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="300 of 600 rows would be left out"):
         mend_log(write(tmp_path, [*LINES, *LINES[1:]]))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such names on Windows")
+def test_a_line_in_a_logs_name_is_no_key_of_the_sidecar(tmp_path: Path) -> None:
+    path = write(tmp_path, LINES).rename(tmp_path / 'a\n[conditions]\n"load.mass" = "1 kg"\n#.csv')
+    (_, _), (_, sidecar) = write_mended(mend_log(path), tmp_path / "new.csv", {}).items()
+    assert "conditions" not in tomlkit.parse(sidecar)

@@ -2,13 +2,14 @@ import json
 import math
 import os
 import stat
+from io import StringIO
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from pneuopt.quantities.errors import InputError
-from pneuopt.quantities.output import check_output_paths, write_json, write_records, write_text
+from pneuopt.quantities.output import check_output_paths, format_table, write_json, write_records, write_text
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -133,3 +134,13 @@ def test_a_disk_that_is_full_leaves_the_old_file_and_no_other(tmp_path: Path, mo
     with pytest.raises(InputError, match="cannot be written \\(No space left on device\\)"):
         write_text(path, "lost")
     assert [p.read_text() for p in tmp_path.iterdir()] == ["kept"]
+
+
+def test_text_in_a_table_is_no_formula() -> None:
+    """Names of logs, cases and columns come from users; a spreadsheet computes what begins with = + - @."""
+    hostile = ["=cmd|' /C calc'!A0", "+1", "-1+1", "@SUM(A1)", "\t=1", "run_01", "a=b"]
+    frame = pd.DataFrame({"=HYPERLINK(1)": hostile, "value": [-1.5, *range(6)]})
+    read = pd.read_csv(StringIO(format_table(frame)))
+    assert list(read) == ["'=HYPERLINK(1)", "value"]
+    assert read.iloc[:, 0].tolist() == [f"'{text}" for text in hostile[:5]] + hostile[5:]
+    assert read["value"].tolist() == [-1.5, *range(6)]
