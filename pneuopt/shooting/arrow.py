@@ -130,6 +130,20 @@ class ArrowEquations:
                 self.gradient - flat.T @ node_part,
             )
 
+    def node_step(self, damping: Array) -> Array | None:
+        """The Gauss-Newton step of the nodes alone, shape (m, n); None where their matrix is not positive definite.
+
+        Parameters
+        ----------
+        damping : ndarray, shape (m,)
+            Of each node's diagonal.
+        """
+        with np.errstate(all="ignore"):  # as in an elimination
+            try:
+                return -self.solve_nodes(self.node_gradient.reshape(-1, 1), damping).reshape(self.node_gradient.shape)
+            except LinAlgError:
+                return None
+
     def descent_rate(self, step: GaussNewtonStep) -> float:
         """Rate at which the cost falls along a step."""
         with np.errstate(all="ignore"):

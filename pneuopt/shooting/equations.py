@@ -255,27 +255,6 @@ def segment_gaps(segments: Segments, nodes: Array, x_end: Array) -> Array:
     return gaps
 
 
-def second_order_correction(equations: NormalEquations, step: Array, moved: Array, nodes: Array, gaps: Array) -> Array:
-    """Second-order correction of a step: shift the nodes so that the gaps become what the linear model promised.
-
-    Parameters
-    ----------
-    equations : NormalEquations
-        Where the step (nodes `step`, shape (m, n) in nominal sizes; parameters `moved`, shape (k,)) was computed.
-    step, moved : ndarray
-    nodes, gaps : ndarray, shape (m, n)
-        The nodes after the step, and the gaps behind them.
-
-    Returns
-    -------
-    ndarray, shape (m, n)
-    """
-    segments, slopes, n = equations.segments, equations.linearisation, nodes.shape[1]
-    excess = gaps - _promised_gaps(equations, _unknown_changes(equations, step, moved))
-    shift = propagate_shifts(np.where(segments.linked[:, None, None], slopes.end_sensitivities[:, :, :n], 0.0), excess)
-    return np.asarray(nodes + shift * segments.nominal)
-
-
 def missed_curvature(
     equations: NormalEquations, step: Array, moved: Array, trial: NormalEquations, sigma: Array
 ) -> Array:
