@@ -1,6 +1,7 @@
 """The public names and their homes, from which `__init__.py` loads them when they are first used."""
 
 from . import plotting
+from .control.acceleration_feedback import AccelerationFeedback
 from .control.averaging import average_dither, mean_start, ripple
 from .control.bumpless import bumpless_transfer
 from .control.dead_zone_inverse import DeadZoneInverse
@@ -24,6 +25,7 @@ from .control.loop import ClosedLoop
 from .control.motion_feedforward import MotionFeedforward
 from .control.moves import Move, MoveProfile
 from .control.pid import PID, AntiWindup
+from .control.pressure_feedback import PressureFeedback
 from .control.reference import Reference, Step
 from .control.sensor import Encoder, SensorLag
 from .dynamics.python_control import from_control, to_control
@@ -169,6 +171,7 @@ __all__ = [
     "ITAE",
     "PID",
     "AOptimal",
+    "AccelerationFeedback",
     "Actuator",
     "AirUse",
     "AntiWindup",
@@ -259,6 +262,7 @@ __all__ = [
     "Precision",
     "Presliding",
     "PressureDependent",
+    "PressureFeedback",
     "Processes",
     "Profile",
     "Progress",

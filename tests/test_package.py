@@ -16,8 +16,10 @@ import pneuopt
 ROOT = Path(__file__).parents[1]
 PUBLIC_NAMES = [
     "AOptimal",
+    "AccelerationFeedback",
     "DOptimal",
     "ExperimentDesign",
+    "PressureFeedback",
     "next_experiment",
     "Precision",
     "Actuator",

@@ -135,7 +135,8 @@ class AveragedPlant:
         if not waves.frequency:
             return best
         point = best.output[:, -1], u[:, names(loop.plant.inputs).index(loop.command.name)]
-        waves = replace(waves, feedback=controller_response(loop, p, waves.frequency, *point))
+        if not loop.is_composed:  # far above its bandwidth such a controller is taken not to react
+            waves = replace(waves, feedback=controller_response(loop, p, waves.frequency, *point))
         left = _imbalance(best, waves)
         step, size = _newton_step(best, waves, left), np.linalg.norm(left, axis=1)
         fraction, k = np.ones(len(x)), np.arange(len(x))

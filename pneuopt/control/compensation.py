@@ -87,7 +87,7 @@ class Compensator(Protocol):
         """What it remembers."""
         ...
 
-    def start(self, seen: Instant) -> list[Any]:
+    def start(self, on: SensedSignal, seen: Instant) -> list[Any]:
         """The states in a loop whose signals have been constant so far, or with a sampled PID since the last sample."""
         ...
 
@@ -185,7 +185,7 @@ def compensation_function(loop: CompensatedLoop, on: SensedSignal, command: Quan
     for part in acting_always(loop):
         rates = dict.fromkeys(part.motion_inputs(on), ca.SX(0))
         seen = Instant(ca.SX(0), r, y, made, None, rates, shown)
-        x = dict(zip((q.name for q in part.states(on, command)), map(ca.SX, part.start(seen)), strict=True))
+        x = dict(zip((q.name for q in part.states(on, command)), map(ca.SX, part.start(on, seen)), strict=True))
         made = made + part.act(seen, x, without_prefix(p, part.section))[1]
     slopes = (ca.densify(ca.jacobian(made, signal)) for signal in (v, y))
     return ca.Function("compensation", [v, r, y, stack(shown), stack(p)], [made, *slopes])

@@ -60,7 +60,7 @@ class DeadZoneInverse:
         """None."""
         return ()
 
-    def start(self, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
         """No states."""
         return []
 

@@ -94,7 +94,7 @@ class FrictionFeedforward:
         """None."""
         return ()
 
-    def start(self, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
         """No states."""
         return []
 

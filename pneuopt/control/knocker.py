@@ -77,7 +77,7 @@ class Knocker:
         """The command and the direction at the last onset."""
         return replace(command, name="command"), Quantity("direction", "1")
 
-    def start(self, seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, seen: Instant) -> list[Any]:
         """The command so far, and no direction."""
         return [seen.command, 0.0]
 

@@ -6,9 +6,10 @@ from functools import lru_cache
 import numpy as np
 
 from pneuopt.control.averaged_plant import AveragedPlant
+from pneuopt.control.composed_loops import ComposedLoops
 from pneuopt.control.linear_controller import linear_controller, operating_point
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.dynamics.system import Linearisation
+from pneuopt.dynamics.system import Linearisation, names
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import ParameterSet
 
@@ -61,7 +62,8 @@ def open_loop(
     P is the `linear_plant`, averaged under dither.
     A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé form,
     its integral as one without a dead band. Compensators that act always count by their slopes at the operating point;
-    a knocker's pulses do not. Parameters as for `linear_plant`.
+    a knocker's pulses do not. A loop with further feedback (`ClosedLoop.is_composed`) is cut at the command, and a
+    sampled one of these is exact, see `composed_loops`. Parameters as for `linear_plant`.
 
     Returns
     -------
@@ -69,6 +71,8 @@ def open_loop(
         From the control error, input "error", to the measured output; the plant's states come first.
     """
     x, u = operating_point(loop, parameters, x, u)
+    if loop.is_composed:
+        return _composed_loops(loop, parameters, x, u)[0]
     plant, controller = linear_plant(loop, parameters, x, u), linear_controller(loop, parameters, x, u)
     m, n = len(controller.A), len(plant.A)
     return Linearisation(
@@ -80,6 +84,38 @@ def open_loop(
         ("error",),
         (loop.feedback.name,),
     )
+
+
+def noise_path(
+    loop: ClosedLoop, parameters: ParameterSet, x: Array | None = None, u: Mapping[str, float] | None = None
+) -> Linearisation:
+    """The controller of a loop with further feedback, from noise on what the PID sees to the command.
+
+    Parameters as for `linear_plant`; frequencies as in `open_loop`.
+    """
+    return _composed_loops(loop, parameters, *operating_point(loop, parameters, x, u))[1]
+
+
+def _composed_loops(
+    loop: ClosedLoop, parameters: ParameterSet, x: Array, u: Mapping[str, float]
+) -> tuple[Linearisation, Linearisation]:
+    """The open loop and the noise path at an operating point."""
+    loop.check(parameters)
+    at = np.array([[u.get(n, 0.0) for n in names(loop.plant.inputs)]])
+    found = _composed(loop)(loop.parameter_vector(parameters)[None], np.asarray(x, dtype=float)[None], at)
+    plant = names(loop.plant.states)
+    own = [f"controller.{k}" for k in range(found.loop[0].shape[-1] - len(plant))]
+    A, B, C, D = (M[0] for M in found.loop)
+    opened = Linearisation(A, B, C, D, (*plant, *own), ("error",), (loop.command.name,))
+    A, B, C, D = (M[0] for M in found.noise)
+    states = tuple(f"controller.{k}" for k in range(found.noise[0].shape[-1]))
+    return opened, Linearisation(A, B, C, D, states, ("noise",), (loop.command.name,))
+
+
+@lru_cache(maxsize=8)
+def _composed(loop: ClosedLoop) -> ComposedLoops:
+    """The function of a loop, kept likewise."""
+    return ComposedLoops(loop)
 
 
 @lru_cache(maxsize=8)

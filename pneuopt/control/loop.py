@@ -7,14 +7,13 @@ drives the actuated input.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from operator import or_
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from pneuopt.control.command import added_command
 from pneuopt.control.compensation import (
     Compensator,
     check_compensators,
@@ -24,6 +23,7 @@ from pneuopt.control.compensation import (
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import ParallelForm, parallel_gains
+from pneuopt.control.loop_equations import continuous_rates, held_rates
 from pneuopt.control.loop_start import start_state
 from pneuopt.control.pid import PID
 from pneuopt.control.sampled import controller_update
@@ -34,7 +34,6 @@ from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (
     DiscreteSystem,
     Motion,
-    Symbols,
     System,
     define,
     discretise,
@@ -45,7 +44,7 @@ from pneuopt.dynamics.system import (
 from pneuopt.quantities.arguments import check_argument
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import ModelError, require
-from pneuopt.quantities.parameters import ParameterSet, Quantity, with_prefix, without_prefix
+from pneuopt.quantities.parameters import ParameterSet, Quantity, without_prefix
 from pneuopt.quantities.unit_algebra import unit_ratio
 
 
@@ -127,6 +126,11 @@ class ClosedLoop:
         """The plant's output that is fed back."""
         return select_signal("output", self.measured, self.plant.outputs, "speed")
 
+    @property
+    def controlled(self) -> Quantity:
+        """The plant's output that the PID controls."""
+        return self.feedback
+
     @cached_property
     def parameters(self) -> ParameterSet:
         """Those of the plant, "pid.*", "dither.*", "sensor.*", "feedforward.*" and the compensators', all defaults."""
@@ -182,6 +186,12 @@ class ClosedLoop:
         """The plant's, then "control": what the actuator gets."""
         return (*self.plant.outputs, replace(self.command, name="control"))
 
+    @property
+    def is_composed(self) -> bool:
+        """Whether more than the PID remembers what it is fed back: linearised, the loop is `ComposedLoops`'s."""
+        on = self.sensed_signal
+        return any(part.acts_always and part.states(on, self.command) for part in self.compensators)
+
     def system(self) -> System:
         """The loop as one ODE, with a continuous PID.
 
@@ -196,7 +206,7 @@ class ClosedLoop:
             f"a loop sampled every {h} s is no ODE; use discrete(), or hold_system() between samples",
             ModelError,
         )
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._continuous_rhs)
+        return define(self.states, self.inputs, self.outputs, self.parameters, partial(continuous_rates, self))
 
     def hold_system(self) -> System:
         """Between two samples of a sampled PID: the plant runs on the held command, the controller's states rest.
@@ -204,7 +214,7 @@ class ClosedLoop:
         An analogue dither is in here, as a function of time; a sampled one is part of the held command.
         """
         require(self.pid.sample_time is not None, "a continuous loop holds nothing; use system()", ModelError)
-        return define(self.states, self.inputs, self.outputs, self.parameters, self._hold_rhs)
+        return define(self.states, self.inputs, self.outputs, self.parameters, partial(held_rates, self))
 
     @cached_property
     def update(self) -> ca.Function:
@@ -212,7 +222,7 @@ class ClosedLoop:
         require(self.pid.sample_time is not None, "a continuous loop has no update; use system()", ModelError)
         t, x, u = ca.SX.sym("t"), symbols(self.states), symbols(self.inputs)
         p: Signals = {n: ca.SX.sym(n) for n in self.parameters}
-        y = self._plant_rates(t, x, u, p, ca.SX(0))[1]
+        y = evaluate_plant(self.plant, self.command.name, t, x, u, p, ca.SX(0))[1]
         after = stack({**x, **controller_update(self, t, x, u, y, p).states})
         return ca.Function("update", [t, *map(stack, (x, u, p))], [after], ["t", "x", "u", "p"], ["x_after"])
 
@@ -346,41 +356,6 @@ class ClosedLoop:
         """
         self.check(parameters)
         return start_state(self, parameters, x_plant, reference, command, start or {})
-
-    def _continuous_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        shown = self._plant_rates(t, x, u, p, ca.SX(0))[1]
-        seen = x["sensor.reading"] if self.sensor else shown[self.feedback.name]
-        moved, added = added_command(self, t, x, u, seen, shown, p)
-        rates, command = self.pid.rates(
-            without_prefix(x, "pid"),
-            u["reference"],
-            seen,
-            added,
-            without_prefix(p, "pid"),
-        )
-        xdot, y = self._plant_rates(t, x, u, p, command)
-        own = with_prefix(rates, "pid") | moved | self._sensor_rates(x, y, p)
-        return xdot | own, y | {"control": command}
-
-    def _hold_rhs(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
-        command = x["pid.command"]
-        if self.dither and self.dither.analogue:
-            command = self.pid.clip(
-                command + self.dither.wave(t, without_prefix(p, "dither")), without_prefix(p, "pid")
-            )
-        xdot, y = self._plant_rates(t, x, u, p, command)
-        held = tuple(f"{n}." for n in self.tunable_sections)
-        own = {n: ca.SX(0) for n in x if n.startswith(held)} | self._sensor_rates(x, y, p)
-        return xdot | own, y | {"control": command}
-
-    def _sensor_rates(self, x: Symbols, y: Symbols, p: Symbols) -> Signals:
-        if self.sensor is None:
-            return {}
-        own = without_prefix(x, "sensor"), y, self.sensed_signal, without_prefix(p, "sensor")
-        return with_prefix(self.sensor.rates(*own), "sensor")
-
-    def _plant_rates(self, t: ca.SX, x: Symbols, u: Symbols, p: Symbols, command: ca.SX) -> tuple[Signals, Signals]:
-        return evaluate_plant(self.plant, self.command.name, t, x, u, p, command)
 
     @cached_property
     def sensed_signal(self) -> SensedSignal:

@@ -42,5 +42,5 @@ def start_state(
     v = float(uncompensated_command(loop, p, reference, seen, command, [y[n] for n in loop.readings])[0])
     own = loop.pid.start(reference, seen, v, {**without_prefix(value, "pid"), "Kp": float(loop.gains(p)[0])})
     known = Instant(0.0, reference, seen, v, loop.pid.sample_time, {}, y)
-    others = [float(remembered) for part in loop.compensators for remembered in part.start(known)]
+    others = [float(remembered) for part in loop.compensators for remembered in part.start(loop.sensed_signal, known)]
     return np.concatenate([x, sensor, own, [reference] if loop.feedforward else [], others])

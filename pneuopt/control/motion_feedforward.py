@@ -70,7 +70,7 @@ class MotionFeedforward:
         """None."""
         return ()
 
-    def start(self, _seen: Instant) -> list[Any]:
+    def start(self, _on: SensedSignal, _seen: Instant) -> list[Any]:
         """No states."""
         return []
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pneuopt.control.averaged_plant import AveragedPlant
+from pneuopt.control.composed_loops import ComposedLoops
 from pneuopt.control.linear_controller import controller_matrices, linear_gains, pade_delay_response
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.dynamics.system import names
@@ -20,6 +21,7 @@ from pneuopt.quantities.arrays import Array
 
 MAX_SENSITIVITY = "MaxSensitivity"
 Matrices = tuple[Array, Array, Array]  # A, B, C of m plants, shapes (m, n, n), (m, n, 1), (m, 1, n)
+Matrices4 = tuple[Array, Array, Array, Array]  # and D, shape (m, 1, 1)
 
 
 MarginFunction = Callable[[Array, Array, Array, Collection[str]], dict[str, Array]]
@@ -49,12 +51,9 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
         checked.
     """
     w = np.asarray(omega, dtype=float)
+    if loop.is_composed:
+        return _read_worst(_composed_reader(loop, w, lowest_noise))
     linearise, command = _plants(loop), names(loop.plant.inputs).index(loop.command.name)
-
-    def read_margins(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
-        k, m = x.shape[:2]
-        found = read_points(np.tile(p, (k, 1)), x.reshape(k * m, -1), u.reshape(k * m, -1), only)
-        return {n: _worst_in_columns(n, v.reshape(k, m)[-counted_points(n, k) :]) for n, v in found.items()}
 
     def read_points(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
         plants = linearise(p, x, u)
@@ -65,25 +64,76 @@ def batch_margin_function(loop: ClosedLoop, omega: ArrayLike, lowest_noise: floa
             opened = np.concatenate([_poles(matrices[0]), _poles(controllers[0])], axis=1)
             found = {MAX_SENSITIVITY: sensitivity_peaks(opened, closed, w[0], w[-1])}
         else:
-            found = _read_responses(gains, plants.response(loop.dead_time, w), w, lowest_noise, only)
+            respond, at_infinity = _pid_responses(gains, plants.response(loop.dead_time, w))
+            found = _read_responses(respond, at_infinity, w, lowest_noise, only)
         if MAX_SENSITIVITY in only:  # at infinity the loop is open
             found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], 1.0)
-        stable = are_stable(closed)
-        return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
+        return _mark_unstable(found, closed)
+
+    return _read_worst(read_points)
+
+
+def _read_worst(read_points: MarginFunction) -> MarginFunction:
+    """The function that reads the worst over operating points, from one that reads single points."""
+
+    def read_margins(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
+        k, m = x.shape[:2]
+        found = read_points(np.tile(p, (k, 1)), x.reshape(k * m, -1), u.reshape(k * m, -1), only)
+        return {n: _worst_in_columns(n, v.reshape(k, m)[-counted_points(n, k) :]) for n, v in found.items()}
 
     return read_margins
 
 
-def _read_responses(
-    gains: Array, plant: Callable[[Array], ComplexArray], w: Array, lowest_noise: float, only: Collection[str]
-) -> dict[str, Array]:
-    """Margins and peaks of loops on frequencies of shape (n,), crossings interpolated and peaks refined."""
+def _composed_reader(loop: ClosedLoop, w: Array, lowest_noise: float) -> MarginFunction:
+    """Function that reads the margins of loops with further feedback, for parameters and points of shape (m, n)."""
+    linearise = ComposedLoops(loop, compiled=True)
+
+    def read_points(p: Array, x: Array, u: Array, only: Collection[str]) -> dict[str, Array]:
+        opened, noise = linearise(p, x, u)
+        loops, controllers = (_matrix_response(own, w) for own in (opened, noise))
+        (A, B, C, D), ends = opened, (opened[3][:, 0, 0], noise[3][:, 0, 0])
+        found = _read_responses(
+            lambda w: (loops(w), controllers(w)), np.abs(ends[1] / (1 + ends[0])), w, lowest_noise, only
+        )
+        if MAX_SENSITIVITY in only:
+            found[MAX_SENSITIVITY] = np.maximum(found[MAX_SENSITIVITY], np.abs(1 / (1 + ends[0])))
+        return _mark_unstable(found, _poles(A - B @ C / (1 + D)))
+
+    return read_points
+
+
+def _matrix_response(system: Matrices4, typical: Array) -> Callable[[Array], ComplexArray]:
+    """Responses of m systems with one input and one output."""
+    A, B, C, D = system
+    response = _partial_fraction_response(A, B[..., 0], C[:, 0], typical)
+    return lambda w: np.asarray(response(w) + D[:, 0])
+
+
+def _mark_unstable(found: dict[str, Array], closed: ComplexArray) -> dict[str, Array]:
+    """Metrics with those of unstable loops NaN or infinite, by the closed loops' poles."""
+    stable = are_stable(closed)
+    return {n: np.where(stable, value, nan if n in _MARGIN_FUNCTIONS else inf) for n, value in found.items()}
+
+
+Responses = Callable[[Array], tuple[ComplexArray, ComplexArray]]
+"""``w -> (L, C)``: responses of m loops and of their controllers from measurement to command."""
+
+
+def _pid_responses(gains: Array, plant: Callable[[Array], ComplexArray]) -> tuple[Responses, Array]:
+    """Of loops with a PID alone, and what a noise gain is at infinity, shape (m,)."""
     Kp, Ki, Kd, Tf = gains[..., None]
 
     def responses(w: Array) -> tuple[ComplexArray, ComplexArray]:
         a, b = controller_parts((Kp, Ki, Kd, Tf), w)
         return plant(w) * (a + 1j * b), a + 1j * b
 
+    return responses, np.abs(Kp + Kd / Tf)[:, 0]
+
+
+def _read_responses(
+    responses: Responses, noise_at_infinity: Array, w: Array, lowest_noise: float, only: Collection[str]
+) -> dict[str, Array]:
+    """Margins and peaks of loops on frequencies of shape (n,), crossings interpolated and peaks refined."""
     (L, C), noisy = responses(w), int(np.searchsorted(w, (1 - 1e-9) * lowest_noise))
     with np.errstate(all="ignore"):
         found = {n: crossing(L) for n, crossing in _MARGIN_FUNCTIONS.items() if n in only}
@@ -91,7 +141,7 @@ def _read_responses(
             k = noisy if n == NOISE_GAIN else 0
             found[n] = _refine_peaks(size, responses, w[k:], size(L[:, k:], C[:, k:]))
     if NOISE_GAIN in only:
-        found[NOISE_GAIN] = np.maximum(found[NOISE_GAIN], np.abs(Kp + Kd / Tf)[:, 0])
+        found[NOISE_GAIN] = np.maximum(found[NOISE_GAIN], noise_at_infinity)
     return found
 
 

@@ -146,7 +146,7 @@ def lowest_noise_frequency(horizon: float) -> float:
 
 def noise_gain(
     open_loop: Linearisation,
-    gains: tuple[float, float, float, float],
+    controller: tuple[float, float, float, float] | Linearisation,
     lowest_frequency: float = 0.0,
     on_grid: GridResponse | None = None,
 ) -> float:
@@ -159,8 +159,8 @@ def noise_gain(
     ----------
     open_loop : Linearisation
         ``L = C P`` (`open_loop`), strictly proper.
-    gains : (float, float, float, float)
-        Kp, Ki, Kd, Tf of the PID C, with Tf > 0.
+    controller : (float, float, float, float) or Linearisation
+        Kp, Ki, Kd, Tf of the PID C, with Tf > 0; or C itself (`noise_path`).
     lowest_frequency : float
         [rad/s]; what lies below does not count. An integral answers a constant error of a measured speed without bound
         where the plant cannot go on moving so, a piston whose chambers fill for example.
@@ -180,10 +180,16 @@ def noise_gain(
     >>> noise_gain(L, (3.0, 0.0, 0.0, 0.01))
     3.0
     """
-    Kp, _, Kd, Tf = gains
+    if isinstance(controller, Linearisation):
+        at_infinity = float(controller.D[0, 0] / (1 + open_loop.D[0, 0]))
+    else:
+        Kp, _, Kd, Tf = controller
+        at_infinity = Kp + Kd / Tf
 
     def control_response(w: Array, L: ComplexArray) -> ComplexArray:
-        a, b = controller_parts(gains, w)
+        if isinstance(controller, Linearisation):
+            return np.asarray(frequency_response(controller, w) / (1 + L))
+        a, b = controller_parts(controller, w)
         return np.asarray((a + 1j * b) / (1 + L))
 
     on_grid = on_grid or GridResponse.of(open_loop)
@@ -191,7 +197,7 @@ def noise_gain(
         counts, first = on_grid.omega > lowest_frequency, [lowest_frequency]
         L = np.append(frequency_response(open_loop, first), on_grid.L[counts])
         on_grid = GridResponse(np.append(first, on_grid.omega[counts]), L)
-    return _response_peak(control_response, open_loop, on_grid, Kp + Kd / Tf)[0]
+    return _response_peak(control_response, open_loop, on_grid, at_infinity)[0]
 
 
 def frequency_response(linearisation: Linearisation, omega: ArrayLike) -> ComplexArray:

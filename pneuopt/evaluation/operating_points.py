@@ -24,7 +24,7 @@ import numpy as np
 
 from pneuopt.control.averaged_plant import is_affine
 from pneuopt.control.linear_controller import operating_gains
-from pneuopt.control.linear_loop import open_loop
+from pneuopt.control.linear_loop import noise_path, open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.reference import Reference, disturbance_input
 from pneuopt.control.rest import find_rest, set_sliding_direction
@@ -210,13 +210,14 @@ def _find_points(
 def _margin_row(loop: ClosedLoop, parameters: ParameterSet, point: OperatingPoint, horizon: float) -> dict[str, Any]:
     linear, lowest = open_loop(loop, parameters, point.x, point.inputs), lowest_noise_frequency(horizon)
     on_grid = GridResponse.of(linear)
-    robust = margins(linear, on_grid)
+    robust, at = margins(linear, on_grid), (loop, parameters, point.x, point.inputs)
+    controller = noise_path(*at) if loop.is_composed else operating_gains(*at)
     found = {
         "MaxSensitivity": robust.max_sensitivity,
         "MaxComplementarySensitivity": robust.max_complementary_sensitivity,
         "GainMargin": robust.gain_margin,
         "PhaseMargin": robust.phase_margin,
-        NOISE_GAIN: noise_gain(linear, operating_gains(loop, parameters, point.x, point.inputs), lowest, on_grid),
+        NOISE_GAIN: noise_gain(linear, controller, lowest, on_grid),
     }
     if not robust.stable:
         found = {n: nan if n.endswith("Margin") else inf for n in found}

@@ -30,6 +30,9 @@ STATE_MEANINGS: Mapping[str, str] = {
     "pid.previous_error": "weighted error of the sample before",
     "pid.pending": "command that acts at the next sample",
     "feedforward.filter": "reference, filtered",
+    "pressure_feedback.slow": "differential pressure, its slow part",
+    "acceleration_feedback.position": "filtered position",
+    "acceleration_feedback.speed": "filtered speed",
     "knocker.command": "command at the last pulse's onset",
     "knocker.direction": "direction of the last pulse",
 }
@@ -201,7 +204,7 @@ def _start(parts: _ComputedParts, u: Signals, shown: Signals, p: Symbols, centre
     begun["feedforward.filter"] = u["reference"]
     for part in parts.compensators:
         known = Instant(ca.SX(0), u["reference"], seen, command, parts.pid.sample_time, {}, shown)
-        own = zip(part.states(parts.sensed_signal, unit), part.start(known), strict=True)
+        own = zip(part.states(parts.sensed_signal, unit), part.start(parts.sensed_signal, known), strict=True)
         begun |= {f"{part.section}.{q.name}": v for q, v in own}
     return {**begun, SAMPLE: ca.SX(0)}
 

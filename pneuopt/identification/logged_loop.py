@@ -189,7 +189,7 @@ class LoggedLoop:
         x0 = {f"pid.{q.name}": v for q, v in zip(pid.states(alone.feedback, alone.command), own, strict=True)}
         x0 |= {"sensor.reading": seen[0], "feedforward.filter": reference[0]}
         for part in alone.compensators:
-            begun = part.start(Instant(0.0, reference[0], seen[0], 0.0, pid.sample_time))
+            begun = part.start(alone.sensed_signal, Instant(0.0, reference[0], seen[0], 0.0, pid.sample_time))
             remembered = zip(part.states(alone.sensed_signal, alone.command), begun, strict=True)
             x0 |= {f"{part.section}.{q.name}": v for q, v in remembered}
         x0 |= {} if was_at_rest else {"pid.integral": 0.0}

@@ -36,6 +36,8 @@ RANGES = {
     "offset": (-1.0, 1.0),
     "frequency": (20.0, 150.0),
     "gain": (-2.0, 5.0),
+    "pressure_feedback.gain": (0.0, 1e-5),
+    "acceleration_feedback.gain": (0.0, 0.1),
     "time": (0.01, 0.2),
     "level": (0.0, 1.0),
     "speed": (0.0, 3.0),
@@ -78,7 +80,7 @@ def random_loop(seed: int) -> tuple[ClosedLoop, ParameterSet, float]:
         compensators=tuple(k() for k in kinds),
     )  # fmt: skip
     values = {
-        n: g.uniform(*RANGES[n.split(".")[1]])
+        n: g.uniform(*RANGES.get(n, RANGES[n.split(".")[1]]))
         for n in loop.parameters
         if n.split(".")[1] in RANGES and n not in loop.plant.parameters
     }

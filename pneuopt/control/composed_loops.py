@@ -1,0 +1,248 @@
+"""`ComposedLoops`: open loops whose controller feeds back several signals, linearised, cut at the command.
+
+The controller's law is differentiated as it runs (`controller_update`), so there is one law. A sampled loop is exact:
+the plant on a held command by its matrix exponential, the controller from sample to sample with its delay, and the
+discrete loop L(z) in continuous form by the bilinear transformation ``z = (1 + s h/2)/(1 - s h/2)``, which maps the
+unit circle to the imaginary axis. Margins and peaks are those of L(z); a frequency w is shown as ``2/h tan(w h/2)``
+[rad/s], which is w but for 1 % at a tenth of the sampling frequency over pi.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import expm
+
+from pneuopt.control.averaged_plant import AveragedPlant
+from pneuopt.control.command import added_command
+from pneuopt.control.compensation import Instant, acting_always, uncompensated_command
+from pneuopt.control.dither import DITHER_OFFSET
+from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.sampled import controller_update
+from pneuopt.control.sensor import Encoder, SensorLag
+from pneuopt.control.wiring import Signals
+from pneuopt.dynamics.system import names, stack
+from pneuopt.quantities.arrays import Array
+from pneuopt.quantities.parameters import with_prefix, without_prefix
+
+Matrices = tuple[Array, Array, Array, Array]
+"""A, B, C, D of m systems with one input and one output, shapes (m, n, n), (m, n, 1), (m, 1, n), (m, 1, 1)."""
+
+
+class OpenLoops(NamedTuple):
+    """m loops cut at their commands.
+
+    Attributes
+    ----------
+    loop : tuple of ndarray
+        Under negative feedback, as `Matrices`; the plant's states come first.
+    noise : tuple of ndarray
+        The controllers from noise on what the PID sees to the command, without the plant.
+    """
+
+    loop: Matrices
+    noise: Matrices
+
+
+@dataclass(frozen=True, eq=False)
+class ComposedLoops:
+    """Function that linearises many loops of one kind.
+
+    Under dither the plant is the mean over its ripple, as in `AveragedPlant`, with a controller that does not react to
+    the ripple.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    compiled : bool
+        Whether machine code is made of the plant's Jacobian, which pays for many plants.
+    """
+
+    loop: ClosedLoop
+    compiled: bool = False
+
+    def __call__(self, p: Array, x: Array, u: Array) -> OpenLoops:
+        """Linearise.
+
+        Parameters
+        ----------
+        p : ndarray, shape (m, n_parameters)
+            In the order of ``loop.parameters``.
+        x : ndarray, shape (m, n_plant_states)
+        u : ndarray, shape (m, n_plant_inputs)
+            The operating points, the command among the inputs.
+        """
+        plant, shown = self._plants(p, x, u)
+        law = self._laws(p, shown, u[:, names(self.loop.plant.inputs).index(self.loop.command.name)])
+        h = self.loop.pid.sample_time
+        if h is None:
+            return OpenLoops(_join(plant, law, 0), law.noise)
+        A, B = _hold(*plant[:2], h)
+        joined = _join((A, B, plant[2]), law, self.loop.pid.delay)
+        return OpenLoops(_bilinear(joined, h), _bilinear(law.noise, h))
+
+    def _plants(self, p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        """A, B and C of the plants with a sensor's lag, in scaled states, and their outputs, shape (m, n_outputs)."""
+        loop, scale = self.loop, np.array([q.nominal for q in self.loop.plant.states])
+        A, B, _, _, _ = self._average(p, x, u)
+        A, B = A * scale / scale[:, None], (B / scale)[..., None]
+        own = p[:, [list(loop.parameters).index(n) for n in loop.plant.parameters]]
+        slopes, shown = self._outputs(x.T, u.T, own.T)
+        C = slopes.full().reshape(len(loop.plant.outputs), len(x), -1, order="F").transpose(1, 0, 2) * scale
+        if isinstance(loop.sensor, SensorLag):
+            rate = 1 / np.reshape(loop.sensor_lag(p.T), (-1, 1, 1)) + np.zeros((len(x), 1, 1))
+            k, n = names(loop.plant.outputs).index(loop.controlled.name), A.shape[-1]
+            A = np.block([[A, np.zeros((len(x), n, 1))], [rate * C[:, k : k + 1], -rate]])
+            B = np.concatenate([B, np.zeros((len(x), 1, 1))], axis=1)
+            C = np.concatenate([C, np.zeros((*C.shape[:2], 1))], axis=2)
+            C[:, k] = np.eye(1, n + 1, n)
+        return (A, B, C), shown.full().T
+
+    @cached_property
+    def _average(self) -> AveragedPlant:
+        return AveragedPlant(self.loop, self.compiled)
+
+    @cached_property
+    def _outputs(self) -> ca.Function:
+        """``(x, u, p) -> slopes to the states, outputs`` of the plant."""
+        x, u, p = (ca.SX.sym(s, self.loop.plant.ode.size1_in(i)) for i, s in enumerate("xup", 1))
+        y = self.loop.plant.ode(0, x, u, p)[1]
+        return ca.Function("outputs", [x, u, p], [ca.densify(ca.jacobian(y, x)), y])
+
+    def _laws(self, p: Array, shown: Array, command: Array) -> "_Laws":
+        """The controllers at outputs of shape (m, n_outputs) and commands of shape (m,)."""
+        loop, order = self.loop, list(self.loop.parameters)
+        bare = command - (p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0)
+        y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
+        seen, read = y[loop.controlled.name], np.array([y[n] for n in loop.readings])
+        v = uncompensated_command(loop, p.T, seen, seen, bare, read)
+        sizes = [self._law.size_out(k) for k in range(4)]
+        found = [
+            M.full().reshape(rows, len(p), columns, order="F").transpose(1, 0, 2)
+            for M, (rows, columns) in zip(self._law(shown.T, v[None], p.T), sizes, strict=True)
+        ]
+        return _Laws(*found)
+
+    @cached_property
+    def _law(self) -> ca.Function:
+        """``(y, v, p) -> A, B, C, D`` of the controller, from the plant's outputs and then the noise to the command.
+
+        v is the PID's command at the operating point, where its error is zero.
+        """
+        loop = _linear_law(self.loop)
+        y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), self.loop.parameters))
+        v, noise, r = ca.SX.sym("v"), ca.SX.sym("noise"), ca.SX.sym("reference")
+        known = [q.name for q in loop.states[len(loop.plant.states) :]]
+        x: Signals = {n: ca.SX.sym(n) for n in known if n not in _COMMANDS and n not in _lagging(loop)}
+        moved, w = _controller(loop, x, r, y, noise, p)
+        at = _resting_states(loop, x, y, v, p)
+        z = ca.vertcat(stack(x), stack(y), noise)
+        J = ca.jacobian(ca.vertcat(stack({n: moved[n] for n in x}), w), z)
+        point = ca.vertcat(stack({n: at[n] for n in x}), 0, y[loop.feedback.name])
+        J = ca.substitute(J, ca.vertcat(stack(x), noise, r), point)
+        n = len(x)
+        blocks = (J[:n, :n], J[:n, n:], J[n, :n], J[n, n:])
+        return ca.Function("law", [stack(y), v, stack(p)], [ca.densify(block) for block in blocks])
+
+
+_COMMANDS = ("pid.command", "pid.pending")  # states that hold the command: the hold and the delay have their own
+
+
+class _Laws(NamedTuple):
+    """Controllers from the plant's outputs and the noise to the command, shapes (m, rows, columns)."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+    @property
+    def noise(self) -> Matrices:
+        """From the noise alone."""
+        return self.A, self.B[..., -1:], self.C, self.D[..., -1:]
+
+
+def _linear_law(loop: ClosedLoop) -> ClosedLoop:
+    """The loop without what its linearisation leaves out: limits, dead band, counts, dither, pulses."""
+    sensor = replace(loop.sensor, resolution=0.0) if isinstance(loop.sensor, Encoder) else loop.sensor
+    pid = replace(loop.pid, limits=False, dead_band=False)
+    return replace(loop, pid=pid, sensor=sensor, dither=None, compensators=acting_always(loop))
+
+
+def _lagging(loop: ClosedLoop) -> tuple[str, ...]:
+    return ("sensor.reading",) if isinstance(loop.sensor, SensorLag) else ()
+
+
+def _controller(loop: ClosedLoop, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals) -> tuple[Signals, ca.SX]:
+    """Rates or next values of a controller's states, and its command before the clip, under a reference at rest."""
+    own = without_prefix(x, "sensor")
+    seen = (
+        loop.sensor.update(own, y, loop.sensed_signal, without_prefix(p, "sensor"))
+        if isinstance(loop.sensor, Encoder)
+        else {}
+    )
+    measured = seen.get("reading", y[loop.controlled.name]) + noise
+    bare, u = replace(loop, sensor=None), dict.fromkeys(names(loop.inputs), ca.SX(0))
+    u["reference"] = r
+    shown = {**y, loop.controlled.name: measured}
+    if loop.pid.sample_time is None:
+        moved, added = added_command(bare, ca.SX(0), x, u, measured, shown, p)
+        rates, w = loop.pid.rates(without_prefix(x, "pid"), u["reference"], measured, added, without_prefix(p, "pid"))
+        return with_prefix(rates, "pid") | moved, w
+    held = {n: ca.SX(0) for n in _COMMANDS}
+    found = controller_update(bare, ca.SX(0), x | held, u, shown, p)
+    return with_prefix(seen, "sensor") | found.states, found.terms["unlimited"]
+
+
+def _resting_states(loop: ClosedLoop, x: Signals, y: Signals, v: ca.SX, p: Signals) -> Signals:
+    """The states under constant signals, with the integral that makes the PID's command v."""
+    h, measured = loop.pid.sample_time or 0.0, y[loop.controlled.name]
+    at: Signals = {n: ca.SX(0) for n in x}
+    if isinstance(loop.sensor, Encoder):
+        at["sensor.reading"], position = measured, y[loop.sensor.position]
+        at["sensor.count"] = position - h * measured
+    seen = Instant(ca.SX(0), measured, measured, v, loop.pid.sample_time, {}, y)
+    for part in loop.compensators:
+        named = (f"{part.section}.{q.name}" for q in part.states(loop.sensed_signal, loop.command))
+        at |= dict(zip(named, map(ca.SX, part.start(loop.sensed_signal, seen)), strict=True))
+    given: Mapping[str, ca.SX] = {**at, "pid.integral": ca.SX(0)}
+    own = without_prefix(given, "pid")
+    at["pid.integral"] = v - loop.pid.output(own, measured, measured, without_prefix(p, "pid"))
+    return at
+
+
+def _join(plant: tuple[Array, Array, Array], law: _Laws, delay: int) -> Matrices:
+    """The open loop from a command to the controller's, its sign turned, which acts a sample later with a delay."""
+    (A, B, C), m = plant, len(plant[0])
+    into, direct, n, k = law.B[..., :-1], law.D[..., :-1], A.shape[-1], law.A.shape[-1]
+    A = np.block([[A, np.zeros((m, n, k))], [into @ C, law.A]])
+    B, C = np.concatenate([B, np.zeros((m, k, 1))], axis=1), -np.concatenate([direct @ C, law.C], axis=2)
+    if delay:
+        A = np.block([[A, np.zeros((m, n + k, 1))], [C, np.zeros((m, 1, 1))]])
+        B, C = (
+            np.concatenate([B, np.zeros((m, 1, 1))], axis=1),
+            np.zeros((m, 1, n + k + 1)) + np.eye(1, n + k + 1, n + k),
+        )
+    return A, B, C, np.zeros((m, 1, 1))
+
+
+def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:
+    """Matrices of plants from sample to sample on a held command."""
+    m, n = A.shape[:2]
+    both = np.concatenate([np.concatenate([A, B], axis=2), np.zeros((m, 1, n + 1))], axis=1)
+    sound = np.isfinite(both).all(axis=(1, 2))
+    moved = np.full_like(both, np.nan)
+    moved[sound] = expm(both[sound] * h)
+    return moved[:, :n, :n], moved[:, :n, n:]
+
+
+def _bilinear(system: Matrices, h: float) -> Matrices:
+    """Discrete systems in continuous form, ``z = (1 + s h/2)/(1 - s h/2)``."""
+    A, B, C, D = system
+    one = np.eye(A.shape[-1])
+    M = np.linalg.inv(A + one)
+    root = 2 / np.sqrt(h)
+    return 2 / h * M @ (A - one), root * M @ B, root * C @ M, D - C @ M @ B
