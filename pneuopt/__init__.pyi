@@ -25,6 +25,7 @@ from .control.loop import ClosedLoop
 from .control.motion_feedforward import MotionFeedforward
 from .control.moves import Move, MoveProfile
 from .control.pid import PID, AntiWindup
+from .control.position_loop import PositionLoop
 from .control.pressure_feedback import PressureFeedback
 from .control.reference import Reference, Step
 from .control.sensor import Encoder, SensorLag
@@ -259,6 +260,7 @@ __all__ = [
     "PneumaticDrive",
     "PneuoptError",
     "Polytropic",
+    "PositionLoop",
     "Precision",
     "Presliding",
     "PressureDependent",

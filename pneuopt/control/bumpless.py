@@ -62,7 +62,8 @@ def bumpless_transfer(
     remembered = order.index("pid.filter" if loop.pid.sample_time is None else "pid.previous_error")
     c, c_new = (loop.parameter_vector(p)[list(loop.parameters).index("pid.c")] for p in (old, new))
     before = _next_command(loop, state, old, reference)
-    state[remembered] += (c_new - c) * reference
+    if loop.outer is None:  # the speed that a cascade's PID has been given is not known here
+        state[remembered] += (c_new - c) * reference
     integral = order.index("pid.integral")
     state[integral] += before - _next_command(loop, state, new, reference)
     if loop.compensators:

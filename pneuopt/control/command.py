@@ -1,6 +1,7 @@
 """`added_command`: what is added to the PID's command before the clip: feedforward, compensators and dither."""
 
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import casadi as ca
 
@@ -8,6 +9,7 @@ from pneuopt.control.compensation import Compensator, Instant, compensate
 from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.pid import PID
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED
 from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.system import Symbols
@@ -37,6 +39,28 @@ class CommandParts(Protocol):
         """They add between the two."""
         ...
 
+    @property
+    def outer(self) -> PositionLoop | None:
+        """The outer loop of a cascade."""
+        ...
+
+
+def pid_reference(parts: CommandParts, u: Mapping[str, Any], position: Any, p: Mapping[str, Any]) -> dict[str, Any]:
+    """The inputs as the PID and its compensators see them: in a cascade their reference is a speed.
+
+    Parameters
+    ----------
+    parts : ClosedLoop
+    u, p : mapping of str to casadi.SX
+        The loop's inputs and parameters.
+    position : casadi.SX
+        What the loop is judged by, as the controller sees it.
+    """
+    if parts.outer is None:
+        return dict(u)
+    own = without_prefix(p, parts.outer.section)
+    return {**u, "reference": parts.outer.set_point(u["reference"], u.get(REFERENCE_SPEED, 0.0), position, own)}
+
 
 def added_command(
     parts: CommandParts, t: ca.SX, x: Symbols, u: Symbols, measured: ca.SX, y: Symbols, p: Symbols
@@ -48,7 +72,7 @@ def added_command(
     parts : ClosedLoop
     t : casadi.SX
     x, u, p : mapping of str to casadi.SX
-        The loop's states, inputs and parameters.
+        The loop's states, inputs as `pid_reference` gives them, and parameters.
     measured : casadi.SX
         The measured signal, as the controller sees it.
     y : mapping of str to casadi.SX

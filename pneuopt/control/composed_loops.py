@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from pneuopt.control.averaged_plant import AveragedPlant
-from pneuopt.control.command import added_command
+from pneuopt.control.command import added_command, pid_reference
 from pneuopt.control.compensation import Instant, acting_always, uncompensated_command
 from pneuopt.control.dither import DITHER_OFFSET
 from pneuopt.control.loop import ClosedLoop
@@ -77,12 +77,12 @@ class ComposedLoops:
         """
         plant, shown = self._plants(p, x, u)
         law = self._laws(p, shown, u[:, names(self.loop.plant.inputs).index(self.loop.command.name)])
-        h = self.loop.pid.sample_time
+        h, direct = self.loop.pid.sample_time, np.zeros((*plant[2].shape[:2], 1))
         if h is None:
-            return OpenLoops(_join(plant, law, 0), law.noise)
-        A, B = _hold(*plant[:2], h)
-        joined = _join((A, B, plant[2]), law, self.loop.pid.delay)
-        return OpenLoops(_bilinear(joined, h), _bilinear(law.noise, h))
+            return OpenLoops(_join((*plant, direct), law.feedback), law.noise)
+        held = _bilinear((*_hold(*plant[:2], h), plant[2], direct), h)
+        joined = _join(held, _bilinear(law.feedback, h))
+        return OpenLoops(_delay(joined, h) if self.loop.pid.delay else joined, _bilinear(law.noise, h))
 
     def _plants(self, p: Array, x: Array, u: Array) -> tuple[tuple[Array, Array, Array], Array]:
         """A, B and C of the plants with a sensor's lag, in scaled states, and their outputs, shape (m, n_outputs)."""
@@ -130,7 +130,7 @@ class ComposedLoops:
     def _law(self) -> ca.Function:
         """``(y, v, p) -> A, B, C, D`` of the controller, from the plant's outputs and then the noise to the command.
 
-        v is the PID's command at the operating point, where its error is zero.
+        v is the PID's command at the operating point.
         """
         loop = _linear_law(self.loop)
         y, p = ({n: ca.SX.sym(n) for n in own} for own in (names(loop.plant.outputs), self.loop.parameters))
@@ -158,6 +158,11 @@ class _Laws(NamedTuple):
     B: Array
     C: Array
     D: Array
+
+    @property
+    def feedback(self) -> Matrices:
+        """From the plant's outputs, the sign turned."""
+        return self.A, self.B[..., :-1], -self.C, -self.D[..., :-1]
 
     @property
     def noise(self) -> Matrices:
@@ -189,8 +194,11 @@ def _controller(loop: ClosedLoop, x: Signals, r: ca.SX, y: Signals, noise: ca.SX
     u["reference"] = r
     shown = {**y, loop.controlled.name: measured}
     if loop.pid.sample_time is None:
-        moved, added = added_command(bare, ca.SX(0), x, u, measured, shown, p)
-        rates, w = loop.pid.rates(without_prefix(x, "pid"), u["reference"], measured, added, without_prefix(p, "pid"))
+        inner = pid_reference(bare, u, y[loop.feedback.name], p)
+        moved, added = added_command(bare, ca.SX(0), x, inner, measured, shown, p)
+        rates, w = loop.pid.rates(
+            without_prefix(x, "pid"), inner["reference"], measured, added, without_prefix(p, "pid")
+        )
         return with_prefix(rates, "pid") | moved, w
     held = {n: ca.SX(0) for n in _COMMANDS}
     found = controller_update(bare, ca.SX(0), x | held, u, shown, p)
@@ -210,23 +218,25 @@ def _resting_states(loop: ClosedLoop, x: Signals, y: Signals, v: ca.SX, p: Signa
         at |= dict(zip(named, map(ca.SX, part.start(loop.sensed_signal, seen)), strict=True))
     given: Mapping[str, ca.SX] = {**at, "pid.integral": ca.SX(0)}
     own = without_prefix(given, "pid")
-    at["pid.integral"] = v - loop.pid.output(own, measured, measured, without_prefix(p, "pid"))
+    wanted = pid_reference(loop, {"reference": y[loop.feedback.name]}, y[loop.feedback.name], p)["reference"]
+    at["pid.integral"] = v - loop.pid.output(own, wanted, measured, without_prefix(p, "pid"))
     return at
 
 
-def _join(plant: tuple[Array, Array, Array], law: _Laws, delay: int) -> Matrices:
-    """The open loop from a command to the controller's, its sign turned, which acts a sample later with a delay."""
-    (A, B, C), m = plant, len(plant[0])
-    into, direct, n, k = law.B[..., :-1], law.D[..., :-1], A.shape[-1], law.A.shape[-1]
-    A = np.block([[A, np.zeros((m, n, k))], [into @ C, law.A]])
-    B, C = np.concatenate([B, np.zeros((m, k, 1))], axis=1), -np.concatenate([direct @ C, law.C], axis=2)
-    if delay:
-        A = np.block([[A, np.zeros((m, n + k, 1))], [C, np.zeros((m, 1, 1))]])
-        B, C = (
-            np.concatenate([B, np.zeros((m, 1, 1))], axis=1),
-            np.zeros((m, 1, n + k + 1)) + np.eye(1, n + k + 1, n + k),
-        )
-    return A, B, C, np.zeros((m, 1, 1))
+def _join(plant: Matrices, controller: Matrices) -> Matrices:
+    """The open loop from the command to what the controller makes of the outputs.
+
+    Joined in continuous form, the matrix keeps its zeros, and a double integral its two poles at zero.
+    """
+    (A, B, C, D), (Ac, Bc, Cc, Dc) = plant, controller
+    joined = np.block([[A, np.zeros((len(A), A.shape[-1], Ac.shape[-1]))], [Bc @ C, Ac]])
+    return joined, np.concatenate([B, Bc @ D], axis=1), np.concatenate([Dc @ C, Cc], axis=2), Dc @ D
+
+
+def _delay(system: Matrices, h: float) -> Matrices:
+    """Systems with a delay of a sample behind them: ``1/z = (1 - s h/2)/(1 + s h/2)``."""
+    one = np.ones((len(system[0]), 1, 1))
+    return _join(system, (-2 / h * one, 2 / np.sqrt(h) * one, 2 / np.sqrt(h) * one, -one))
 
 
 def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:
@@ -240,7 +250,7 @@ def _hold(A: Array, B: Array, h: float) -> tuple[Array, Array]:
 
 
 def _bilinear(system: Matrices, h: float) -> Matrices:
-    """Discrete systems in continuous form, ``z = (1 + s h/2)/(1 - s h/2)``."""
+    """Discrete systems in continuous form, ``z = (1 + s h/2)/(1 - s h/2)``, of any number of inputs and outputs."""
     A, B, C, D = system
     one = np.eye(A.shape[-1])
     M = np.linalg.inv(A + one)

@@ -26,9 +26,10 @@ from pneuopt.control.forms import ParallelForm, parallel_gains
 from pneuopt.control.loop_equations import continuous_rates, held_rates
 from pneuopt.control.loop_start import start_state
 from pneuopt.control.pid import PID
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sampled import controller_update
 from pneuopt.control.sensor import REFERENCE_ACCELERATION, REFERENCE_SPEED, Encoder, SensedSignal, SensorLag
-from pneuopt.control.wiring import Signals, check_algebraic_loop, evaluate_plant, select_signal
+from pneuopt.control.wiring import Signals, check_algebraic_loop, check_cascade, evaluate_plant, select_signal
 from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.runnable import PlantField
 from pneuopt.dynamics.system import (
@@ -68,7 +69,9 @@ class ClosedLoop:
         What a change of the reference adds to the PID's command.
     compensators : tuple of Compensator
         What is added to the command against friction and dead zone, in the order in which they act: `Knocker`,
-        `FrictionFeedforward`, `DeadZoneInverse`.
+        `FrictionFeedforward`, `DeadZoneInverse`, `MotionFeedforward`, `PressureFeedback`, `AccelerationFeedback`.
+    outer : PositionLoop, optional
+        Makes the loop a cascade: it is judged by the position, whose error sets the speed that the PID controls.
 
     Raises
     ------
@@ -87,14 +90,16 @@ class ClosedLoop:
     sensor: SensorLag | Encoder | None = None
     feedforward: Feedforward | None = None
     compensators: tuple[Compensator, ...] = ()
+    outer: PositionLoop | None = None
 
     def __post_init__(self) -> None:
         if self.sensor is not None:
             self.sensor.check(self.sensed_signal)
         if not isinstance(self.sensor, SensorLag):
             check_algebraic_loop(
-                self.plant, self.command.name, self.feedback.name if self.sensor is None else self.sensor.position
+                self.plant, self.command.name, self.controlled.name if self.sensor is None else self.sensor.position
             )
+        check_cascade(self)
         reserved = {"reference": names(self.plant.inputs), "control": names(self.plant.outputs)}
         for name, taken in reserved.items():
             require(name not in taken, f"the plant has a signal {name!r} of its own; rename it", ModelError)
@@ -124,17 +129,21 @@ class ClosedLoop:
     @cached_property
     def feedback(self) -> Quantity:
         """The plant's output that is fed back."""
-        return select_signal("output", self.measured, self.plant.outputs, "speed")
+        usual = (self.plant.axis or Axis()).position if self.outer else "speed"
+        return select_signal("output", self.measured, self.plant.outputs, usual)
 
     @property
     def controlled(self) -> Quantity:
         """The plant's output that the PID controls."""
-        return self.feedback
+        if self.outer is None:
+            return self.feedback
+        speed = (self.plant.axis or Axis()).speed
+        return select_signal("output", speed, self.plant.outputs, None)
 
     @cached_property
     def parameters(self) -> ParameterSet:
         """Those of the plant, "pid.*", "dither.*", "sensor.*", "feedforward.*" and the compensators', all defaults."""
-        h, measured, unit = self.pid.sample_time, self.feedback.unit, self.command.unit
+        h, measured, unit = self.pid.sample_time, self.controlled.unit, self.command.unit
         parts = {
             "pid": self.pid.parameters(measured, unit),
             "dither": self.dither.parameters(unit, h) if self.dither else ParameterSet(),
@@ -142,6 +151,8 @@ class ClosedLoop:
             "feedforward": self.feedforward.parameters(measured, unit) if self.feedforward else ParameterSet(),
             **{c.section: c.parameters(self.sensed_signal, unit) for c in self.compensators},
         }
+        if self.outer:
+            parts[self.outer.section] = self.outer.parameters(self.feedback.unit, measured)
         return reduce(or_, (own.with_prefix(name) for name, own in parts.items()), self.plant.parameters)
 
     @property
@@ -149,7 +160,7 @@ class ClosedLoop:
         """The plant's, the sensor's ("sensor.reading"), the controller's ("pid.*", "feedforward.filter") and so on."""
         parts = {
             "sensor": self.sensor.states(self.sensed_signal) if self.sensor else (),
-            "pid": self.pid.states(self.feedback, self.command),
+            "pid": self.pid.states(self.controlled, self.command),
             "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
             **{c.section: c.states(self.sensed_signal, self.command) for c in self.compensators},
         }
@@ -159,7 +170,8 @@ class ClosedLoop:
     @property
     def tunable_sections(self) -> tuple[str, ...]:
         """Prefixes of the parameters that a tuning may change: the controller's, not the sensor's or the plant's."""
-        return ("pid", "dither", "feedforward", *(c.section for c in self.compensators))
+        outer = (self.outer.section,) if self.outer else ()
+        return ("pid", *outer, "dither", "feedforward", *(c.section for c in self.compensators))
 
     @property
     def inputs(self) -> tuple[Quantity, ...]:
@@ -173,12 +185,14 @@ class ClosedLoop:
         on = self.sensed_signal
         units = {REFERENCE_SPEED: on.speed_unit, REFERENCE_ACCELERATION: unit_ratio(on.speed_unit, "s")}
         used = {n for part in self.compensators for n in part.motion_inputs(on)}
+        used |= {REFERENCE_SPEED} if self.outer else set()
         return tuple(Quantity(n, unit) for n, unit in units.items() if n in used)
 
     @cached_property
     def readings(self) -> tuple[str, ...]:
-        """The plant's outputs that compensators read, in its order."""
+        """The plant's outputs that the controller reads beside what its PID controls, in the plant's order."""
         used = {n for part in self.compensators for n in part.reads(self.sensed_signal)}
+        used |= {self.feedback.name} if self.outer and not isinstance(self.sensor, Encoder) else set()
         return tuple(n for n in names(self.plant.outputs) if n in used)
 
     @property
@@ -188,9 +202,9 @@ class ClosedLoop:
 
     @property
     def is_composed(self) -> bool:
-        """Whether more than the PID remembers what it is fed back: linearised, the loop is `ComposedLoops`'s."""
+        """Whether more than a PID of one signal is fed back, so that the loop is linearised by `ComposedLoops`."""
         on = self.sensed_signal
-        return any(part.acts_always and part.states(on, self.command) for part in self.compensators)
+        return bool(self.outer) or any(part.acts_always and part.states(on, self.command) for part in self.compensators)
 
     def system(self) -> System:
         """The loop as one ODE, with a continuous PID.
@@ -299,11 +313,12 @@ class ClosedLoop:
         return self.sensor.time_constant(self.sensed_signal, value) if self.sensor else 0.0
 
     def count_size(self, parameters: ParameterSet) -> float:
-        """What one count of the sensor changes its reading by [measured unit]; 0 of a sensor without counts."""
+        """What one count of the sensor changes its reading by [feedback's unit]; 0 of a sensor without counts."""
         if self.sensor is None:
             return 0.0
         value = dict(zip(self.parameters, self.parameter_vector(parameters).tolist(), strict=True))
-        return self.sensor.count_size(self.sensed_signal, without_prefix(value, "sensor"))
+        on = replace(self.sensed_signal, measured=self.feedback)
+        return self.sensor.count_size(on, without_prefix(value, "sensor"))
 
     @property
     def dead_time(self) -> float:
@@ -361,8 +376,9 @@ class ClosedLoop:
     def sensed_signal(self) -> SensedSignal:
         """What the sensor reads."""
         axis = self.plant.axis or Axis()
-        order = {axis.position: 0, axis.speed: 1}.get(self.feedback.name, None if self.plant.axis else 1)
-        return SensedSignal(self.feedback, {q.name: q for q in self.plant.outputs}, self.pid.sample_time, order)
+        order = {axis.position: 0, axis.speed: 1}.get(self.controlled.name, None if self.plant.axis else 1)
+        outputs = {q.name: q for q in self.plant.outputs}
+        return SensedSignal(self.controlled, outputs, self.pid.sample_time, order, cascade=bool(self.outer))
 
 
 def check_closed_loop(loop: object) -> None:

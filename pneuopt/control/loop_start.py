@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pneuopt.control.command import pid_reference
 from pneuopt.control.compensation import Instant, uncompensated_command
 from pneuopt.control.rest import find_rest, set_sliding_direction
 from pneuopt.control.wiring import check_initial_command
@@ -38,9 +39,10 @@ def start_state(
     shown = loop.plant.ode(0, x, np.zeros(len(loop.plant.inputs)), [value[n] for n in loop.plant.parameters])[1]
     y = dict(zip(names(loop.plant.outputs), shown.full().ravel().tolist(), strict=True))
     sensor = loop.sensor.start(y, loop.sensed_signal, without_prefix(value, "sensor")) if loop.sensor else []
-    seen = sensor[0] if sensor else y[loop.feedback.name]
-    v = float(uncompensated_command(loop, p, reference, seen, command, [y[n] for n in loop.readings])[0])
-    own = loop.pid.start(reference, seen, v, {**without_prefix(value, "pid"), "Kp": float(loop.gains(p)[0])})
-    known = Instant(0.0, reference, seen, v, loop.pid.sample_time, {}, y)
+    seen = sensor[0] if sensor else y[loop.controlled.name]
+    wanted = float(pid_reference(loop, {"reference": reference}, y[loop.feedback.name], value)["reference"])
+    v = float(uncompensated_command(loop, p, wanted, seen, command, [y[n] for n in loop.readings])[0])
+    own = loop.pid.start(wanted, seen, v, {**without_prefix(value, "pid"), "Kp": float(loop.gains(p)[0])})
+    known = Instant(0.0, wanted, seen, v, loop.pid.sample_time, {}, y)
     others = [float(remembered) for part in loop.compensators for remembered in part.start(loop.sensed_signal, known)]
     return np.concatenate([x, sensor, own, [reference] if loop.feedforward else [], others])

@@ -6,6 +6,7 @@ from typing import Protocol
 import casadi as ca
 import numpy as np
 
+from pneuopt.control.command import CommandParts, pid_reference
 from pneuopt.control.wiring import Signals, evaluate_plant
 from pneuopt.dynamics.system import FRICTION_DIRECTION, Symbols, System, define, names, parameter_vector
 from pneuopt.quantities.arrays import Array
@@ -15,7 +16,7 @@ from pneuopt.quantities.parameters import ParameterSet, Quantity
 INTEGRAL_STATE = "pid.integral"
 
 
-class WiredLoop(Protocol):
+class WiredLoop(CommandParts, Protocol):
     """What of a `ClosedLoop` its equilibrium depends on."""
 
     @property
@@ -31,6 +32,11 @@ class WiredLoop(Protocol):
     @property
     def feedback(self) -> Quantity:
         """The plant's output that is fed back."""
+        ...
+
+    @property
+    def controlled(self) -> Quantity:
+        """The plant's output that the PID controls."""
         ...
 
     @property
@@ -152,13 +158,14 @@ def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSe
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
         shown = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1]
-        y, read = shown[loop.feedback.name], ca.vertcat(*(shown[n] for n in loop.readings))
+        y, read = shown[loop.controlled.name], ca.vertcat(*(shown[n] for n in loop.readings))
+        r = pid_reference(loop, u, shown[loop.feedback.name], p)["reference"]
         every = ca.vertcat(*p.values())
         gains = loop.gains(every)
-        command = gains[0] * (p["pid.b"] * u["reference"] - y) + x.get(INTEGRAL_STATE, 0.0)
-        command = loop.compensation(command, u["reference"], y, read, every)[0]
+        command = gains[0] * (p["pid.b"] * r - y) + x.get(INTEGRAL_STATE, 0.0)
+        command = loop.compensation(command, r, y, read, every)[0]
         rates, outputs = evaluate_plant(plant, loop.command.name, t, moving, u, p, command)
-        rates |= {INTEGRAL_STATE: gains[1] * (u["reference"] - y)}
+        rates |= {INTEGRAL_STATE: gains[1] * (r - y)}
         return {n: rates[n] for n in x}, outputs | {"control": command}
 
     return define(states, loop.inputs, loop.outputs, loop.parameters, rhs)

@@ -7,11 +7,11 @@ from typing import NamedTuple, Protocol
 
 import casadi as ca
 
-from pneuopt.control.command import CommandParts, added_command, added_terms
+from pneuopt.control.command import CommandParts, added_command, added_terms, pid_reference
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.system import Symbols
-from pneuopt.quantities.parameters import with_prefix, without_prefix
+from pneuopt.quantities.parameters import Quantity, with_prefix, without_prefix
 
 
 class ControllerParts(CommandParts, Protocol):
@@ -20,6 +20,11 @@ class ControllerParts(CommandParts, Protocol):
     @property
     def sensor(self) -> SensorLag | Encoder | None:
         """Through which the controller sees the measured signal."""
+        ...
+
+    @property
+    def feedback(self) -> Quantity:
+        """The plant's output that the loop is judged by, and an outer loop controls."""
         ...
 
     @property
@@ -66,6 +71,8 @@ def controller_update(
         else {}
     )
     measured = seen["reading"] if seen else y[loop.sensed_signal.measured.name]
+    if loop.outer is not None:
+        u = pid_reference(loop, u, seen["count"] if "count" in seen else y[loop.feedback.name], p)
     moved, added = added_command(loop, t, x, u, measured, y, p)
     arguments = without_prefix(x, "pid"), u["reference"], measured
     own = without_prefix(p, "pid")

@@ -30,13 +30,16 @@ class SensedSignal:
     sample_time : float, optional
         The controller's [s].
     order : int, optional
-        Of the reference as a derivative of the axis's position: 0 a position, 1 a speed; None of any other signal.
+        Of the measured signal as a derivative of the axis's position: 0 itself, 1 its speed; None of any other.
+    cascade : bool
+        Whether the controller that wants a speed is the inner one of a cascade, whose reference is a position.
     """
 
     measured: Quantity
     outputs: Mapping[str, Quantity]
     sample_time: float | None
     order: int | None = 1
+    cascade: bool = False
 
     @property
     def speed_unit(self) -> str:
@@ -47,7 +50,7 @@ class SensedSignal:
     @property
     def speed_input(self) -> tuple[str, ...]:
         """The loop's input with the reference's speed; none where the reference is that speed."""
-        return (REFERENCE_SPEED,) if self.order == 0 else ()
+        return (REFERENCE_SPEED,) if self.order == 0 or self.cascade else ()
 
     @property
     def h(self) -> float:

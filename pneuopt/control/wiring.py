@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from math import inf
+from typing import Protocol
 
 import casadi as ca
 
+from pneuopt.dynamics.hooks import Axis
 from pneuopt.dynamics.system import Symbols, System, names
 from pneuopt.quantities.errors import ModelError, check_names, require
 from pneuopt.quantities.parameters import Quantity
@@ -51,6 +53,52 @@ def check_algebraic_loop(plant: System, command: str, output: str) -> None:
         "measure another output, or give the plant an actuator or a sensor with a lag",
         ModelError,
     )
+
+
+class CascadedLoop(Protocol):
+    """What of a `ClosedLoop` decides whether it can be a cascade."""
+
+    @property
+    def plant(self) -> System:
+        """Without the controller."""
+        ...
+
+    @property
+    def command(self) -> Quantity:
+        """The input that is driven."""
+        ...
+
+    @property
+    def feedback(self) -> Quantity:
+        """The output that the loop is judged by."""
+        ...
+
+    @property
+    def controlled(self) -> Quantity:
+        """The output that the PID controls."""
+        ...
+
+    @property
+    def outer(self) -> object:
+        """The outer loop."""
+        ...
+
+    @property
+    def feedforward(self) -> object:
+        """The feedforward of the reference's jumps."""
+        ...
+
+
+def check_cascade(loop: CascadedLoop) -> None:
+    """Refuse an outer loop of anything but the axis's position, and a feedforward of its jumps."""
+    if loop.outer is None:
+        return
+    position = (loop.plant.axis or Axis()).position
+    told = f"a PositionLoop controls the {position}, this loop {loop.feedback.name!r}; take measured={position!r}"
+    require(loop.feedback.name == position, told, ModelError)
+    check_algebraic_loop(loop.plant, loop.command.name, position)
+    told = "a Feedforward is of jumps of what the PID follows, in a cascade a speed; take MotionFeedforward"
+    require(loop.feedforward is None, told, ModelError)
 
 
 def check_initial_command(command: float, value: Mapping[str, float], unit: str) -> None:

@@ -273,6 +273,8 @@ def sensitivity_terms(
         smooth function of the gains, counts.
     """
     shaping = ", ".join(type(c).__name__ for c in acting_always(loop))
+    told = "a cascade's speed loop has a response of its own; use margins(open_loop(...))"
+    require(loop.outer is None, told, ModelError)
     message = f"{shaping}: its slope at the operating point counts in the sensitivity; use margins(open_loop(...))"
     require(not shaping, message, ModelError)
     free = [n for n in parameters.free_names if n in loop.plant.parameters]

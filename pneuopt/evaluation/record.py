@@ -150,13 +150,13 @@ class _SampledController:
 
     def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, log_inputs: Trajectory, x: Array) -> None:
         loop.check(parameters)
-        signal = loop.feedback
-        others = [q for q in loop.plant.outputs if q.name in loop.readings and q != signal]
+        signal, read = loop.controlled, replace(loop, sensor=None).readings
+        others = [q for q in loop.plant.outputs if q.name in read and q != signal]
         shown, self._others = [signal, *others], names(others)
         echo_plant = define(
             shown, [loop.command], shown, loop.plant.parameters, lambda _t, y, _u, _p: (_zero_rates(y), y)
         )
-        echo_loop = replace(loop, plant=echo_plant, sensor=None)
+        echo_loop = replace(loop, plant=replace(echo_plant, axis=loop.plant.axis), sensor=None)
         self._update, self._p = compile_function(echo_loop.update), echo_loop.parameter_vector(parameters)
         plant_state, controller_state = x[: len(rig.plant.states)], x[len(shown) - len(echo_loop.states) :]
         self._rig, self._loop, self._inputs, self._x = rig, loop, log_inputs, controller_state
@@ -173,7 +173,9 @@ class _SampledController:
     def act(self, k: int, readings: Mapping[str, float]) -> float:
         """Return the command at sample k, and advance the controller by one sample."""
         self._feedback_values.append(self._feedback(readings))
-        t, seen = self._inputs.t[k], [self._feedback_values[-1], *(readings[n] for n in self._others)]
+        counted = {self._rig.encoder.position: self._position} if self._position is not None else {}
+        shown = {**readings, **counted}
+        t, seen = self._inputs.t[k], [self._feedback_values[-1], *(shown[n] for n in self._others)]
         after = self._update(t, np.append(seen, self._x), self._references[k], self._p)[0]
         self._x = after[len(seen) :]
         self._commands.append(float(after[self._command]))
@@ -192,7 +194,7 @@ class _SampledController:
 
     def _feedback(self, readings: Mapping[str, float]) -> float:
         """Measured signal as the controller gets it: a sensor's reading, or a speed differentiated from an encoder."""
-        wanted, source = self._loop.feedback.name, self._rig.feedback
+        wanted, source = self._loop.controlled.name, self._rig.feedback
         if source == wanted:
             return readings[wanted]
         counts = Sensor(resolution=self._rig.encoder.resolution)

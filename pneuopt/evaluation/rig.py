@@ -132,7 +132,8 @@ class Rig:
             _check_loop(self.loop)
             message = f"the controller needs {self.feedback!r}, which no sensor measures; add it to sensors"
             require(self.feedback in self.sensors, message, ModelError)
-            absent = ", ".join(n for n in self.loop.readings if n not in self.sensors)
+            read = dict.fromkeys((*self.loop.readings, *([self.loop.feedback.name] if self.loop.outer else [])))
+            absent = ", ".join(n for n in read if n not in self.sensors)
             require(not absent, f"the controller reads {absent}, which no sensor measures; add to sensors", ModelError)
 
     @property
@@ -161,7 +162,7 @@ class Rig:
         """Channel that the controller reads, the position where an encoder gives the speed; None without a loop."""
         if self.loop is None:
             return None
-        wanted = self.loop.feedback.name
+        wanted = self.loop.controlled.name
         return self.encoder.position if wanted == "speed" and "speed" not in self.sensors else wanted
 
     @property

@@ -32,7 +32,8 @@ def export_settings(
     """Write what is to be typed into a PID block, with formula and source, and the design as that block runs it.
 
     The loop is simulated with the block's set-point weights, filter, rounding of times and anti-windup; what the block
-    has not at all (dither, feedforward, compensators) is taken to be programmed around it, as in the design.
+    has not at all (dither, feedforward, compensators, an outer loop) is taken to be programmed around it, as in the
+    design.
 
     Parameters
     ----------

@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
+from pneuopt.control.command import pid_reference
 from pneuopt.control.compensation import Compensator, Instant
 from pneuopt.control.dither import Dither, Waveform
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form, parallel_gains
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sampled import controller_update
 from pneuopt.control.sensor import Encoder, SensedSignal
 from pneuopt.control.wiring import Signals
@@ -144,6 +146,8 @@ class _ComputedParts:
     compensators: tuple[Compensator, ...]
     sensor: Encoder | None
     sensed_signal: SensedSignal
+    outer: PositionLoop | None
+    feedback: Quantity
 
 
 @dataclass(frozen=True)
@@ -175,8 +179,9 @@ def _law(loop: ClosedLoop) -> _Law:
     counts = isinstance(loop.sensor, Encoder) and loop.sensor.differentiates(sensed)
     encoder = replace(loop.sensor, resolution=0.0) if counts and isinstance(loop.sensor, Encoder) else None
     dither = None if loop.dither is None else _WrappedDither(**vars(loop.dither))
-    parts = _ComputedParts(loop.pid, dither, loop.feedforward, loop.compensators, encoder, sensed)
-    measured = sensed.outputs[encoder.position] if encoder else loop.feedback
+    lead, added = loop.feedforward, loop.compensators
+    parts = _ComputedParts(loop.pid, dither, lead, added, encoder, sensed, loop.outer, loop.feedback)
+    measured = sensed.outputs[encoder.position] if encoder else loop.controlled
     known = loop.states[len(loop.plant.states) :]
     x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}
     p: Signals = {n: ca.SX.sym(n) for n in (*loop.parameters, CENTRE)}
@@ -190,7 +195,8 @@ def _law(loop: ClosedLoop) -> _Law:
     converted = {} if loop.pid.form is Form.PARALLEL else {f"{n}_parallel": value for n, value in gains.items()}
     after = {**found.states, SAMPLE: x[SAMPLE] + 1}
     terms = {f"{n}_term" if n in ADDED_TERMS else n: v for n, v in found.terms.items()} | converted
-    begun = _start(parts, u, shown, {**own, "Kp": gains["Kp"]}, p[CENTRE])
+    inner = pid_reference(parts, u, shown[loop.feedback.name], p) if loop.outer else u
+    begun = _start(parts, inner, shown, {**own, "Kp": gains["Kp"]}, p[CENTRE])
     return _Law(u, x, p, measured, after, begun, terms)
 
 

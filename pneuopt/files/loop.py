@@ -1,8 +1,9 @@
-"""The loop in a tuning.toml: [loop], [pid], [sensor], [dither], [feedforward] and the sections of `COMPENSATORS`."""
+"""The loop in a tuning.toml: [loop], its controller and sensor, and what is added to the command."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, AntiWindup
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import System
 from pneuopt.files.toml import construct_at, read_fixed_value, read_parameter
@@ -24,7 +26,7 @@ from pneuopt.quantities.units import read_value, write_value
 
 TuningSections = Mapping[str, Any]
 
-TUNABLE_SECTIONS = ("pid", "dither", "feedforward", *COMPENSATORS)
+TUNABLE_SECTIONS = ("pid", PositionLoop.section, "dither", "feedforward", *COMPENSATORS)
 """Sections whose values may be free."""
 LOOP_SECTIONS = tuple(LOOP_KEYS)
 
@@ -76,9 +78,13 @@ def _loop(table: TuningSections, plant: System, path: str | Path) -> ClosedLoop:
     sensor = _sensor(table["sensor"], plant, f"{path}: [sensor]") if "sensor" in table else None
     lead = _feedforward(table["feedforward"], f"{path}: [feedforward]") if "feedforward" in table else None
     parts = tuple(_compensator(n, table[n], f"{path}: [{n}]") for n in COMPENSATORS if n in table)
-    return construct_at(
-        lambda: ClosedLoop(plant, pid, dither, **wiring, sensor=sensor, feedforward=lead, compensators=parts), str(path)
+    outer = (
+        _position_loop(table[PositionLoop.section], f"{path}: [{PositionLoop.section}]")
+        if PositionLoop.section in table
+        else None
     )
+    loop = partial(ClosedLoop, plant, pid, dither, **wiring, sensor=sensor)
+    return construct_at(lambda: loop(feedforward=lead, compensators=parts, outer=outer), str(path))
 
 
 def _pid(table: Mapping[str, Any], where: str) -> PID:
@@ -157,6 +163,11 @@ def _feedforward(table: Mapping[str, Any], where: str) -> Feedforward:
         return Feedforward()
     time = read_parameter(table["time"], Parameter(1.0, "s"), f"{where} time").value
     return construct_at(lambda: Feedforward(time), where)
+
+
+def _position_loop(table: Mapping[str, Any], where: str) -> PositionLoop:
+    require("Kp" in table, f'{where} has no gain; write Kp = "10 1/s"')
+    return PositionLoop()
 
 
 def _compensator(section: str, table: Mapping[str, Any], where: str) -> Compensator:

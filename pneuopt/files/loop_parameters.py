@@ -8,6 +8,7 @@ from pneuopt.control.dither import Dither
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.pid import PID
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import SensedSignal
 from pneuopt.files.tuning_keys import TUNING_KEYS
 from pneuopt.quantities.keys import Key, parameter_key
@@ -33,6 +34,7 @@ def tuning_keys(command: str = "command", measured: str = "measured") -> Mapping
     signal = SensedSignal(Quantity("measured", measured), {}, SAMPLE_TIME)
     parts = {
         "pid": _pid_keys(command, measured),
+        PositionLoop.section: _parameter_keys(PositionLoop().parameters(measured, f"{measured}/s"), "Kp"),
         "dither": _parameter_keys(Dither().parameters(command), "frequency"),
         "feedforward": _parameter_keys(Feedforward().parameters(measured, command), "gain"),
         **{name: _parameter_keys(part().parameters(signal, command), part.size) for name, part in COMPENSATORS.items()},

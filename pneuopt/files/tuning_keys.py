@@ -12,6 +12,7 @@ from pneuopt.control.compensators import COMPENSATORS
 from pneuopt.control.dither import Waveform
 from pneuopt.control.forms import Form
 from pneuopt.control.pid import AntiWindup
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.simulate import MAX_STEPS
 from pneuopt.evaluation.certificate import Defect
@@ -45,6 +46,7 @@ LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
         ),
         "limits": Key("least and largest command", Takes.LIST, "{command}", example='["-5 V", "5 V"]'),
     },
+    PositionLoop.section: {},
     "dither": {
         "waveform": choice("shape of the oscillation", _words(Waveform), Waveform.SINE.value),
         "analogue": flag("whether a generator behind the sampled controller adds it"),
@@ -68,6 +70,7 @@ LOOP_KEYS: Mapping[str, Mapping[str, Key]] = {
 LOOP_MEANINGS: Mapping[str, str] = {
     "loop": "which signals the controller connects",
     "pid": "the controller, with its first gain at least",
+    PositionLoop.section: "makes it a cascade: the position's error sets the speed that the PID controls",
     "sensor": "what the controller sees of the signal: a lag, or an encoder",
     "dither": "a small oscillation added to the command",
     "feedforward": "what a change of the reference adds to the command",

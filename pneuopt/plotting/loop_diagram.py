@@ -61,6 +61,7 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     sheet.draw_arrow("reference", loop.feedback.unit, least=1.2 if loop.feedforward else 0.9)
     begin, error = sheet.x, sheet.draw_sum("−")
     sheet.draw_arrow("error", loop.feedback.unit)
+    _draw_position_loop(sheet, loop)
     _draw_pid(sheet, loop)
     _draw_feedforward(sheet, loop)
     _draw_compensators(sheet, loop)
@@ -72,6 +73,15 @@ def plot_loop(loop: ClosedLoop) -> "Figure":
     _list_states(sheet, loop)
     sheet.fit(figure)
     return figure
+
+
+def _draw_position_loop(sheet: Sheet, loop: ClosedLoop) -> None:
+    """The outer loop of a cascade; what the PID is fed back itself is said in words."""
+    if loop.outer is not None:
+        sheet.write_below(sheet.draw_block("$K_p$", SMALL_WIDTH), "position\nloop")
+        sheet.draw_arrow(f"{loop.controlled.name} wanted", loop.controlled.unit)
+        sheet.draw_sum(f"− {loop.controlled.name}")
+        sheet.draw_arrow()
 
 
 def _draw_pid(sheet: Sheet, loop: ClosedLoop) -> None:

@@ -303,7 +303,8 @@ class LinearisedProblem:
             [k for k in ROBUSTNESS_REQUIREMENTS if self._spec.concerns(k)],
         )
         loop = self._simulator.loop
-        sections = tuple(f"{c.section}." for c in acting_always(loop))
+        outer = (loop.outer,) if loop.outer else ()
+        sections = tuple(f"{c.section}." for c in (*outer, *acting_always(loop)))
         felt = {*(f"pid.{gain}" for gain in loop.pid.form.gains), DITHER_AMPLITUDE, DITHER_FREQUENCY}
         shaping = [k for k, name in enumerate(names) if name in felt or name.startswith(sections)]
         found: dict[type, tuple[Array, Array]] = {

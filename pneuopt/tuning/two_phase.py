@@ -158,7 +158,7 @@ class Optima:
 
 def is_linear(loop: ClosedLoop) -> bool:
     """Whether the loop without its clip is a linear ODE: its Jacobian depends on neither states nor inputs."""
-    if loop.pid.sample_time is not None or acting_always(loop):
+    if loop.pid.sample_time is not None or loop.is_composed or acting_always(loop):
         return False
     ode = without_clip(loop).system().ode
     t, x, u, p = (ca.SX.sym(k, ode.size1_in(i)) for i, k in enumerate("txup"))

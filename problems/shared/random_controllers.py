@@ -10,6 +10,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID, AntiWindup
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import names
 from pneuopt.export.program import controller_program, short_name
@@ -74,10 +75,12 @@ def random_loop(seed: int) -> tuple[ClosedLoop, ParameterSet, float]:
     dither = [Dither(), Dither(waveform=Waveform.TRIANGLE), Dither(analogue=True), None][int(g.integers(4))]
     lead = Feedforward() if g.integers(2) else None
     measured = "position" if seed % 4 == 1 else "speed"
+    outer = PositionLoop() if seed % 8 == 1 else None
+    lead = None if outer else lead
     kinds = [k for k in COMPENSATORS.values() if g.integers(2)]
     loop = ClosedLoop(
         PneumaticDrive(friction=Viscous()), pid, dither, measured=measured, sensor=sensor, feedforward=lead,
-        compensators=tuple(k() for k in kinds),
+        compensators=tuple(k() for k in kinds), outer=outer,
     )  # fmt: skip
     values = {
         n: g.uniform(*RANGES.get(n, RANGES[n.split(".")[1]]))
@@ -98,6 +101,7 @@ def run_library(seed: int) -> Run:
     reference = 0.3 * np.repeat(g.normal(size=SAMPLES // 50), 50)
     more = g.normal(size=(SAMPLES, len(loop.motion_inputs))) * 0.1
     air = 5e5 + 1e4 * np.cumsum(g.normal(size=(SAMPLES, len(loop.readings))), axis=0)
+    air[:, [n == "position" for n in loop.readings]] = motion[:, :1]
     shown = np.array([_shown(loop, row) for row in motion])
     inputs, outputs = np.column_stack([reference, shown, more, air]), np.empty(SAMPLES)
     begun = program.start([*inputs[0], centre], program.values).full().ravel()
@@ -106,7 +110,7 @@ def run_library(seed: int) -> Run:
     for k in range(SAMPLES):
         x[[plant.index("position"), plant.index("speed")]] = motion[k]
         if isinstance(loop.sensor, SensorLag):
-            x[order.index("sensor.reading")] = motion[k, int(loop.feedback.name == "speed")]
+            x[order.index("sensor.reading")] = motion[k, int(loop.controlled.name == "speed")]
         x[[plant.index(n) for n in loop.readings]] = air[k]
         x = loop.update(k * h, x, [reference[k], *more[k]], p).full().ravel()
         by_name = dict(zip(order, x, strict=True))
@@ -119,4 +123,4 @@ def _shown(loop: ClosedLoop, motion: Array) -> float:
     if isinstance(loop.sensor, Encoder):
         size = loop.sensor.resolution
         return float(size * np.floor(motion[0] / size + 0.5)) if size else float(motion[0])
-    return float(motion[int(loop.feedback.name == "speed")])
+    return float(motion[int(loop.controlled.name == "speed")])

@@ -95,3 +95,4 @@ def test_every_form_and_part_is_among_the_random_controllers() -> None:
         assert {bool(getattr(loop.pid, option)) for loop in loops} == {False, True}
     assert {loop.pid.anti_windup for loop in loops if loop.pid.limits} == set(AntiWindup)
     assert {loop.feedforward is None for loop in loops} == {False, True}
+    assert {type(loop.sensor).__name__ for loop in loops if loop.outer} == {"NoneType", "Encoder"}

@@ -14,6 +14,7 @@ from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.forms import Form
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
+from pneuopt.control.position_loop import PositionLoop
 from pneuopt.control.sensor import Encoder, SensorLag
 from pneuopt.dynamics.system import System, define
 from pneuopt.models.drive import ForceDrive
@@ -59,6 +60,10 @@ LOOPS = {
     "rivals": (
         ClosedLoop(VALVE, PID(1e-3), measured="speed", compensators=tuple(part() for part in COMPENSATORS.values())),
         {*SAMPLED, *RIVALS},
+    ),
+    "cascade": (
+        ClosedLoop(VALVE, PID(1e-3), sensor=Encoder(), outer=PositionLoop()),
+        {*SAMPLED, "encoder"},
     ),
     "other input": (ClosedLoop(pushed(), PID(limits=False), actuated="valve_voltage"), set()),
 }
