@@ -171,9 +171,9 @@ class _Laws(NamedTuple):
 
 
 def _linear_law(loop: ClosedLoop) -> ClosedLoop:
-    """The loop without what its linearisation leaves out: limits, dead band, counts, dither, pulses."""
+    """The loop without what its linearisation leaves out: limits, dead band, resets, counts, dither, pulses."""
     sensor = replace(loop.sensor, resolution=0.0) if isinstance(loop.sensor, Encoder) else loop.sensor
-    pid = replace(loop.pid, limits=False, dead_band=False)
+    pid = replace(loop.pid, limits=False, dead_band=False, reset=False)
     return replace(loop, pid=pid, sensor=sensor, dither=None, compensators=acting_always(loop))
 
 

@@ -61,9 +61,9 @@ def open_loop(
 
     P is the `linear_plant`, averaged under dither.
     A sampled PID counts as its continuous equivalent (`linear_gains`) with the `dead_time` in second-order Padé form,
-    its integral as one without a dead band. Compensators that act always count by their slopes at the operating point;
-    a knocker's pulses do not. A loop with further feedback (`ClosedLoop.is_composed`) is cut at the command, and a
-    sampled one of these is exact, see `composed_loops`. Parameters as for `linear_plant`.
+    its integral as one without dead band and resets. Compensators that act always count by their slopes at the
+    operating point; a knocker's pulses do not. A loop with further feedback (`ClosedLoop.is_composed`) is cut at the
+    command, and a sampled one of these is exact, see `composed_loops`. Parameters as for `linear_plant`.
 
     Returns
     -------

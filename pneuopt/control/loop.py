@@ -145,7 +145,7 @@ class ClosedLoop:
         """Those of the plant, "pid.*", "dither.*", "sensor.*", "feedforward.*" and the compensators', all defaults."""
         h, measured, unit = self.pid.sample_time, self.controlled.unit, self.command.unit
         parts = {
-            "pid": self.pid.parameters(measured, unit),
+            "pid": self.pid.parameters(measured, unit, self.feedback.unit),
             "dither": self.dither.parameters(unit, h) if self.dither else ParameterSet(),
             "sensor": self.sensor.parameters(self.sensed_signal) if self.sensor else ParameterSet(),
             "feedforward": self.feedforward.parameters(measured, unit) if self.feedforward else ParameterSet(),

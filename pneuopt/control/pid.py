@@ -12,6 +12,7 @@ from typing import Any
 import casadi as ca
 
 from pneuopt.control.forms import ZERO_N_MESSAGE, ZERO_TI_MESSAGE, Form, parallel_gains
+from pneuopt.control.reset_integral import RESET_STATES, reset_parameters, reset_quantities
 from pneuopt.dynamics.system import Symbols
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
@@ -67,6 +68,9 @@ class PID:
         Whether the integral has one; its half width is the parameter dead_band [measured unit].
     anti_windup : AntiWindup
         Back-calculation, or of a sampled controller clamping. Without limits it is without effect.
+    reset : bool
+        Whether a sampled controller's integral is reset where the error changes sign, and where the motion then stops
+        (`reset_integral`): against hunting. The parameters are reset_ratio [1] and reset_band [the reference's unit].
 
     Raises
     ------
@@ -80,6 +84,7 @@ class PID:
     delay: int = 0
     dead_band: bool = False
     anti_windup: AntiWindup = AntiWindup.BACK_CALCULATION
+    reset: bool = False
 
     def __post_init__(self) -> None:
         h, delay = self.sample_time, self.delay
@@ -93,14 +98,17 @@ class PID:
         require(isinstance(kind, AntiWindup), f"PID: anti_windup is one of {kinds}, got {kind!r}")
         told = "PID: clamping is decided once a sample: give a sample_time, or take back-calculation"
         require(h is not None or kind is AntiWindup.BACK_CALCULATION, told)
+        require(h is not None or not self.reset, "PID: a reset is decided once a sample: give a sample_time")
 
-    def parameters(self, input_unit: str, output_unit: str) -> ParameterSet:
+    def parameters(self, input_unit: str, output_unit: str, reference_unit: str = "") -> ParameterSet:
         """Defaults: a gain of 1, no I, no D, ``Tf = 10 ms`` or ``N = 10``, ``b = c = 1``, no limit, no dead band.
 
         Parameters
         ----------
         input_unit, output_unit : str
             Units of the measured signal and of the command; the gains' units follow.
+        reference_unit : str
+            Unit of what the loop is judged by; by default the measured signal's.
 
         Returns
         -------
@@ -151,7 +159,8 @@ class PID:
         }
         if self.anti_windup is AntiWindup.CLAMPING:
             del saturation["Tt"]
-        return ParameterSet(core | saturation if self.limits else core)
+        found = ParameterSet(core | saturation if self.limits else core)
+        return found | reset_parameters(reference_unit or input_unit) if self.reset else found
 
     @property
     def positive_parameters(self) -> tuple[str, ...]:
@@ -174,6 +183,9 @@ class PID:
         require(p.get("N", inf) != 0, f"pid.{ZERO_N_MESSAGE}")
         filtered = "pid.N = inf" if self.form is Form.STANDARD else f"pid.Tf = {p['Tf']:g} s"
         require(p["Tf"] > 0 or h is not None, f"{filtered}: a continuous derivative needs a filter, Tf > 0")
+        for name, most in (("reset_ratio", 1.0), ("reset_band", inf)):
+            told = f"pid.{name} must lie within [0, {most:g}], got {p.get(name, 0.0):g}"
+            require(0 <= p.get(name, 0.0) <= most, told)
         band = p.get("dead_band", 0.0)
         require(band >= 0, f"pid.dead_band must not be negative, got {band:g}; 0 is none")
         if self.limits:
@@ -195,6 +207,7 @@ class PID:
             Quantity("previous_error", measured.unit, measured.nominal),
             Quantity("command", command.unit, command.nominal),
             *(pending for _ in range(self.delay)),
+            *(reset_quantities(measured) if self.reset else ()),
         )
 
     def start(self, r: Any, y: Any, command: Any, p: Mapping[str, Any]) -> list[Any]:
@@ -210,7 +223,7 @@ class PID:
         integral, error = command - p["Kp"] * (p["b"] * r - y), p["c"] * r - y
         if self.sample_time is None:
             return [integral, error]
-        return [integral, 0.0, error, *[command] * (1 + self.delay)]
+        return [integral, 0.0, error, *[command] * (1 + self.delay), *[0.0] * (len(RESET_STATES) * self.reset)]
 
     def rates(self, x: Symbols, r: ca.SX, y: ca.SX, added: ca.SX, p: Symbols) -> tuple[dict[str, ca.SX], ca.SX]:
         """The continuous law.
@@ -239,14 +252,15 @@ class PID:
         """The sampled law at a sample: the next value of each state, "command" being what is held.
 
         Parameters as for `rates`; the states are "integral", "derivative", "previous_error", "command", and with a
-        delay "pending", the command that the next sample holds.
+        delay "pending", the command that the next sample holds; with a reset as `reset_integral` leaves them.
         """
         terms = self.terms(x, r, y, p)
         w = self.output(x, r, y, p) + added
         u = self.clip(w, p)
         sent = {"command": x["pending"], "pending": u} if self.delay else {"command": u}
         remembered = {"derivative": terms["derivative"], "previous_error": p["c"] * r - y}
-        return {"integral": self._unwind(x["integral"], terms["integral"], w, u, p), **remembered, **sent}
+        own = {n: x[n] for n in RESET_STATES if self.reset}
+        return {"integral": self._unwind(x["integral"], terms["integral"], w, u, p), **remembered, **sent, **own}
 
     def terms(self, x: Symbols, r: ca.SX, y: ca.SX, p: Symbols) -> dict[str, ca.SX]:
         """The sampled law's terms at a sample: "proportional", "integral" before back-calculation, "derivative"."""

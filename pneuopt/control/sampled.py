@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import casadi as ca
 
 from pneuopt.control.command import CommandParts, added_command, added_terms, pid_reference
+from pneuopt.control.reset_integral import reset_integral
 from pneuopt.control.sensor import Encoder, SensedSignal, SensorLag
 from pneuopt.control.wiring import Signals
 from pneuopt.dynamics.system import Symbols
@@ -71,8 +72,10 @@ def controller_update(
         else {}
     )
     measured = seen["reading"] if seen else y[loop.sensed_signal.measured.name]
+    position = measured if loop.outer is None else seen["count"] if "count" in seen else y[loop.feedback.name]
+    x = {**x, **_reset(loop, without_prefix(x, "pid"), u["reference"] - position, without_prefix(p, "pid"))}
     if loop.outer is not None:
-        u = pid_reference(loop, u, seen["count"] if "count" in seen else y[loop.feedback.name], p)
+        u = pid_reference(loop, u, position, p)
     moved, added = added_command(loop, t, x, u, measured, y, p)
     arguments = without_prefix(x, "pid"), u["reference"], measured
     own = without_prefix(p, "pid")
@@ -80,3 +83,8 @@ def controller_update(
     terms = loop.pid.terms(*arguments, own) | added_terms(loop, t, x, u, measured, y, p)[1]
     sum_before_clip = loop.pid.output(*arguments, own) + added
     return ControllerUpdate(after, {"error": u["reference"] - measured, **terms, "unlimited": sum_before_clip})
+
+
+def _reset(loop: ControllerParts, x: Symbols, error: ca.SX, p: Symbols) -> Signals:
+    """The PID's states that a reset changes before its law is computed."""
+    return with_prefix(reset_integral(x, error, p), "pid") if loop.pid.reset else {}

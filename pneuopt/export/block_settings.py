@@ -97,7 +97,8 @@ def run_as_block(
     kind = AntiWindup.CLAMPING if clamps else loop.pid.anti_windup
     found += ["its integral is clamped at a limit, the design's unwinds by back-calculation"] if clamps else []
     found += ["it has no dead band of the integral"] if loop.pid.dead_band else []
-    pid = replace(loop.pid, form=Form.PARALLEL, anti_windup=kind, dead_band=False)
+    found += ["it has no reset of the integral"] if loop.pid.reset else []
+    pid = replace(loop.pid, form=Form.PARALLEL, anti_windup=kind, dead_band=False, reset=False)
     own = replace(loop, pid=pid)
     gains = loop.parallel_form(parameters)
     values = {f"pid.{n}": v for n, v in vars(gains).items()} | _block_gains(loop, parameters, form, found)

@@ -30,6 +30,8 @@ STATE_MEANINGS: Mapping[str, str] = {
     "pid.integral": "integral term, with what unwinds it",
     "pid.derivative": "filtered derivative term",
     "pid.previous_error": "weighted error of the sample before",
+    "pid.side": "side on which the error was last",
+    "pid.excursion": "how far the error has gone since it changed sides",
     "pid.pending": "command that acts at the next sample",
     "feedforward.filter": "reference, filtered",
     "pressure_feedback.slow": "differential pressure, its slow part",

@@ -93,11 +93,13 @@ def _pid(table: Mapping[str, Any], where: str) -> PID:
     _check_gains(table, form, where)
     sample_time = _read_value(table, "sample_time", keys, where)
     delay = _sample_count(table.get("delay", keys["delay"].usual), f"{where} delay")
-    banded = "dead_band" in table
+    banded, resets = "dead_band" in table, "reset_ratio" in table
+    told = "reset_band is that of resets; write reset_ratio, too, 1 for the whole integral"
+    require(resets or "reset_band" not in table, f"{where} {told}")
     unwinds = _read_choice(table, "anti_windup", keys, where)
     told = "Tt is back-calculation's; clamping has none; leave it out"
     require("Tt" not in table or unwinds is AntiWindup.BACK_CALCULATION, f"{where} {told}")
-    return construct_at(lambda: PID(sample_time, "limits" in table, form, delay, banded, unwinds), where)
+    return construct_at(lambda: PID(sample_time, "limits" in table, form, delay, banded, unwinds, resets), where)
 
 
 def _read_choice(table: Mapping[str, Any], key: str, keys: Mapping[str, Key], where: str) -> Any:

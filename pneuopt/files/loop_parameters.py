@@ -46,7 +46,7 @@ def _pid_keys(command: str, measured: str) -> dict[str, Key]:
     """The gains of every form, and what is shared; those of some forms say which."""
     found: dict[str, Key] = {}
     for form in Form:
-        pid = PID(SAMPLE_TIME, form=form, dead_band=True).parameters(measured, command)
+        pid = PID(SAMPLE_TIME, form=form, dead_band=True, reset=True).parameters(measured, command)
         for name in (n for n in pid if n not in _LIMITS and n not in found):
             forms = [f'"{f.value}"' for f in Form if name in f.gains]
             own = f"form = {' or '.join(forms)}" if 0 < len(forms) < len(Form) else ""

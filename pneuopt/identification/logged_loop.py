@@ -15,6 +15,7 @@ from scipy.signal import savgol_filter
 
 from pneuopt.control.compensation import Instant
 from pneuopt.control.loop import ClosedLoop
+from pneuopt.control.reset_integral import RESET_STATES
 from pneuopt.control.rest import unobservable_states
 from pneuopt.control.sensor import Encoder
 from pneuopt.dynamics.compiled.rollout import Rollout
@@ -126,7 +127,7 @@ class LoggedLoop:
         The command is computed anew at the first sample; of previous error and derivative only a sum counts, and what
         a compensator remembers soon passes.
         """
-        held = {"pid.command", "pid.previous_error"}
+        held = {"pid.command", "pid.previous_error", *(f"pid.{n}" for n in RESET_STATES)}
         held |= {
             f"{c.section}.{q.name}"
             for c in self.loop.compensators

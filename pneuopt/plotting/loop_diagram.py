@@ -87,6 +87,7 @@ def _draw_position_loop(sheet: Sheet, loop: ClosedLoop) -> None:
 def _draw_pid(sheet: Sheet, loop: ClosedLoop) -> None:
     notes = [f"PID, {loop.pid.form.value} form;", "P sees b r − y, D sees c r − y"]
     notes += ["the integral has a dead band"] if loop.pid.dead_band else []
+    notes += ["the error's change of sign resets it"] if loop.pid.reset else []
     notes += ["it is clamped at a limit"] if loop.pid.limits and loop.pid.anti_windup is AntiWindup.CLAMPING else []
     sheet.write_below(sheet.draw_block(LAWS[loop.pid.form], PID_WIDTH), "\n".join(notes))
 

@@ -33,12 +33,15 @@ RANGES = {
     "c": (0.0, 1.0),
     "Tt": (0.01, 0.5),
     "dead_band": (0.0, 0.02),
+    "reset_ratio": (0.2, 1.0),
+    "reset_band": (0.0, 0.01),
     "amplitude": (0.0, 2.0),
     "offset": (-1.0, 1.0),
     "frequency": (20.0, 150.0),
     "gain": (-2.0, 5.0),
     "pressure_feedback.gain": (0.0, 1e-5),
     "acceleration_feedback.gain": (0.0, 0.1),
+    "acceleration_feedback.filter": (2e-3, 0.01),
     "time": (0.01, 0.2),
     "level": (0.0, 1.0),
     "speed": (0.0, 3.0),
@@ -71,6 +74,7 @@ def random_loop(seed: int) -> tuple[ClosedLoop, ParameterSet, float]:
         int(g.integers(2)),
         bool(g.integers(2)),
         list(AntiWindup)[seed % 4 == 2],
+        seed % 6 == 3,
     )
     dither = [Dither(), Dither(waveform=Waveform.TRIANGLE), Dither(analogue=True), None][int(g.integers(4))]
     lead = Feedforward() if g.integers(2) else None

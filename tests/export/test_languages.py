@@ -91,7 +91,7 @@ def test_every_form_and_part_is_among_the_random_controllers() -> None:
     assert {(loop.dither.waveform.value, loop.dither.analogue) for loop in loops if loop.dither} == {
         ("sine", False), ("triangle", False), ("sine", True)
     }  # fmt: skip
-    for option in ("delay", "dead_band", "limits"):
+    for option in ("delay", "dead_band", "limits", "reset"):
         assert {bool(getattr(loop.pid, option)) for loop in loops} == {False, True}
     assert {loop.pid.anti_windup for loop in loops if loop.pid.limits} == set(AntiWindup)
     assert {loop.feedforward is None for loop in loops} == {False, True}
