@@ -14,7 +14,7 @@ from pneuopt.quantities.errors import ModelError, require
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
 from pneuopt.quantities.unit_algebra import unit_ratio
 
-FILTER_TIME = 5e-3  # [s] default: a short one passes an encoder's counts, a long one delays what shall damp
+DERIVATIVE_FILTER_TIME = 5e-3  # [s] default: a short one passes an encoder's counts, a long one delays what shall damp
 MIN_FILTER_TIME = 1e-4  # [s]; below, the loop is too stiff to integrate, and a difference over a sample is all counts
 
 
@@ -55,7 +55,10 @@ class AccelerationFeedback:
                     0.0, unit_ratio(f"{unit}*s", on.speed_unit), meaning="command taken back per acceleration"
                 ),
                 "filter": Parameter(
-                    FILTER_TIME, "s", lower=MIN_FILTER_TIME, meaning="time constant of each derivative's filter"
+                    DERIVATIVE_FILTER_TIME,
+                    "s",
+                    lower=MIN_FILTER_TIME,
+                    meaning="time constant of each derivative's filter",
                 ),
             }
         )

@@ -40,7 +40,7 @@ class OpenLoops(NamedTuple):
     loop : tuple of ndarray
         Under negative feedback, as `Matrices`; the plant's states come first.
     noise : tuple of ndarray
-        The controllers from noise on what the PID sees to the command, without the plant.
+        The controllers from noise on what the PID sees, in a cascade on the position, to the command, without plant.
     """
 
     loop: Matrices
@@ -94,7 +94,7 @@ class ComposedLoops:
         C = slopes.full().reshape(len(loop.plant.outputs), len(x), -1, order="F").transpose(1, 0, 2) * scale
         if isinstance(loop.sensor, SensorLag):
             rate = 1 / np.reshape(loop.sensor_lag(p.T), (-1, 1, 1)) + np.zeros((len(x), 1, 1))
-            k, n = names(loop.plant.outputs).index(loop.controlled.name), A.shape[-1]
+            k, n = names(loop.plant.outputs).index(loop.pid_signal.name), A.shape[-1]
             A = np.block([[A, np.zeros((len(x), n, 1))], [rate * C[:, k : k + 1], -rate]])
             B = np.concatenate([B, np.zeros((len(x), 1, 1))], axis=1)
             C = np.concatenate([C, np.zeros((*C.shape[:2], 1))], axis=2)
@@ -117,7 +117,7 @@ class ComposedLoops:
         loop, order = self.loop, list(self.loop.parameters)
         bare = command - (p[:, order.index(DITHER_OFFSET)] if DITHER_OFFSET in order else 0.0)
         y = dict(zip(names(loop.plant.outputs), shown.T, strict=True))
-        seen, read = y[loop.controlled.name], np.array([y[n] for n in loop.readings])
+        seen, read = y[loop.pid_signal.name], np.array([y[n] for n in loop.readings])
         v = uncompensated_command(loop, p.T, seen, seen, bare, read)
         sizes = [self._law.size_out(k) for k in range(4)]
         found = [
@@ -184,15 +184,17 @@ def _lagging(loop: ClosedLoop) -> tuple[str, ...]:
 def _controller(loop: ClosedLoop, x: Signals, r: ca.SX, y: Signals, noise: ca.SX, p: Signals) -> tuple[Signals, ca.SX]:
     """Rates or next values of a controller's states, and its command before the clip, under a reference at rest."""
     own = without_prefix(x, "sensor")
+    noisy = loop.feedback.name
+    y = {**y, noisy: y[noisy] + noise} if loop.outer else y
     seen = (
         loop.sensor.update(own, y, loop.sensed_signal, without_prefix(p, "sensor"))
         if isinstance(loop.sensor, Encoder)
         else {}
     )
-    measured = seen.get("reading", y[loop.controlled.name]) + noise
+    measured = seen.get("reading", y[loop.pid_signal.name]) + (0 if loop.outer else noise)
     bare, u = replace(loop, sensor=None), dict.fromkeys(names(loop.inputs), ca.SX(0))
     u["reference"] = r
-    shown = {**y, loop.controlled.name: measured}
+    shown = {**y, loop.pid_signal.name: measured}
     if loop.pid.sample_time is None:
         inner = pid_reference(bare, u, y[loop.feedback.name], p)
         moved, added = added_command(bare, ca.SX(0), x, inner, measured, shown, p)
@@ -207,7 +209,7 @@ def _controller(loop: ClosedLoop, x: Signals, r: ca.SX, y: Signals, noise: ca.SX
 
 def _resting_states(loop: ClosedLoop, x: Signals, y: Signals, v: ca.SX, p: Signals) -> Signals:
     """The states under constant signals, with the integral that makes the PID's command v."""
-    h, measured = loop.pid.sample_time or 0.0, y[loop.controlled.name]
+    h, measured = loop.pid.sample_time or 0.0, y[loop.pid_signal.name]
     at: Signals = {n: ca.SX(0) for n in x}
     if isinstance(loop.sensor, Encoder):
         at["sensor.reading"], position = measured, y[loop.sensor.position]

@@ -91,6 +91,7 @@ def noise_path(
 ) -> Linearisation:
     """The controller of a loop with further feedback, from noise on what the PID sees to the command.
 
+    In a cascade the noise is the position's, which an `Encoder` differentiates, too.
     Parameters as for `linear_plant`; frequencies as in `open_loop`.
     """
     return _composed_loops(loop, parameters, *operating_point(loop, parameters, x, u))[1]
@@ -102,7 +103,7 @@ def _composed_loops(
     """The open loop and the noise path at an operating point."""
     loop.check(parameters)
     at = np.array([[u.get(n, 0.0) for n in names(loop.plant.inputs)]])
-    found = _composed(loop)(loop.parameter_vector(parameters)[None], np.asarray(x, dtype=float)[None], at)
+    found = _composed_function(loop)(loop.parameter_vector(parameters)[None], np.asarray(x, dtype=float)[None], at)
     plant = names(loop.plant.states)
     own = [f"controller.{k}" for k in range(found.loop[0].shape[-1] - len(plant))]
     A, B, C, D = (M[0] for M in found.loop)
@@ -113,7 +114,7 @@ def _composed_loops(
 
 
 @lru_cache(maxsize=8)
-def _composed(loop: ClosedLoop) -> ComposedLoops:
+def _composed_function(loop: ClosedLoop) -> ComposedLoops:
     """The function of a loop, kept likewise."""
     return ComposedLoops(loop)
 

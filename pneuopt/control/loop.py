@@ -97,7 +97,7 @@ class ClosedLoop:
             self.sensor.check(self.sensed_signal)
         if not isinstance(self.sensor, SensorLag):
             check_algebraic_loop(
-                self.plant, self.command.name, self.controlled.name if self.sensor is None else self.sensor.position
+                self.plant, self.command.name, self.pid_signal.name if self.sensor is None else self.sensor.position
             )
         check_cascade(self)
         reserved = {"reference": names(self.plant.inputs), "control": names(self.plant.outputs)}
@@ -133,7 +133,7 @@ class ClosedLoop:
         return select_signal("output", self.measured, self.plant.outputs, usual)
 
     @property
-    def controlled(self) -> Quantity:
+    def pid_signal(self) -> Quantity:
         """The plant's output that the PID controls."""
         if self.outer is None:
             return self.feedback
@@ -143,7 +143,7 @@ class ClosedLoop:
     @cached_property
     def parameters(self) -> ParameterSet:
         """Those of the plant, "pid.*", "dither.*", "sensor.*", "feedforward.*" and the compensators', all defaults."""
-        h, measured, unit = self.pid.sample_time, self.controlled.unit, self.command.unit
+        h, measured, unit = self.pid.sample_time, self.pid_signal.unit, self.command.unit
         parts = {
             "pid": self.pid.parameters(measured, unit, self.feedback.unit),
             "dither": self.dither.parameters(unit, h) if self.dither else ParameterSet(),
@@ -160,7 +160,7 @@ class ClosedLoop:
         """The plant's, the sensor's ("sensor.reading"), the controller's ("pid.*", "feedforward.filter") and so on."""
         parts = {
             "sensor": self.sensor.states(self.sensed_signal) if self.sensor else (),
-            "pid": self.pid.states(self.controlled, self.command),
+            "pid": self.pid.states(self.pid_signal, self.command),
             "feedforward": self.feedforward.states(self.feedback) if self.feedforward else (),
             **{c.section: c.states(self.sensed_signal, self.command) for c in self.compensators},
         }
@@ -376,9 +376,9 @@ class ClosedLoop:
     def sensed_signal(self) -> SensedSignal:
         """What the sensor reads."""
         axis = self.plant.axis or Axis()
-        order = {axis.position: 0, axis.speed: 1}.get(self.controlled.name, None if self.plant.axis else 1)
+        order = {axis.position: 0, axis.speed: 1}.get(self.pid_signal.name, None if self.plant.axis else 1)
         outputs = {q.name: q for q in self.plant.outputs}
-        return SensedSignal(self.controlled, outputs, self.pid.sample_time, order, cascade=bool(self.outer))
+        return SensedSignal(self.pid_signal, outputs, self.pid.sample_time, order, cascade=bool(self.outer))
 
 
 def check_closed_loop(loop: object) -> None:

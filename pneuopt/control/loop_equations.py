@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def continuous_rates(loop: "ClosedLoop", t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
     """Rates and outputs of a loop with a continuous PID."""
     shown = evaluate_plant(loop.plant, loop.command.name, t, x, u, p, ca.SX(0))[1]
-    seen = x["sensor.reading"] if loop.sensor else shown[loop.controlled.name]
+    seen = x["sensor.reading"] if loop.sensor else shown[loop.pid_signal.name]
     u = pid_reference(loop, u, shown[loop.feedback.name], p)
     moved, added = added_command(loop, t, x, u, seen, shown, p)
     rates, command = loop.pid.rates(without_prefix(x, "pid"), u["reference"], seen, added, without_prefix(p, "pid"))

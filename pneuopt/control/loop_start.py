@@ -39,7 +39,7 @@ def start_state(
     shown = loop.plant.ode(0, x, np.zeros(len(loop.plant.inputs)), [value[n] for n in loop.plant.parameters])[1]
     y = dict(zip(names(loop.plant.outputs), shown.full().ravel().tolist(), strict=True))
     sensor = loop.sensor.start(y, loop.sensed_signal, without_prefix(value, "sensor")) if loop.sensor else []
-    seen = sensor[0] if sensor else y[loop.controlled.name]
+    seen = sensor[0] if sensor else y[loop.pid_signal.name]
     wanted = float(pid_reference(loop, {"reference": reference}, y[loop.feedback.name], value)["reference"])
     v = float(uncompensated_command(loop, p, wanted, seen, command, [y[n] for n in loop.readings])[0])
     own = loop.pid.start(wanted, seen, v, {**without_prefix(value, "pid"), "Kp": float(loop.gains(p)[0])})

@@ -35,7 +35,7 @@ class WiredLoop(CommandParts, Protocol):
         ...
 
     @property
-    def controlled(self) -> Quantity:
+    def pid_signal(self) -> Quantity:
         """The plant's output that the PID controls."""
         ...
 
@@ -158,7 +158,7 @@ def _rest_system(loop: WiredLoop, free: tuple[str, ...], parameters: ParameterSe
     def rhs(t: ca.SX, x: Symbols, u: Symbols, p: Symbols) -> tuple[Signals, Signals]:
         moving = {n: x.get(n, ca.SX(0)) for n in names(plant.states)}
         shown = evaluate_plant(plant, loop.command.name, t, moving, u, p, ca.SX(0))[1]
-        y, read = shown[loop.controlled.name], ca.vertcat(*(shown[n] for n in loop.readings))
+        y, read = shown[loop.pid_signal.name], ca.vertcat(*(shown[n] for n in loop.readings))
         r = pid_reference(loop, u, shown[loop.feedback.name], p)["reference"]
         every = ca.vertcat(*p.values())
         gains = loop.gains(every)

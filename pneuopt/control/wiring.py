@@ -74,7 +74,7 @@ class CascadedLoop(Protocol):
         ...
 
     @property
-    def controlled(self) -> Quantity:
+    def pid_signal(self) -> Quantity:
         """The output that the PID controls."""
         ...
 

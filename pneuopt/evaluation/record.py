@@ -150,7 +150,7 @@ class _SampledController:
 
     def __init__(self, rig: Rig, loop: ClosedLoop, parameters: ParameterSet, log_inputs: Trajectory, x: Array) -> None:
         loop.check(parameters)
-        signal, read = loop.controlled, replace(loop, sensor=None).readings
+        signal, read = loop.pid_signal, replace(loop, sensor=None).readings
         others = [q for q in loop.plant.outputs if q.name in read and q != signal]
         shown, self._others = [signal, *others], names(others)
         echo_plant = define(
@@ -194,7 +194,7 @@ class _SampledController:
 
     def _feedback(self, readings: Mapping[str, float]) -> float:
         """Measured signal as the controller gets it: a sensor's reading, or a speed differentiated from an encoder."""
-        wanted, source = self._loop.controlled.name, self._rig.feedback
+        wanted, source = self._loop.pid_signal.name, self._rig.feedback
         if source == wanted:
             return readings[wanted]
         counts = Sensor(resolution=self._rig.encoder.resolution)

@@ -162,7 +162,7 @@ class Rig:
         """Channel that the controller reads, the position where an encoder gives the speed; None without a loop."""
         if self.loop is None:
             return None
-        wanted = self.loop.controlled.name
+        wanted = self.loop.pid_signal.name
         return self.encoder.position if wanted == "speed" and "speed" not in self.sensors else wanted
 
     @property

@@ -95,10 +95,10 @@ def make_header(name: str, loop: ClosedLoop, parameters: ParameterSet, centre: f
 
 def _gain_lines(loop: ClosedLoop, parameters: ParameterSet) -> list[str]:
     """The gains in the parallel, standard and series forms."""
-    gains, gain = loop.parallel_form(parameters), unit_ratio(loop.command.unit, loop.controlled.unit)
+    gains, gain = loop.parallel_form(parameters), unit_ratio(loop.command.unit, loop.pid_signal.unit)
     units = {"Kp": gain, "K": gain, "Ti": "s", "Td": "s", "Tf": "s", "N": ""}
-    units["Ki"] = unit_ratio(loop.command.unit, f"{difference_unit(loop.controlled.unit)}*s")
-    units["Kd"] = unit_ratio(f"{difference_unit(loop.command.unit)}*s", loop.controlled.unit)
+    units["Ki"] = unit_ratio(loop.command.unit, f"{difference_unit(loop.pid_signal.unit)}*s")
+    units["Kd"] = unit_ratio(f"{difference_unit(loop.command.unit)}*s", loop.pid_signal.unit)
 
     def line(name: str, convert: Callable[[], Any], formula: str) -> str:
         try:

@@ -183,7 +183,7 @@ def _law(loop: ClosedLoop) -> _Law:
     dither = None if loop.dither is None else _WrappedDither(**vars(loop.dither))
     lead, added = loop.feedforward, loop.compensators
     parts = _ComputedParts(loop.pid, dither, lead, added, encoder, sensed, loop.outer, loop.feedback)
-    measured = sensed.outputs[encoder.position] if encoder else loop.controlled
+    measured = sensed.outputs[encoder.position] if encoder else loop.pid_signal
     known = loop.states[len(loop.plant.states) :]
     x = symbols([q for q in known if encoder or not q.name.startswith("sensor.")]) | {SAMPLE: ca.SX.sym(SAMPLE)}
     p: Signals = {n: ca.SX.sym(n) for n in (*loop.parameters, CENTRE)}

@@ -79,8 +79,8 @@ def _draw_position_loop(sheet: Sheet, loop: ClosedLoop) -> None:
     """The outer loop of a cascade; what the PID is fed back itself is said in words."""
     if loop.outer is not None:
         sheet.write_below(sheet.draw_block("$K_p$", SMALL_WIDTH), "position\nloop")
-        sheet.draw_arrow(f"{loop.controlled.name} wanted", loop.controlled.unit)
-        sheet.draw_sum(f"− {loop.controlled.name}")
+        sheet.draw_arrow(f"{loop.pid_signal.name} wanted", loop.pid_signal.unit)
+        sheet.draw_sum(f"− {loop.pid_signal.name}")
         sheet.draw_arrow()
 
 
@@ -196,7 +196,8 @@ def _draw_feedback(sheet: Sheet, loop: ClosedLoop, outlet: float, error: float) 
     sheet.draw_line([*path[:2], (place + width / 2, SENSOR_HEIGHT)])
     sheet.draw_box(place, SENSOR_HEIGHT, width, text)
     sheet.draw_line([(place - width / 2, SENSOR_HEIGHT), *path[2:]])
-    for q in (q for q in loop.states if q.name == "sensor.reading"):
+    shown = "sensor.count" if loop.outer and isinstance(loop.sensor, Encoder) else "sensor.reading"
+    for q in (q for q in loop.states if q.name == shown):
         sheet.write(place - width / 2 - 0.1, SENSOR_HEIGHT + 0.04, " ".join(signal_lines(q)), ha="right", va="bottom")
 
 

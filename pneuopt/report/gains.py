@@ -41,7 +41,7 @@ def report_forms(loop: ClosedLoop, parameters: ParameterSet) -> Report:
         Every parameter of the loop.
     """
     parallel = loop.parallel_form(parameters)
-    unit = unit_ratio(loop.command.unit, loop.controlled.unit)
+    unit = unit_ratio(loop.command.unit, loop.pid_signal.unit)
     units = {"Kp": unit, "K": unit, "Ki": unit_ratio(unit, "s"), "Kd": unit_ratio(f"({unit})*s", "1"), "N": "1"}
     rows, refused = [], []
     for (name, law), convert in zip(LAW_TEXTS.items(), (_as_given, to_standard, to_series), strict=True):

@@ -114,7 +114,7 @@ def run_library(seed: int) -> Run:
     for k in range(SAMPLES):
         x[[plant.index("position"), plant.index("speed")]] = motion[k]
         if isinstance(loop.sensor, SensorLag):
-            x[order.index("sensor.reading")] = motion[k, int(loop.controlled.name == "speed")]
+            x[order.index("sensor.reading")] = motion[k, int(loop.pid_signal.name == "speed")]
         x[[plant.index(n) for n in loop.readings]] = air[k]
         x = loop.update(k * h, x, [reference[k], *more[k]], p).full().ravel()
         by_name = dict(zip(order, x, strict=True))
@@ -127,4 +127,4 @@ def _shown(loop: ClosedLoop, motion: Array) -> float:
     if isinstance(loop.sensor, Encoder):
         size = loop.sensor.resolution
         return float(size * np.floor(motion[0] / size + 0.5)) if size else float(motion[0])
-    return float(motion[int(loop.controlled.name == "speed")])
+    return float(motion[int(loop.pid_signal.name == "speed")])

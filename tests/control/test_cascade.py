@@ -9,7 +9,7 @@ from pneuopt.control.compensation import Compensator
 from pneuopt.control.dead_zone_inverse import DeadZoneInverse
 from pneuopt.control.feedforward import Feedforward
 from pneuopt.control.friction_feedforward import Direction, FrictionFeedforward
-from pneuopt.control.linear_loop import open_loop
+from pneuopt.control.linear_loop import noise_path, open_loop
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.motion_feedforward import MotionFeedforward
 from pneuopt.control.pid import PID
@@ -21,7 +21,7 @@ from pneuopt.dynamics.simulate import simulate
 from pneuopt.dynamics.system import names
 from pneuopt.evaluation.batch_margins import batch_margin_function
 from pneuopt.evaluation.evaluate import evaluate
-from pneuopt.evaluation.margins import frequency_response, margins
+from pneuopt.evaluation.margins import frequency_response, margins, noise_gain
 from pneuopt.evaluation.record import record
 from pneuopt.evaluation.requirements import Overshoot, SettlingTime
 from pneuopt.evaluation.rig import Rig, Sensor
@@ -60,7 +60,7 @@ def steady_motion(speed: float) -> tuple[np.ndarray, dict[str, float]]:
 
 def test_signals_and_units_are_those_of_position_and_speed() -> None:
     loop = cascade(MotionFeedforward(), FrictionFeedforward(Direction.MEASURED))
-    assert (loop.feedback.name, loop.controlled.name) == ("position", "speed")
+    assert (loop.feedback.name, loop.pid_signal.name) == ("position", "speed")
     assert [(q.name, q.unit) for q in loop.inputs] == [
         ("reference", "m"),
         ("reference_speed", "m/s"),
@@ -119,6 +119,9 @@ def test_margins_are_those_of_the_exactly_sampled_loop(encoder: bool) -> None:
     found = margins(linear)
     assert found.stable
     assert found.max_sensitivity == pytest.approx(np.abs(1 / (1 + L)).max(), rel=1e-5)
+    seen = ((0.8 * proportional + integral) * 5.0 + encoder * (proportional + integral) * v / y) / (1 + L)
+    noise = noise_gain(linear, noise_path(loop, p, x, u), 0.3)
+    assert noise == pytest.approx(np.abs(seen)[w >= 0.3].max(), rel=1e-4)
     read = batch_margin_function(loop, np.geomspace(0.01, 20 / H, 600), 0.3)
     inputs = np.array([[[u.get(n, 0.0) for n in names(loop.plant.inputs)]]])
     in_search = read(loop.parameter_vector(p)[None], x[None, None], inputs, ["MaxSensitivity", "PhaseMargin"])

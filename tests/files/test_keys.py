@@ -99,7 +99,9 @@ def test_a_tunings_keys_are_those_of_its_reader(tmp_path: Path) -> None:
     assert accepted(read_loop, path, rest) == {r.section for r in list_keys() if r.file == "tuning.toml"}
     forms = {"parallel": "Kp = '1 N*s/m'", "standard": "Kp = '1 N*s/m'", "series": "K = '1 N*s/m'"}
     pids = [
-        f"[pid]\nform = '{f}'\n{gain}\nlimits = ['-1 N', '1 N']\ndead_band = '1 mm/s'\n" for f, gain in forms.items()
+        f"[pid]\nform = '{f}'\n{gain}\nlimits = ['-1 N', '1 N']\ndead_band = '1 mm/s'\n"
+        "sample_time = '1 ms'\nreset_ratio = 1\n"
+        for f, gain in forms.items()
     ]
     gains = set().union(*(accepted(read_loop, path, pid + REFERENCE, "pid") for pid in pids))
     assert gains == listed("tuning.toml", "pid")
