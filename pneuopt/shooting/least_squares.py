@@ -56,7 +56,7 @@ class LeastSquares:
     progress : callable, optional
         Receives one line of text an iteration.
     budget : CpuBudget, optional
-        Ends the search as Ctrl-C does, before the iteration that comes next.
+        Ends the search as Ctrl-C does, before the trial step that comes next.
     max_misfit : float
         Squared residuals a sample, in noise variances, beyond which the search ends after the first stage, or before
         the last where the gaps do not absorb the misfit, for a caller who has other starts to try.

@@ -100,13 +100,16 @@ class Descent:
         self.objective, self.damping, self._is_negligible = objective, damping, is_negligible
         self.node_damping = np.zeros(objective.segments.count)
 
-    def step(self, current: Iterate) -> Iterate | None:
+    def step(self, current: Iterate, budget: CpuBudget | None = None) -> Iterate | None:
         """The next iterate; None if no damping lowers the cost, or the step would be negligible.
 
-        After the first try the damping rises only at the nodes that have overshot, if there are any.
+        After the first try the damping rises only at the nodes that have overshot, if there are any. A budget that is
+        spent raises `BudgetSpentError` before the next try, for ten of them by fine integration steps take seconds.
         """
         raise_by, scaling = 10.0, self.objective.scaling
         for k in range(MAX_TRIES):
+            if budget is not None:
+                budget.check()
             reduced = current.equations.arrow.eliminate(self.damping, self.node_damping)
             step = reduced and reduced.step(scaling.movable(current.z, current.equations, reduced))
             if k == 0 and step:

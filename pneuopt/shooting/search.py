@@ -302,12 +302,10 @@ class Search:
         descent = Descent(self._objective(), damping, self._is_negligible_step, damps_nodes=self.noisy_gaps)
         hopeless, self.stage_began = 0, self.iterations
         for _ in range(iterations):
-            if self.method.budget is not None:
-                self.method.budget.check()
             if self.stage.refine > 1 and self._corrects_residuals and self.correction is None:
                 self._correct_residuals(fine_steps(self.segments, self.substeps, self.stage.refine))
                 descent.objective = self._objective()
-            trial = descent.step(self.current)
+            trial = descent.step(self.current, self.method.budget)
             if trial is None:
                 return True
             self.iterations += 1

@@ -12,6 +12,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from pneuopt.dynamics.system import DiscreteSystem, Symbols, define, discretise
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.parameters import Parameter, ParameterSet, Quantity
+from pneuopt.shooting.budget import BudgetSpentError, CpuBudget
 from pneuopt.shooting.equations import missed_curvature, normal_equations
 from pneuopt.shooting.least_squares import LeastSquares
 from pneuopt.shooting.levenberg_marquardt import Descent, Iterate, Objective
@@ -141,7 +142,7 @@ def test_a_search_with_noise_of_the_states_that_creeps_leaps(
     search, leaps, taken = Search(segment(wrong_squares()), LeastSquares()), list[float](), list[float]()
     search.noisy_gaps, search.current = True, iterate(1000.0)
 
-    def creep(descent: Descent, current: Iterate) -> Iterate:
+    def creep(descent: Descent, current: Iterate, _: object) -> Iterate:
         descent.promised = 35.0
         taken.append(current.cost)
         return iterate(current.cost - 0.1)
@@ -160,3 +161,22 @@ def test_a_search_with_noise_of_the_states_that_creeps_leaps(
     leaps.clear()
     search._run_stage(5)
     assert not leaps
+
+
+def test_a_budget_ends_a_step_between_its_tries() -> None:
+    """Ten tries by fine integration steps took six seconds beyond the end."""
+    segments, budget = segment(wrong_squares()), CpuBudget(1e9)
+    objective = Objective(segments, ParameterScaling(segments.transcription), np.array([GAP]), 1)
+    current, tried = objective.evaluate(start_nodes(segments), objective.scaling.start), list[Iterate]()
+    descent = Descent(objective, 1e-3, lambda *_: False)
+
+    def spend(*_: object) -> Iterate:
+        budget.seconds, budget._end = 0.0, 0.0
+        tried.append(current)  # no lower, so that another damping would be tried
+        return current
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(descent, "_trial", spend)
+        with pytest.raises(BudgetSpentError):
+            descent.step(current, budget)
+    assert len(tried) == 1
