@@ -24,7 +24,6 @@ from pneuopt.cli.study_front import run_front
 from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page
 from pneuopt.cli.terminal import progress
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.evaluation.report import metric_units
 from pneuopt.evaluation.requirements import (
     METRICS,
@@ -48,6 +47,12 @@ from pneuopt.studies.journal import Journal
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
 from pneuopt.studies.processes import Processes
+from pneuopt.studies.sample_time import (
+    SAMPLE_TIME,
+    evaluate_at_sample_time,
+    loop_at_sample_time,
+    with_sample_time,
+)
 from pneuopt.studies.sweep import sweep
 from pneuopt.tuning.certifier import certified_objective
 from pneuopt.tuning.tune import tune
@@ -108,14 +113,16 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     require(outputs.plot is None or count <= MAX_MAP_AXES, many)
     task, parameters = read_fit_and_tuning(study.drive, study.tuning)
     warn_of_status(study.tuning, "tuning")
-    (cases, axes), units = _read_cases(study, parameters), metric_units(task.loop)
+    (cases, axes), units = _read_cases(study, task, parameters), metric_units(task.loop)
+    if any(SAMPLE_TIME in values for values in cases.values()):
+        parameters = with_sample_time(task.loop, parameters)
     check_names("metric", study.show, units, f"{file}: [metrics] show")
     with _keep_cases(study, outputs, len(cases), computing.resume) as journal, computing.open() as executor:
         table, checks = _compute_cases(study, task, parameters, (cases, axes), quiet, journal, executor)
     verdict, status = _grid_verdict(table, len(task.references))
     if checks is not None:
         verdict, status = _batch_verdict(checks, verdict, status)
-    seen = _worst_of_references(table, axes, study.show)
+    seen = _worst_of_references(table, axes, study.show, parameters)
     written, metrics = {axis.name: axis.unit for axis in axes}, {name: units[name] for name in study.show}
     breaks = table["case"][table["breaks"]] if study.tune else ()
     flags = tuple(Line(f"{case}: breaks with its neighbours, also searched from their gains") for case in breaks)
@@ -155,6 +162,8 @@ def _compute_cases(
         left = [n for n in study.show if n not in LANE_METRICS]
         remedy = "leave it out, or leave out [study] batch"
         require(not left, f"{study.path}: [metrics] show: {', '.join(left)} is not read off responses; {remedy}")
+        alike = SAMPLE_TIME not in parameters
+        require(alike, f"{study.path}: [study] a batch has one sample time: leave out batch, or {SAMPLE_TIME}")
         with progress("running", quiet=quiet) as report_progress:
             found = evaluate_batch(
                 task.loop,
@@ -168,14 +177,16 @@ def _compute_cases(
                 journal=journal,
             )
         return found.table, found.checks
-    certify = partial(evaluate, task.loop, task.references, band=band, max_steps=task.max_steps)
+    certify = partial(evaluate_at_sample_time, task.loop, task.references, band=band, max_steps=task.max_steps)
     with progress("certifying", quiet=quiet) as report_progress:
         table = sweep(certify, parameters, cases, executor=executor, progress=report_progress, journal=journal)
     return table, None
 
 
-def _read_cases(study: Study, parameters: ParameterSet) -> tuple[Cases, tuple[SweptAxis, ...]]:
-    """The cases of a study, and the parameters in which they differ."""
+def _read_cases(study: Study, task: Tuning, parameters: ParameterSet) -> tuple[Cases, tuple[SweptAxis, ...]]:
+    """The cases of a study, and the parameters in which they differ; a sample time can be named, but not spread."""
+    if SAMPLE_TIME in study.axes or ("table" in study.cases and task.loop.pid.sample_time is not None):
+        parameters = with_sample_time(task.loop, parameters)
     if study.cases:
         cases = read_study_cases(study, parameters)
         return cases, swept_axes(parameters, cases)
@@ -246,12 +257,13 @@ def tune_cell(sources: Mapping[str, bytes], drive: Path, tuning: Path, parameter
     """
     with read_once(sources):
         task = read_tuning(tuning, read_drive(drive)[0].system(), parameters)
+    loop, own = loop_at_sample_time(task.loop, parameters)
     result = tune(
-        task.loop,
+        loop,
         task.references,
-        parameters,
+        own,
         minimise=task.specification,
-        scenarios=task.scenarios(parameters),
+        scenarios=task.scenarios(own),
         accept=task.accept,
         plants={},
         max_steps=task.max_steps,
@@ -287,11 +299,13 @@ def _batch_verdict(checks: "pd.DataFrame", verdict: str, status: int) -> tuple[s
     return f"{verdict}; {said}", max(status, EXIT_FAILURE) if differ else status
 
 
-def _worst_of_references(table: "pd.DataFrame", axes: Sequence[SweptAxis], metrics: Sequence[str]) -> "pd.DataFrame":
+def _worst_of_references(
+    table: "pd.DataFrame", axes: Sequence[SweptAxis], metrics: Sequence[str], nominal: ParameterSet
+) -> "pd.DataFrame":
     """The table that is shown: the axes in the units of the file, each metric's worst over the references."""
     seen = table[["error"]].copy()
-    for axis in axes:
-        seen[axis.name] = axis.in_axis_unit(table[axis.name])
+    for axis in axes:  # one that all cases leave at its nominal value has no column
+        seen[axis.name] = axis.in_axis_unit(table[axis.name] if axis.name in table else nominal.value(axis.name))
     for metric in metrics:
         own = table[[c for c in table if _metric_name(c) == metric]]
         worst = own.min if larger_is_better(metric) else own.max

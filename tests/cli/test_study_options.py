@@ -93,3 +93,20 @@ def test_processes_do_the_same(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert run("study study.toml -o processes.csv").exit_code == 0
     one, other = (pd.read_csv(f"{name}.csv").drop(columns="seconds [s]") for name in ("threads", "processes"))
     pd.testing.assert_frame_equal(one, other)
+
+
+def test_the_sample_time_is_an_axis_each_with_a_loop_of_its_own(folder: Path) -> None:
+    before = Path("study.toml").read_text("utf-8").partition("[axes]")[0]
+    Path("study.toml").write_text(f"{before}[axes]\npid.sample_time = ['1 ms', '4 ms']\n", encoding="utf-8")
+    assert run("study study.toml -q -o cases.csv").exit_code == 0
+    cases = pd.read_csv("cases.csv")
+    assert cases["pid.sample_time [s]"].tolist() == [0.001, 0.004]
+    Path("study.toml").write_text(before + "[table]\nfile = 'times.csv'\n", encoding="utf-8")
+    Path("times.csv").write_text("pid.sample_time [ms]\n4\n1\n", encoding="utf-8")
+    assert run("study study.toml -q -o table.csv").exit_code == 0
+    settling = "SettlingTime[0 to 0.2] [s]"
+    assert pd.read_csv("table.csv")[settling].tolist() == cases[settling].tolist()[::-1]
+    edit("tuning.toml", 'sample_time = "5 ms"', 'sample_time = "4 ms"')
+    Path("times.csv").write_text("load.mass\n5\n", encoding="utf-8")
+    assert run("study study.toml -q -o slow.csv").exit_code == 0
+    assert pd.read_csv("slow.csv")[settling].tolist() == cases[settling].tolist()[1:]
