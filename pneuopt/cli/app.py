@@ -240,8 +240,9 @@ def study_command(
 ) -> None:
     """Certify a loop over any plants, or tune it over a grid or along a Pareto front; status 1 if a case fails."""
     with report_errors():
+        from pneuopt.cli.computing import Computing
         from pneuopt.cli.shared import Outputs
-        from pneuopt.cli.study import Computing, run_study
+        from pneuopt.cli.study import run_study
 
         computing = Computing(executor, time_limit, memory_limit, resume)
         raise typer.Exit(run_study(file, Outputs(output, json, plot, report), quiet, computing))

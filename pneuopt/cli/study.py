@@ -1,14 +1,13 @@
 """`pneuopt study`: a loop certified over a grid of parameters or other cases; a front is in `study_front`."""
 
 import math
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pneuopt.cli.computing import Computing, keep_cases
 from pneuopt.cli.exit_status import EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_SUCCESS
 from pneuopt.cli.shared import (
     Outputs,
@@ -16,7 +15,6 @@ from pneuopt.cli.shared import (
     file_hashes,
     finish,
     read_fit_and_tuning,
-    warn,
     warn_of_status,
 )
 from pneuopt.cli.show_studies import format_csv, lead_report, report_cases, report_checks
@@ -42,7 +40,6 @@ from pneuopt.quantities.source import read_once
 from pneuopt.quantities.status import Code, Status
 from pneuopt.studies.batch import LANE_METRICS, evaluate_batch
 from pneuopt.studies.cases import grid
-from pneuopt.studies.cluster import open_executor
 from pneuopt.studies.journal import Journal
 from pneuopt.studies.neighbours import sweep_from_neighbours
 from pneuopt.studies.outcome import INTERRUPTED_CASE
@@ -62,38 +59,6 @@ if TYPE_CHECKING:
 
 # Columns of a study that tunes: its objective, and the word before the name of a gain that was found.
 OBJECTIVE, FOUND = "objective", "found"
-
-
-@dataclass(frozen=True)
-class Computing:
-    """How the cases of a study are computed.
-
-    Attributes
-    ----------
-    executor : str
-        As for `open_executor`; empty: one process a CPU.
-    seconds, megabytes : float
-        What a case may take.
-    resume : bool
-        Whether there must be a journal of this study.
-    """
-
-    executor: str = ""
-    seconds: float = math.inf
-    megabytes: float = math.inf
-    resume: bool = False
-
-    @contextmanager
-    def open(self) -> Iterator[Executor | Processes]:
-        """Open the executor."""
-        limits = Processes(None, self.seconds, self.megabytes)
-        if not self.executor:
-            yield limits
-            return
-        here = self.executor.isdecimal() or limits == Processes()
-        require(here, f"--time-limit and --memory-limit hold in processes of this machine, not on {self.executor}")
-        with open_executor(self.executor) as executor:
-            yield replace(limits, count=executor.count) if isinstance(executor, Processes) else executor
 
 
 def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -> int:
@@ -117,7 +82,7 @@ def run_cases(study: Study, outputs: Outputs, quiet: bool, computing: Computing)
     if any(SAMPLE_TIME in values for values in cases.values()):
         parameters = with_sample_time(task.loop, parameters)
     check_names("metric", study.show, units, f"{file}: [metrics] show")
-    with _keep_cases(study, outputs, len(cases), computing.resume) as journal, computing.open() as executor:
+    with keep_cases(study, outputs, len(cases), computing.resume) as journal, computing.open() as executor:
         table, checks = _compute_cases(study, task, parameters, (cases, axes), quiet, journal, executor)
     verdict, status = _grid_verdict(table, len(task.references))
     if checks is not None:
@@ -195,26 +160,6 @@ def _read_cases(study: Study, task: Tuning, parameters: ParameterSet) -> tuple[C
         return grid(parameters, {axis.name: axis.points for axis in axes}), axes
     except InputError as error:
         raise InputError(f"{study.path}: [axes] {error}") from None
-
-
-@contextmanager
-def _keep_cases(study: Study, outputs: Outputs, count: int, resume: bool) -> Iterator[Journal | None]:
-    """Keep the cases as they come, beside the file that is asked for."""
-    place = outputs.output or outputs.json
-    if place is None:
-        require(not resume, "--resume goes on where the file of -o or --json was left: name it")
-        yield None
-        return
-    hashes = file_hashes(study.path, study.drive, study.tuning)
-    journal = Journal(place.with_name(f"{place.name}.journal"), hashes, resume=resume)
-    if journal.known:
-        warn(f"{journal.path}: {len(journal.known)} of {count} cases are known from an earlier run of this study")
-    try:
-        yield journal
-    finally:
-        journal.close(finished=False)
-        if journal.problem:
-            warn(journal.problem)
 
 
 def _tune_cells(
