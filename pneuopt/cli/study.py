@@ -20,6 +20,7 @@ from pneuopt.cli.shared import (
 from pneuopt.cli.show_studies import format_csv, lead_report, report_cases, report_checks
 from pneuopt.cli.study_front import run_front
 from pneuopt.cli.study_pages import MAX_MAP_AXES, case_page
+from pneuopt.cli.study_sensitivity import run_sensitivity
 from pneuopt.cli.terminal import progress
 from pneuopt.control.loop import ClosedLoop
 from pneuopt.evaluation.report import metric_units
@@ -65,6 +66,8 @@ def run_study(file: Path, outputs: Outputs, quiet: bool, computing: Computing) -
     """Compute what a study.toml asks for, a grid, other cases or a front; returns the exit status."""
     study = read_study(file)
     outputs.check([file, study.drive, study.tuning])
+    if study.sensitivity is not None:
+        return run_sensitivity(study, outputs, quiet, computing)
     if study.pareto is None:
         return run_cases(study, outputs, quiet, computing)
     require(computing == Computing(), f"{file}: a front is one search after another: it takes no option of cases")

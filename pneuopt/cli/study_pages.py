@@ -1,4 +1,4 @@
-"""The pages that `pneuopt study --report` writes: of cases, and of a Pareto front."""
+"""The pages that `pneuopt study --report` writes: of cases, of a sensitivity, and of a Pareto front."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
@@ -37,6 +37,12 @@ def front_page(study: Study, report: Report, draw: Callable[[], "Figure"], pair:
     first, second = pair
     alt = f"{first} of certified designs over {second}; limits at which none was certified are marked."
     return study_page(_page_source(study), report, draw, what="Pareto front", alt=alt)
+
+
+def sensitivity_page(study: Study, report: Report, draw: Callable[[], "Figure"]) -> Page:
+    """The page of a study that asks which tolerances matter."""
+    alt = "Share of a metric's variance that each parameter brings, by itself and with others, as bars with intervals."
+    return study_page(_page_source(study), report, draw, what="Sensitivity", alt=alt)
 
 
 def _page_source(study: Study) -> Source:

@@ -210,12 +210,14 @@ def _study_template(loop: ClosedLoop, first: FirstFiles, values: ParameterSet) -
     title = (
         "How the loop does on other plants; name fit.toml and tuned.toml, once there are such:",
         "    pneuopt study study.toml -o cases.csv --plot map.png",
-        "[samples], [corners] or [table] ask for other cases in place of [axes];",
+        "[samples], [corners] or [table] ask for other cases in place of [axes]; [sensitivity]",
+        "asks which tolerances matter;",
         "[pareto] asks for a front instead; leave out [axes] and [metrics] then.",
     )
     names = {"axes": '"supply.pressure" = { from = "5 bar(g)", to = "7 bar(g)", steps = 3 }'}
     names = names if "supply.pressure" in values else {"axes": '"pid.Kp" = { from = 0.5, to = 1.5, steps = 3 }'}
-    names |= {"samples": f'"{first.swept}" = {{ {_EXAMPLE_SPREAD} }}', "corners": f'"{first.swept}" = "30 %"'}
+    names |= dict.fromkeys(("samples", "sensitivity"), f'"{first.swept}" = {{ {_EXAMPLE_SPREAD} }}')
+    names |= {"corners": f'"{first.swept}" = "30 %"'}
     return Template(title, STUDY_KEYS, stated, examples=ends, names=names, schema=_schema_path("study"))
 
 

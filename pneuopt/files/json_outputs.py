@@ -232,6 +232,16 @@ _FOUND = {
     "rows": Member("first and last", Holds.COUNTS, is_optional=True),
     "message": _text("what is wrong, and the remedy"),
 }
+_OF_AN_AXIS = {"figure": _text("metric"), "axis": _text("parameter or pattern")}
+_SHARES = _OF_AN_AXIS | _numbers(
+    first="of the variance, by itself [1]",
+    first_low="[1]",
+    first_high="[1]",
+    total="with what it does by way of others [1]",
+    total_low="[1]",
+    total_high="[1]",
+)
+_SLOPES = _OF_AN_AXIS | _numbers(change="a standard deviation [unit]", relative="[1]", share="of the variance [1]")
 
 
 def _output(meaning: str, **members: Member) -> Member:
@@ -294,6 +304,16 @@ OUTPUTS: Mapping[str, Member] = {
         verdict=_text("how many hold"),
         cases=_rows("a row a case: parameters, metrics, seconds, error", {"case": _text("name")}, is_open=True),
         checks=_optional(_rows("of a batch, a row a certified metric", {"case": _text("name")}, is_open=True)),
+        provenance=_PROVENANCE,
+    ),
+    "sensitivity": _output(
+        "`pneuopt study` of a [sensitivity]",
+        status=_STOPPED,
+        verdict=_text("how many points hold"),
+        shares=_rows("a row a metric and axis, with 95 % intervals", _SHARES),
+        figures=_rows("a row a metric over the box", _NAMED | _numbers(mean="[unit]", std="[unit]", lost="points [1]")),
+        slopes=_optional(_rows("with local, a row a metric and axis at the design", _SLOPES)),
+        cases=_rows("a row a point: parameters, metrics, seconds, error", {"case": _text("name")}, is_open=True),
         provenance=_PROVENANCE,
     ),
     "front": _output(

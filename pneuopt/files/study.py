@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pneuopt.files.budget import MAX_CASES
 from pneuopt.files.drive import ambient_pressure
 from pneuopt.files.requirements import read_bound
-from pneuopt.files.study_cases import CASE_KEYS
+from pneuopt.files.study_cases import CASE_KEYS, SENSITIVITY_KEY
 from pneuopt.files.toml import read_toml
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, flag, table
@@ -39,8 +39,9 @@ STUDY_KEYS: Mapping[str, Key] = {
         },
         required=True,
     ),
-    "axes": table("the axes of a grid", {}, others=_SWEPT_AXIS, named="parameter"),
+    "axes": table("the axes of a grid, pid.sample_time among them", {}, others=_SWEPT_AXIS, named="parameter"),
     **CASE_KEYS,
+    "sensitivity": SENSITIVITY_KEY,
     "metrics": table(
         "what is shown of the cases",
         {
@@ -92,6 +93,8 @@ class Study:
     batch : bool
         Whether the cases run many at once in SIMD lanes (`evaluate_batch`), and only the worst and a share are
         certified.
+    sensitivity : mapping of str to object, optional
+        It is asked which tolerances matter: as written; `read_sensitivity` reads it.
     """
 
     path: Path
@@ -104,6 +107,7 @@ class Study:
     tune: bool = False
     cases: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     batch: bool = False
+    sensitivity: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -179,7 +183,7 @@ def read_study(path: str | Path) -> Study:
         alone = name not in sections or "pareto" not in sections
         require(alone, f"{path}: [{name}] belongs to a grid, [pareto] to a front; leave one of them out")
     cases = {name: sections[name] for name in CASE_KEYS if name in sections}
-    chosen = [*(["axes"] if axes else []), *cases, *(["pareto"] if "pareto" in sections else [])]
+    chosen = [*(["axes"] if axes else []), *cases, *(n for n in ("sensitivity", "pareto") if n in sections)]
     require(bool(chosen), f'{path}: no axis; add [axes] with "load.mass" = {_AXIS_EXAMPLE}')
     require(len(chosen) == 1, f"{path}: [{'], ['.join(chosen)}]: a study has cases of one kind; leave one of them out")
     band = read_value(metrics["band"], "1", where=f"{path}: [metrics] band") if "band" in metrics else None
@@ -190,6 +194,8 @@ def read_study(path: str | Path) -> Study:
     require(not (tune and batch), f"{path}: [study] a batch is of one design: leave out tune or batch")
     require(not (batch and "pareto" in sections), f"{path}: [study] batch is of cases; a front is tuned: leave it out")
     require(not (tune and "pareto" in sections), f"{path}: [study] tune belongs to a grid; a front is tuned anyway")
+    told = "sensitivity" in sections
+    require(not (told and (tune or batch)), f"{path}: [sensitivity] evaluates one design: leave out tune and batch")
     require(not (tune and cases), f"{path}: [study] tune needs a grid, whose cells have neighbours: write [axes]")
     require(not (tune and band), f"{path}: [metrics] band would not be the one tuned for; state it in {tuning.name}")
     return Study(
@@ -203,6 +209,7 @@ def read_study(path: str | Path) -> Study:
         tune,
         cases,
         batch,
+        sections.get("sensitivity"),
     )
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pneuopt.evaluation.monte_carlo import monte_carlo
-from pneuopt.evaluation.scenarios import corners
+from pneuopt.evaluation.scenarios import SampleSpreads, corners
 from pneuopt.files.budget import MAX_CASES
 from pneuopt.files.drive import read_covariance, read_estimates
-from pneuopt.files.spreads import CORNERS_KEY, SAMPLES_KEY, read_draw, read_sample_spreads, read_spreads
+from pneuopt.files.spreads import CORNERS_KEY, SAMPLED_KEY, SAMPLES_KEY, read_draw, read_sample_spreads, read_spreads
 from pneuopt.quantities.errors import InputError, check_names, require
 from pneuopt.quantities.keys import Key, Takes, flag, table
 from pneuopt.quantities.parameters import ParameterSet
@@ -35,6 +35,18 @@ CASE_KEYS: Mapping[str, Key] = {
     ),
 }
 """The sections that say which cases there are, in place of axes; a newcomer adds a row here and in `_READERS`."""
+SENSITIVITY_KEY = table(
+    "which tolerances matter: the shares of a metric's variance that parameters bring, in place of cases",
+    {
+        "count": Key(
+            "points, a power of two; so often each parameter and two more are evaluated", Takes.COUNT, usual=128
+        ),
+        "seed": Key("of the random numbers", Takes.COUNT, usual=0),
+        "local": flag("whether the slopes at the design are computed, too"),
+    },
+    others=SAMPLED_KEY,
+    named="parameter",
+)
 
 
 @dataclass(frozen=True)
@@ -85,6 +97,59 @@ def read_study_cases(study: "Study", parameters: ParameterSet) -> Cases:
         raise error if str(study.path.parent) in str(error) else InputError(f"{source.where} {error}") from None
     require(len(cases) <= MAX_CASES, f"{source.where} makes {len(cases)} cases, {MAX_CASES} are allowed; take fewer")
     return cases
+
+
+@dataclass(frozen=True)
+class SensitivityTask:
+    """What a [sensitivity] asks for.
+
+    Attributes
+    ----------
+    spreads : mapping
+        As for `samples`.
+    count, seed : int
+    local : bool
+        Whether derivatives at the design are asked for, too.
+    """
+
+    spreads: SampleSpreads
+    count: int
+    seed: int
+    local: bool
+
+
+def read_sensitivity(study: "Study", parameters: ParameterSet) -> SensitivityTask:
+    """Read the [sensitivity] of a study.
+
+    Parameters
+    ----------
+    study : Study
+        With `sensitivity`.
+    parameters : ParameterSet
+        The nominal values.
+
+    Returns
+    -------
+    SensitivityTask
+
+    Raises
+    ------
+    InputError
+        The message names file, section and key.
+    """
+    entries, where = dict(study.sensitivity or {}), f"{study.path}: [sensitivity]"
+    known = SENSITIVITY_KEY.keys
+    count, seed, local = (entries.pop(key, known[key].usual) for key in ("count", "seed", "local"))
+    whole = all(isinstance(n, int) and not isinstance(n, bool) for n in (count, seed))
+    require(whole and seed >= 0, f"{where} count and seed are whole numbers, seed not below 0")
+    require(isinstance(local, bool), f"{where} local must be true or false, got {local!r}")
+    require(count >= 16 and count & (count - 1) == 0, f"{where} count: a power of two, 16 or more, not {count}")
+    example = '"load.mass" = "30 %"'
+    require(len(entries) > 0, f"{where} has no parameter; add {example}")
+    spreads = read_sample_spreads(entries, where, parameters)
+    cases = count * (len(spreads) + 2)
+    require(cases <= MAX_CASES, f"{where} makes {cases} cases, {MAX_CASES} are allowed; take a smaller count")
+    return SensitivityTask(spreads, count, seed, local)
 
 
 def _read_samples(given: Mapping[str, Any], source: CaseSource) -> Cases:

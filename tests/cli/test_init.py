@@ -35,6 +35,7 @@ EXCLUSIVE = {
     "samples",
     "corners",
     "table",
+    "sensitivity",
 }  # sections whose keys exclude each other, or another section
 ENTRY = re.compile(r'(# )?("?[\w.]+"?) = (["\d{[-]|true|false).*')
 

@@ -11,7 +11,9 @@ import pandas as pd
 import pytest
 
 from pneuopt.cli import study as study_module
+from pneuopt.cli import study_sensitivity
 from pneuopt.studies.batch import evaluate_batch
+from pneuopt.studies.sensitivity import sensitivity
 from pneuopt.studies.sweep import sweep
 from tests.cli.test_commands import DRIVE, STUDY, TUNING, edit, in_threads, run
 
@@ -110,3 +112,41 @@ def test_the_sample_time_is_an_axis_each_with_a_loop_of_its_own(folder: Path) ->
     Path("times.csv").write_text("load.mass\n5\n", encoding="utf-8")
     assert run("study study.toml -q -o slow.csv").exit_code == 0
     assert pd.read_csv("slow.csv")[settling].tolist() == cases[settling].tolist()[1:]
+
+
+def test_a_study_tells_which_tolerances_matter(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = Path("study.toml").read_text("utf-8").partition("[axes]")[0] + "[sensitivity]\ncount = 16\nlocal = true\n"
+    Path("study.toml").write_text(text + "load.mass = '30 %'\nfriction.viscous = '1 %'\n", encoding="utf-8")
+    with ThreadPoolExecutor(1) as executor:
+        monkeypatch.setattr(study_sensitivity, "sensitivity", in_threads(sensitivity, executor))
+        result = run("study study.toml -q -o shares.csv --json shares.json --plot bars.png")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[0] == "64 points: all certified"
+    shares = pd.read_csv("shares.csv").set_index(["figure", "axis"])
+    figure = "SettlingTime[0 to 0.2]"
+    assert shares.loc[(figure, "load.mass"), "total"] > 0.9
+    assert shares.loc[(figure, "friction.viscous"), "total"] < 0.1
+    assert shares.loc[(figure, "load.mass"), "local_share"] > 0.9
+    said = json.loads(Path("shares.json").read_text("utf-8"))
+    assert len(said["cases"]) == 64
+    assert {row["axis"] for row in said["slopes"]} == {"load.mass", "friction.viscous"}
+    assert Path("bars.png").stat().st_size > 10_000
+    assert not Path("shares.csv.journal").exists()
+
+
+@pytest.mark.parametrize(
+    ("section", "said"),
+    [
+        ("count = 20\nload.mass = '30 %'", "[sensitivity] count: a power of two, 16 or more, not 20"),
+        ("count = 16", '[sensitivity] has no parameter; add "load.mass" = "30 %"'),
+        ("local = 1\nload.mass = '30 %'", "[sensitivity] local must be true or false, got 1"),
+        ("load.mas = '30 %'", "unknown parameter 'load.mas'"),
+        ("load.mass = '30 %'\n[axes]\nload.force = ['1 N']", "a study has cases of one kind"),
+    ],
+)
+def test_a_bad_sensitivity_is_refused(folder: Path, section: str, said: str) -> None:
+    text = Path("study.toml").read_text("utf-8").partition("[axes]")[0]
+    Path("study.toml").write_text(f"{text}[sensitivity]\n{section}\n", encoding="utf-8")
+    result = run("study study.toml -q")
+    assert result.exit_code == 2
+    assert said in " ".join(result.stderr.split())
