@@ -9,6 +9,7 @@ from pneuopt.plotting.bode import plot_bode
 from pneuopt.plotting.canvas import BLUE, GREY, ORANGE, RED, axes_grid, check_figure_path, legend_above, save_figure
 from pneuopt.plotting.diagnostics import plot_correlation, plot_residuals
 from pneuopt.plotting.distributions import plot_distribution
+from pneuopt.plotting.experiment_designs import plot_experiment
 from pneuopt.plotting.findings import plot_finding
 from pneuopt.plotting.fits import plot_fit, plot_prediction
 from pneuopt.plotting.friction_map import friction_force, has_friction_map, plot_friction
@@ -36,6 +37,7 @@ __all__ = [
     "plot_bode",
     "plot_correlation",
     "plot_distribution",
+    "plot_experiment",
     "plot_finding",
     "plot_fit",
     "plot_friction",

@@ -6,9 +6,10 @@ The loop T32 of problems/shared/t32.py with dither, 1 s, one gain set; mass and 
 seconds a plant, all in one run: the whole of `evaluate_batch` without its certificates, drawn plants to table
 ("batch"); the same compiled simulation of one plant at a time, same steps, outputs only ("scalar"); and solve_ivp's
 LSODA at a tolerance of 1e-6, as one writes it first, on the model's CasADi Function ("solve_ivp"), and on the compiled
-right-hand side ("solve_ivp_compiled"). A million plants on paper: core-hours at the measured rate. The differences are
-the largest ones between lanes and certificate, over the plants that were certified. The claims are ratios: the seconds
-are the machine's.
+right-hand side ("solve_ivp_compiled"). The last has no bound: a hundred times is asked of solve_ivp as users have it,
+and this one runs on pneuopt's own machine code. A million plants on paper: core-hours at the measured rate. The
+differences are the largest ones between lanes and certificate, over the plants that were certified. The claims are
+ratios: the seconds are the machine's.
 """
 
 import sys
@@ -68,7 +69,7 @@ def main(plants: int = PLANTS, recertify: float = RECERTIFY) -> "pd.DataFrame":
             Claim("plants_a_core_second", 1 / batch, "1/s"),
             Claim("batch_over_scalar", batch / scalar, "1", None, "<= 0.3"),
             Claim("solve_ivp_over_batch", rival / batch, "1", None, ">= 100"),
-            Claim("solve_ivp_compiled_over_batch", compiled / batch, "1", None, ">= 100"),
+            Claim("solve_ivp_compiled_over_batch", compiled / batch),
             Claim("million", MILLION * batch / 3600, "h"),
             Claim("failed", int((found.table["error"] != "").sum()), "1", None, "<= 0"),
             Claim("certified", checks["case"].nunique()),

@@ -1,0 +1,96 @@
+"""A planned experiment: what is played and how the drive answers, within its limits, and what its log will tell."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pneuopt.identification.experiment_design import ExperimentDesign
+from pneuopt.plotting.canvas import (
+    BLUE, GREY, NORMAL_QUANTILE_95, ORANGE, PLOT_UNITS, RED, axes_grid, axis_label, legend_above,
+)
+from pneuopt.quantities.arrays import Array
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from matplotlib.figure import Figure
+
+MAX_SIGNALS = 4
+"""Panels of signals [1]: more do not fit a page beside the intervals."""
+INCHES_A_PARAMETER = 0.24
+"""Height of a parameter's line [inch]: less and their names touch."""
+NEAR_LIMIT = 0.35
+"""Share of a panel's range [1] within which a limit is drawn: a farther one would squeeze the signal."""
+
+
+def plot_experiment(design: ExperimentDesign) -> "Figure":
+    """The excitation, the signals with limits as the estimates predict them, and the intervals before and after.
+
+    Parameters
+    ----------
+    design : ExperimentDesign
+
+    Returns
+    -------
+    Figure
+        A panel the excitation, and one each signal that has a limit; several runs follow one another. Then half the
+        95 % interval of each free parameter, over its value: before, where logs are in hand, and after.
+    """
+    signals = [n for n in dict.fromkeys((design.channel, *design.limits)) if n in design.runs[0]][:MAX_SIGNALS]
+    heights = [1.3] * len(signals) + [0.6 + INCHES_A_PARAMETER * len(design.table)]
+    figure, grid = axes_grid(len(heights), 1, heights, width=8.0)
+    *panels, last = (row[0] for row in grid)
+    for panel, name in zip(panels, signals, strict=True):
+        _draw_signal(panel, design, name)
+        if panel is not panels[-1]:
+            panel.sharex(panels[-1])
+            panel.tick_params(labelbottom=False)
+    panels[-1].set_xlabel("time [s], one run after the other" if len(design.runs) > 1 else "time [s]")
+    _draw_intervals(last, design)
+    legend_above(figure, panels[0], last)
+    figure.align_ylabels(panels)
+    return figure
+
+
+def _draw_signal(panel: "Axes", design: ExperimentDesign, name: str) -> None:
+    """A signal over all runs, with those of its limits that it comes near."""
+    factor, unit = PLOT_UNITS.get(design.units[name], (1.0, design.units[name]))
+    begin, lowest, highest = 0.0, np.inf, -np.inf
+    for run in design.runs:
+        values = factor * run[name]
+        colour = ORANGE if name == design.channel else BLUE
+        label = ("what is played" if name == design.channel else None) if begin == 0 else None
+        panel.plot(begin + run.t, values, color=colour, lw=0.8, label=label)
+        if begin:
+            panel.axvline(begin, color=GREY, lw=0.8)
+        begin += float(run.t[-1] + run.t[1])
+        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
+    room = NEAR_LIMIT * (highest - lowest)
+    for end in design.limits.get(name, ()):
+        if lowest - room <= factor * end <= highest + room:
+            panel.axhline(factor * end, color=RED, ls="--", lw=0.8)
+    panel.set_ylabel(axis_label(name.replace("_", "\n"), unit))
+
+
+def _draw_intervals(panel: "Axes", design: ExperimentDesign) -> None:
+    """A line a parameter: half its interval before and after, in percent of its value."""
+    table = design.table
+    size = np.abs(table["value"].to_numpy(dtype=float))
+    places = np.arange(len(table))
+
+    def percent(column: str) -> Array:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(100 * NORMAL_QUANTILE_95 * table[column].to_numpy(dtype=float) / size)
+
+    before, after = percent("stderr_before"), percent("stderr_after")
+    panel.hlines(places, after, before, color=GREY, lw=1)
+    if np.isfinite(before).any():
+        panel.plot(before, places, "o", color=GREY, ms=5, label="95 % now")
+    panel.plot(after, places, "o", color=BLUE, ms=5, label="95 % with the planned log")
+    panel.set_xscale("log")
+    asked = table["target"].to_numpy(dtype=bool)
+    names = [f"{n} (asked)" if wanted else str(n) for n, wanted in zip(table.index, asked, strict=True)]
+    panel.set_yticks(places, names)
+    panel.set_ylim(len(table) - 0.5, -0.5)
+    panel.set_xlabel("half of the 95 % interval, of the value [%]")
