@@ -306,6 +306,7 @@ def next_experiment_command(
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write what to play, CSV.")
     ] = None,
     json: Json = None,
+    plot: Plot = None,
     report: ReportFile = None,
     quiet: Quiet = False,
 ) -> None:
@@ -317,7 +318,7 @@ def next_experiment_command(
         targets = tuple(filter(None, (n.strip() for n in target.split(","))))
         lists = (tuple(limit), tuple(noise or ()), tuple(start or ()))
         options = PlannedOptions(duration, sample_time, targets, *lists, runs, mean, budget)
-        raise typer.Exit(run_next_experiment(fit, tuning, options, Outputs(output, json, None, report), quiet))
+        raise typer.Exit(run_next_experiment(fit, tuning, options, Outputs(output, json, plot, report), quiet))
 
 
 @_command("track")

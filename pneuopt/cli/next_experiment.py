@@ -15,11 +15,15 @@ from pneuopt.identification.criteria import AOptimal, DOptimal
 from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.identification.logged_loop import REFERENCE_CHANNELS
 from pneuopt.identification.next_experiment import next_experiment
+from pneuopt.plotting import plot_experiment
 from pneuopt.quantities.errors import check_names, require
 from pneuopt.quantities.output import records
 from pneuopt.quantities.units import read_value
 from pneuopt.report.fit_page import Source
+from pneuopt.report.page import Picture
 from pneuopt.report.summary_page import summary_page, title_of
+
+_ALT = "What is played, the signals with limits as predicted, and each parameter's interval now and afterwards."
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,10 @@ def run_next_experiment(
             progress=report_progress,
         )
     tables = {"design": records(design.table), "provenance": file_hashes(*files), "stats": dict(design.stats)}
-    page = partial(summary_page, Source(title_of("Next experiment", fit, ()), file_hashes(*files)), design.summary())
-    return finish(outputs, _writers(design, outputs.output), tables, None, report=design.summary(), page=page)
+    draw, source = partial(plot_experiment, design), Source(title_of("Next experiment", fit, ()), file_hashes(*files))
+    page = partial(summary_page, source, design.summary(), (Picture(draw, _ALT, _ALT),))
+    writers = _writers(design, outputs.output)
+    return finish(outputs, writers, tables, None, figures=lambda: {"": draw()}, report=design.summary(), page=page)
 
 
 def _writers(design: ExperimentDesign, output: Path | None) -> Writers:

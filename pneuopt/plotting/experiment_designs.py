@@ -6,14 +6,20 @@ import numpy as np
 
 from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.plotting.canvas import (
-    BLUE, GREY, NORMAL_QUANTILE_95, ORANGE, PLOT_UNITS, RED, axes_grid, axis_label, legend_above,
+    BLUE,
+    GREY,
+    NORMAL_QUANTILE_95,
+    ORANGE,
+    PLOT_UNITS,
+    RED,
+    axes_grid,
+    axis_label,
+    legend_above,
 )
 from pneuopt.quantities.arrays import Array
 
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
     from matplotlib.figure import Figure
 
 MAX_SIGNALS = 4

@@ -20,7 +20,7 @@ def run(*words: str) -> Result:
 
 
 def test_a_run_is_planned_and_written(tmp_path: Path) -> None:
-    place = tmp_path / "run.csv"
+    place, figure = tmp_path / "run.csv", tmp_path / "run.png"
     result = run(
         *USUAL,
         "--noise",
@@ -34,6 +34,8 @@ def test_a_run_is_planned_and_written(tmp_path: Path) -> None:
         str(place),
         "--report",
         str(tmp_path / "run.html"),
+        "--plot",
+        str(figure),
     )
     assert result.exit_code == 0, result.output
     assert "a run of 500 ms gives" in result.output
@@ -41,6 +43,7 @@ def test_a_run_is_planned_and_written(tmp_path: Path) -> None:
     assert len(force) == 250
     assert "a run of 500 ms gives" in read_page(tmp_path / "run.html").text
     assert abs(force).max() <= 150
+    assert figure.stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

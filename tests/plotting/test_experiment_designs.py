@@ -1,0 +1,36 @@
+"""The figure of a planned experiment: its signals within their limits, and the intervals before and after."""
+
+import numpy as np
+import pandas as pd
+
+from pneuopt.identification.experiment_design import ExperimentDesign
+from pneuopt.plotting import plot_experiment
+from pneuopt.quantities.trajectories import Trajectory
+
+
+def design(before: float) -> ExperimentDesign:
+    t = np.arange(100) * 0.01
+    run = Trajectory(t, {"position_reference": 0.1 + 0.02 * np.sin(t), "position": 0.1 + 0.02 * np.sin(t), "force": t})
+    rows = {n: {"value": v, "stderr_before": before, "stderr_after": 0.01 * v, "target": v > 1} for n, v in VALUES}
+    limits = {"position": (0.0, 0.121), "force": (-500.0, 500.0)}
+    units = {"position_reference": "m", "position": "m", "force": "N"}
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    return ExperimentDesign("position_reference", (run, run), (), table, limits, {}, "", {}, units)
+
+
+VALUES = (("friction.coulomb", 40.0), ("load.mass", 1.0))
+
+
+def test_each_limited_signal_has_a_panel_and_each_parameter_a_line() -> None:
+    *signals, intervals = plot_experiment(design(0.5)).axes
+    assert [p.get_ylabel() for p in signals] == ["position\nreference [mm]", "position [mm]", "force [N]"]
+    assert [t.get_text() for t in intervals.get_yticklabels()] == ["friction.coulomb (asked)", "load.mass"]
+    dashed = [line for line in signals[1].lines if line.get_linestyle() == "--"]
+    assert [line.get_ydata()[0] for line in dashed] == [121.0]  # type: ignore[index]  # the other limit is far away
+    assert max(line.get_xdata()[-1] for line in signals[0].lines) > 1.9  # type: ignore[operator,index]  # second run
+    np.testing.assert_allclose(intervals.lines[-1].get_xdata(), [1.96, 1.96], rtol=1e-3)
+
+
+def test_without_logs_in_hand_there_is_no_interval_before() -> None:
+    *_, intervals = plot_experiment(design(np.nan)).axes
+    assert len(intervals.lines) == 1
