@@ -81,7 +81,7 @@ from .files.tuning import read_tuning, write_tuned
 from .identification.assumptions import Assumption
 from .identification.checkup import Checkup, check
 from .identification.compare_logs import LogComparison, compare_logs
-from .identification.criteria import AOptimal, DOptimal, Precision
+from .identification.criteria import AOptimal, DOptimal, Precision, WantedPrecision
 from .identification.design_outlook import DesignOutlook, predict_loss
 from .identification.examination import examine_logs
 from .identification.experiment_design import ExperimentDesign
@@ -310,6 +310,7 @@ __all__ = [
     "Usefulness",
     "Verdict",
     "Viscous",
+    "WantedPrecision",
     "Waveform",
     "apply_scenario",
     "average_dither",

@@ -248,6 +248,7 @@ PUBLIC_NAMES = [
     "validate_design",
     "Verdict",
     "Viscous",
+    "WantedPrecision",
     "Waveform",
     "with_sensors",
     "write_fit",

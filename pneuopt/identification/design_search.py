@@ -1,5 +1,6 @@
 """`DesignSearch`: blocks of an excitation by exchange, then refined whole; what is best is an `ExperimentDesign`."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from pneuopt.dynamics.system import names
 from pneuopt.identification.criteria import Criterion
 from pneuopt.identification.experiment_design import ExperimentDesign, tabulate_design
 from pneuopt.identification.planned_run import MIN_SUBSTEPS, PlannedRun
-from pneuopt.identification.waveforms import CYCLES_A_SAMPLE, Block, join_blocks, library, vary
+from pneuopt.identification.waveforms import CYCLES_A_SAMPLE, Block, join_blocks, library, vary_run
 from pneuopt.quantities.arrays import Array
 from pneuopt.quantities.errors import InputError, require
 from pneuopt.quantities.parameters import ParameterSet
@@ -23,9 +24,12 @@ from pneuopt.shooting.budget import CpuBudget
 BLOCKS = 8  # of a run: more are refined longer, fewer make poorer mixtures
 MIN_BLOCK_SAMPLES = 50  # of a block: shorter ones hold no slow motion
 VARIATIONS = 12  # of a block at once, in SIMD lanes: more are better and take longer
-FIRST_SPREAD, LAST_SPREAD = 0.5, 0.05  # of a change [1]: as a search begins and where it ends
-QUIET_ROUNDS = 2  # rounds over all blocks without a gain of `MIN_GAIN`, after which a search has ended
-MIN_GAIN = 0.01  # of the criterion [1] over a round: less is not worth the time
+SPREADS = (0.5, 0.2, 0.08)
+"""Of a change [1], in turn: the largest leave an optimum that is not the best, the smallest find its bottom."""
+ROUNDS_A_SPREAD = 3  # changes of each of them, over the number of blocks: fewer do not find what they can
+QUIET_CYCLES = 2  # cycles over all spreads without a gain of `MIN_GAIN`, after which a search has ended
+QUIET_ROUNDS = 2  # exchanges of each block of the start: a third one changes none
+MIN_GAIN = 0.01  # of the criterion [1] over a cycle: less is not worth the time
 VAGUE = 10.0
 """Relative standard deviation [1] of what nothing tells, which keeps covariances finite: less passes for knowledge."""
 
@@ -126,10 +130,16 @@ class DesignSearch:
         """The largest amplitude."""
         return max(abs(v) for v in self._reach)
 
+    @cached_property
+    def _waves(self) -> list[Block]:
+        """Blocks of every kind."""
+        t = self._grid[: self.samples // self._blocks]
+        return library(self._amplitude, float(t[-1]) or self.run.sample_time, self.run.sample_time)
+
     def _choose_blocks(self) -> list[list[Block]]:
         """The blocks of all runs by exchange: their information adds up."""
         t = self._grid[: self.samples // self._blocks]
-        waves = library(self._amplitude, float(t[-1]) or self.run.sample_time, self.run.sample_time)
+        waves = self._waves
         gains, keeps = self._evaluate(np.stack([np.clip(b.samples(t), *self._reach) for b in waves]))
         if not keeps.any():
             raise self._infeasible(waves, t)
@@ -158,29 +168,26 @@ class DesignSearch:
         return rows[int(np.argmax(keeps))]
 
     def _refine(self, runs: list[list[Block]]) -> list[list[Block]]:
-        """Change block after block of each run by chance, and keep what is better within the limits."""
+        """Change the runs by chance, far and near in turn, and keep what is better within the limits."""
         every = self._evaluate(np.stack([self._signal(blocks) for blocks in runs]))[0]
         best = float(self.judge.deviation(self.known + every.sum(axis=1)))
-        spread, quiet, fastest = FIRST_SPREAD, 0, max(CYCLES_A_SAMPLE / self.run.sample_time, 2 / self._grid[-1])
-        ends = (1 / float(self._grid[-1]), fastest)
-        while quiet < QUIET_ROUNDS and not self.budget.is_spent:
+        fastest = max(CYCLES_A_SAMPLE / self.run.sample_time, 2 / self._grid[-1])
+        ends, quiet = (1 / float(self._grid[-1]), fastest), 0
+        while quiet < QUIET_CYCLES and not self.budget.is_spent:
             before = best
-            for r, k in [(r, k) for k in range(self._blocks) for r in range(self.runs)]:
+            for spread, r in itertools.product(SPREADS, list(range(self.runs)) * (ROUNDS_A_SPREAD * self._blocks)):
                 if self.budget.is_spent:
                     break
                 others = self.known + every.sum(axis=1) - every[:, r]
-                tried = [list(runs[r]) for _ in range(VARIATIONS)]
-                for row in tried:
-                    row[k] = vary(row[k], self.rng, spread, self._amplitude, ends)
+                tried = [vary_run(runs[r], self.rng, spread, self._reach, ends, self._waves) for _ in range(VARIATIONS)]
                 gains, keeps = self._evaluate(np.stack([self._signal(row) for row in tried]))
                 figures = np.where(keeps, self.judge.deviation(others[:, None] + gains), np.inf)
                 winner = int(np.argmin(figures))
                 if figures[winner] < best:
                     best, runs[r] = float(figures[winner]), tried[winner]
                     every[:, r] = gains[:, winner]
-            self.progress(f"relative standard deviation {best:.3g}, {self.tried} runs tried")
-            if best > (1 - MIN_GAIN) * before:
-                spread, quiet = max(spread / 2, LAST_SPREAD), quiet + (spread <= LAST_SPREAD)
+                self.progress(f"relative standard deviation {best:.3g}, {self.tried} runs tried")
+            quiet = quiet + 1 if best > (1 - MIN_GAIN) * before else 0
         return runs
 
     def _evaluate(self, signals: Array) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -18,6 +18,11 @@ AMPLITUDES = 10  # amplitudes of the library: fewer miss the edge of sticking, w
 FREQUENCIES = 8  # frequencies of the library: as for the amplitudes
 LEAST_AMPLITUDE = 3e-4
 """Share of the range [1] of the smallest wave: smaller ones drown in noise, and presliding motion needs this one."""
+ONE_BLOCK, ALL_BLOCKS, FRESH_BLOCK, COPIED_BLOCK = 0.6, 0.75, 0.9, 0.95
+"""Shares [1], each up to the next, of the kinds of change of a run; the rest moves blocks. The first kind refines, the
+others lead out of where it ends."""
+ALL_BLOCKS_SPREAD = 0.15
+"""By how much less blocks move that move together [1]: as far as one alone, hardly any change is for the better."""
 CYCLES_A_SAMPLE = 0.08  # of the highest frequency [1]: a faster wave has corners that the controller cannot play
 
 
@@ -125,3 +130,45 @@ def vary(block: Block, rng: np.random.Generator, spread: float, amplitude: float
         float(np.clip(block.frequency * math.exp(pace), *ends)),
         float(np.clip(level, -amplitude, amplitude)),
     )
+
+
+def vary_run(
+    run: Sequence[Block],
+    rng: np.random.Generator,
+    spread: float,
+    reach: tuple[float, float],
+    ends: tuple[float, float],
+    fresh: Sequence[Block],
+) -> list[Block]:
+    """A run near another one: mostly with one block changed, else with all, with one exchanged, copied or moved.
+
+    Small changes alone stay where the exchange of separate blocks began: what a block tells depends on its neighbours.
+
+    Parameters
+    ----------
+    run : sequence of Block
+    rng : numpy.random.Generator
+    spread : float
+        As for `vary`.
+    reach : (float, float)
+        How far the excitation may go down and up from the start [its unit].
+    ends : (float, float)
+        Lowest and highest frequency [Hz].
+    fresh : sequence of Block
+        Blocks that one may be exchanged for, at any level.
+    """
+    changed, amplitude = list(run), max(abs(v) for v in reach)
+    k, j = (int(n) for n in rng.integers(len(run), size=2))
+    kind, size = rng.random(), spread * rng.random()
+    if kind < ONE_BLOCK:
+        changed[k] = vary(run[k], rng, size, amplitude, ends)
+    elif kind < ALL_BLOCKS:
+        changed = [vary(b, rng, ALL_BLOCKS_SPREAD * spread, amplitude, ends) for b in run]
+    elif kind < FRESH_BLOCK:
+        level = float(rng.uniform(*reach) * rng.random())
+        changed[k] = replace(fresh[int(rng.integers(len(fresh)))], level=level)
+    elif kind < COPIED_BLOCK:
+        changed[k] = vary(run[j], rng, size, amplitude, ends)
+    else:
+        changed[k], changed[j] = run[j], run[k]
+    return changed

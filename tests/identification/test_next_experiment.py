@@ -13,7 +13,7 @@ from pneuopt.control.loop import ClosedLoop
 from pneuopt.control.pid import PID
 from pneuopt.dynamics.simulate import simulate
 from pneuopt.files.results import load_result
-from pneuopt.identification.criteria import AOptimal, DOptimal, Precision
+from pneuopt.identification.criteria import AOptimal, DOptimal, Precision, WantedPrecision
 from pneuopt.identification.experiment_design import ExperimentDesign
 from pneuopt.identification.identify import identify
 from pneuopt.identification.next_experiment import next_experiment
@@ -45,7 +45,7 @@ def design() -> ExperimentDesign:
         limits=LIMITS,
         noise=NOISE,
         plants={},
-        cpu_seconds=600,
+        cpu_seconds=3,
         criterion=DOptimal(),
     )
 
@@ -152,7 +152,7 @@ def test_several_runs_tell_more_than_one_and_are_written_each(tmp_path: Path) ->
 def test_a_design_is_saved_whole_and_reproduced(tmp_path: Path) -> None:
     def planned() -> ExperimentDesign:
         return next_experiment(
-            LOOP, KNOWN.freed(*FREE), duration=0.5, limits=LIMITS, noise=NOISE, cpu_seconds=600, plants={}
+            LOOP, KNOWN.freed(*FREE), duration=0.2, limits=LIMITS, noise=NOISE, cpu_seconds=600, plants={}
         )
 
     first = planned()
@@ -177,6 +177,7 @@ def test_a_design_is_saved_whole_and_reproduced(tmp_path: Path) -> None:
         ({"runs": 0}, "runs = 0: plan one at least"),
         ({"sample_time": 1e-3}, "the loop's controller acts every 0.002 s"),
         ({"criterion": Precision("load.mass")}, "criterion: load.mass is not free"),
+        ({"criterion": WantedPrecision({"load.mass": 0.01})}, "criterion: load.mass is not free"),
         ({"criterion": DOptimal("friction.sigma0")}, "unknown parameter 'friction.sigma0'"),
         ({"plants": -1}, "plants = -1"),
         ({"start": {"angle": 1.0}}, "start: unknown output 'angle'"),
@@ -192,6 +193,25 @@ def test_what_cannot_be_planned_is_refused_with_a_remedy(given: dict[str, Any], 
 def test_nothing_free_is_refused() -> None:
     with pytest.raises(InputError, match="no parameter of the plant is free"):
         next_experiment(LOOP, KNOWN, duration=0.5, limits=LIMITS, noise=NOISE)
+
+
+def test_the_precision_that_is_wanted_decides_which_parameter_counts() -> None:
+    def planned(coulomb: float, viscous: float) -> ExperimentDesign:
+        wanted = WantedPrecision({"friction.coulomb": coulomb, "friction.viscous": viscous})
+        return next_experiment(
+            *(LOOP, KNOWN.freed(*FREE)), duration=0.3, limits=LIMITS, noise=NOISE, cpu_seconds=1, plants={},
+            criterion=wanted,
+        )  # fmt: skip
+
+    of_coulomb, of_viscous = (planned(*wanted).table["stderr_alone"] for wanted in ((1e-5, 1.0), (1.0, 1e-5)))
+    assert of_coulomb["friction.coulomb"] < of_viscous["friction.coulomb"]
+    assert of_viscous["friction.viscous"] < of_coulomb["friction.viscous"]
+
+
+@pytest.mark.parametrize("wanted", [{}, {"load.mass": 0.0}, {"load.mass": float("nan")}])
+def test_a_wanted_precision_is_positive(wanted: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="WantedPrecision"):
+        WantedPrecision(wanted)
 
 
 def test_what_no_run_tells_is_said() -> None:
