@@ -13,6 +13,23 @@ LOCAL_CLUSTER = "dask"
 _SCHEMES = ("tcp://", "tls://", "ws://", "wss://", "ucx://")
 _CONNECT_SECONDS = 10.0  # patience with a scheduler [s]: shorter gives up on a slow net, longer looks like a hang
 
+_OWN_CLUSTER: dict[str, Any] = {
+    "distributed.scheduler.allowed-failures": 0,  # the study itself tries again, case by case
+    "distributed.scheduler.work-stealing-interval": "1s",
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.admin.system-monitor.gil.enabled": False,
+    "distributed.nanny.pre-spawn-environ": dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), 1
+    ),
+}
+"""What a cluster that is there for one study does not need: its sampling profiler, monitors many times a second, and
+memory that is given back to the system after each array. They took as much CPU time as a sixth of the cases
+(problems/speed/study_executors.py)."""
+
 
 @contextmanager
 def open_executor(where: str) -> Iterator[Executor | Processes]:
@@ -55,9 +72,8 @@ def _make_client(distributed: Any, where: str) -> Iterator[Any]:
     import dask
 
     if where == LOCAL_CLUSTER:
-        once = {"distributed.scheduler.allowed-failures": 0}  # the study itself tries again, case by case
         with (
-            dask.config.set(once),
+            dask.config.set(_OWN_CLUSTER),
             distributed.LocalCluster(threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster,
             distributed.Client(cluster) as client,
         ):

@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pneuopt.control.loop import ClosedLoop
-from pneuopt.control.reference import Step
+from pneuopt.control.reference import Reference
 from pneuopt.dynamics.simulate import MAX_STEPS
+from pneuopt.evaluation.band import Band
 from pneuopt.evaluation.evaluate import evaluate
 from pneuopt.quantities.errors import require
 from pneuopt.quantities.parameters import Parameter, ParameterSet
@@ -45,10 +46,10 @@ def loop_at_sample_time(loop: ClosedLoop, parameters: ParameterSet) -> tuple[Clo
 
 def evaluate_at_sample_time(
     loop: ClosedLoop,
-    references: Step | Sequence[Step],
+    references: Reference | Sequence[Reference],
     parameters: ParameterSet,
     *,
-    band: float = 0.02,
+    band: Band = 0.02,
     max_steps: float = MAX_STEPS,
 ) -> "pd.DataFrame":
     """The metrics of a case that may have a sample time among its parameters; as `evaluate`."""
